@@ -1,0 +1,185 @@
+"""Carry out planned grasps with the whole arm, and judge them: the ONE place that says success.
+
+Labelling, evaluation and demos all call `execute_grasp`, so they cannot disagree about what a
+successful grasp is. Knows nothing of how grasps are found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.cell import Cell
+from envs.panda import (
+    MAX_OPENING,
+    Trajectory,
+    UnreachableError,
+    forward_kinematics,
+    inverse_kinematics,
+)
+from envs.world import BIN_CENTRE, BIN_HEIGHT
+from utils.transforms import Grasp, top_down_pose
+
+_CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
+_RELEASE_SECONDS = 0.35  # for the fingers to open and the object to fall into the bin
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp, other finger
+
+
+@dataclass(frozen=True)
+class GraspOutcome:
+    """How an attempt ended.
+
+    reason: `success`, or how it failed: `ik` (a pose or the line to it cannot be reached),
+    `collision` (a contact stopped the approach), `missed` (the fingers closed on nothing),
+    `slipped` (lost before the lift height), `dropped` (lost after it).
+    sim_seconds: simulated time from home and back home, at legal joint speeds.
+    object_index: the object that was held, if any.
+    """
+
+    reason: str
+    sim_seconds: float
+    object_index: int | None = None
+
+    @property
+    def success(self) -> bool:
+        return self.reason == "success"
+
+
+class _Failure(Exception):
+    """Ends an attempt early with a reason."""
+
+    def __init__(self, reason: str, object_index: int | None = None):
+        super().__init__(reason)
+        self.reason, self.object_index = reason, object_index
+
+
+def execute_grasp(cell: Cell, grasp: Grasp) -> GraspOutcome:
+    """Reach, approach, close, lift, hold, carry to the bin, release, go home.
+
+    Success: one object pressed on by both fingers, its centre of mass above
+    execution.lift_height, for execution.hold_seconds and all the way to the bin. A picked object
+    is retired. Whatever happens, the arm is home again at the end.
+    """
+    start = cell.seconds
+    try:
+        index = _pick(cell, grasp)
+        _carry_to_bin(cell, index)
+        outcome, index = "success", index
+    except UnreachableError:
+        outcome, index = "ik", None
+    except _Failure as failure:
+        outcome, index = failure.reason, failure.object_index
+    _go_home(cell)
+    cell.retire_lost_objects()
+    return GraspOutcome(outcome, cell.seconds - start, index)
+
+
+def _pick(cell: Cell, grasp: Grasp) -> int:
+    """From home to an object held above the lift height; its number. Raises _Failure."""
+    settings = cell.config.execution
+    pregrasp = grasp.pose.copy()
+    pregrasp[2, 3] += settings.pregrasp_height
+    q_pregrasp = choose_posture(cell, pregrasp)
+    target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
+    approach = _line(cell, q_pregrasp, target)  # planned before anything moves
+
+    cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
+    _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
+    if not _follow(cell, approach, stop_force=settings.contact_stop):
+        raise _Failure("collision")
+    _close(cell)
+    index = cell.held_object()
+    if index is None:
+        raise _Failure("missed")
+
+    lifted = target.copy()
+    lifted[2, 3] = max(grasp.position[2], 0.0) + settings.lift_height + 0.05
+    _follow(cell, _line(cell, cell.robot.q, lifted))
+    high = cell.object_position(index)[2] > settings.lift_height
+    if not (high and cell.robot.holds(cell.bodies[index])):
+        raise _Failure("slipped", index)
+    cell.step(round(settings.hold_seconds / cell.dt))
+    return index
+
+
+def _carry_to_bin(cell: Cell, index: int) -> None:
+    over_bin = top_down_pose([*BIN_CENTRE, BIN_HEIGHT + 0.17], -np.pi / 2)
+    posture = choose_posture(cell, over_bin)
+    _follow(cell, cell.robot.joint_move(cell.robot.q, posture, **_scales(cell)))
+    if not cell.robot.holds(cell.bodies[index]):
+        raise _Failure("dropped", index)
+    cell.robot.command_gripper(MAX_OPENING)
+    cell.step(round(_RELEASE_SECONDS / cell.dt))
+    cell.retire(index)
+
+
+def _close(cell: Cell) -> None:
+    """Close the fingers until they stop moving."""
+    cell.robot.command_gripper(0.0)
+    before = cell.robot.opening
+    for _ in range(round(_CLOSE_SECONDS / 0.05)):
+        cell.step(round(0.05 / cell.dt))
+        opening = cell.robot.opening
+        if abs(opening - before) < 2e-4:
+            return
+        before = opening
+
+
+def _go_home(cell: Cell) -> None:
+    """Open, rise on a straight line if the hand is low, and return to the home posture."""
+    robot = cell.robot
+    robot.command_gripper(MAX_OPENING)
+    cell.step(round(0.1 / cell.dt))
+    T = forward_kinematics(robot.q)
+    if T[2, 3] < 0.2:
+        up = T.copy()
+        up[2, 3] = 0.2
+        try:
+            _follow(cell, _line(cell, robot.q, up))
+        except UnreachableError:
+            pass  # the joint motion below goes up as well, only less straight
+    _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+
+
+def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
+    """Joint positions (7,) for a gripper pose or the same grasp turned by half a turn, whichever
+    is nearer to home. Raises UnreachableError if neither can be reached."""
+    found, error = [], None
+    for candidate in (pose, pose @ _HALF_TURN):
+        try:
+            found.append(inverse_kinematics(candidate, cell.home, cell.home))
+        except UnreachableError as unreachable:
+            error = unreachable
+    if not found:
+        raise error
+    return min(found, key=lambda q: float(abs(q - cell.home).max()))
+
+
+def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """`pose`, turned by half a turn if the arm chose that way round."""
+    return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ _HALF_TURN
+
+
+def _line(cell: Cell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
+    speed = cell.config.execution.approach_speed
+    return cell.robot.straight_move(q, pose, speed, cell.home, **_scales(cell))
+
+
+def _scales(cell: Cell) -> dict[str, float]:
+    robot = cell.config.robot
+    return {
+        "velocity_scale": robot.velocity_scale,
+        "acceleration_scale": robot.acceleration_scale,
+    }
+
+
+def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> bool:
+    """Run a trajectory; stop where it is and return False at a contact above `stop_force` N."""
+    for q, velocity in zip(trajectory.positions, trajectory.velocities):
+        cell.robot.command_arm(q, velocity)
+        cell.step()
+        if stop_force is not None and cell.robot.contact_force() > stop_force:
+            cell.robot.command_arm(cell.robot.q, np.zeros(7))
+            return False
+    return True

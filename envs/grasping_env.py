@@ -1,0 +1,377 @@
+"""`RobotGraspingEnv`: the Gymnasium face of the robot cell, registered as `RobotGrasping-v0`.
+
+A policy moves the Panda a little at a time and is rewarded for lifting an object. Run
+`python -m envs.grasping_env` for a demonstration that needs no display.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pybullet
+from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
+from scipy.spatial.transform import Rotation
+
+from envs.camera import render
+from envs.cell import Cell, PhysicsError, camera_intrinsics
+from envs.objects import load_object_set
+from envs.panda import (
+    JOINT_LOWER,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    MAX_OPENING,
+    TIP,
+    differential_ik,
+    forward_kinematics,
+)
+from envs.scenes import make_scene
+from envs.studio import Studio
+from envs.world import on_table
+from utils.config import Config, load_config, with_settings
+from utils.errors import UserError
+
+_LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
+_HIGHEST_TIP = 0.50  # m
+_MARGIN = 0.08  # m that E may leave the workspace sideways
+_FOLLOW_TOLERANCE = 0.005  # m between the commanded and the reachable E before it is reported
+
+
+class RobotGraspingEnv(gymnasium.Env):
+    """Lift an object from the table.
+
+    Observation: a Dict with any of `rgb` (H, W, 3) uint8; `depth` (H, W, 1) float32 metres, 0 where
+    unknown; `state` (15,) float32: joint positions (7, rad), joint velocities (7, rad/s), gripper
+    opening (m).
+
+    Action: a Box in [-1, 1], its last entry the gripper's target opening (-1 closed, 1 open).
+    `ee`: dx, dy, dz in units of `position_step` metres, and a rotation vector in units of
+    `rotation_step` radians, both in W. `ee_planar`: dx, dy, dz, dyaw. `joint`: seven changes in
+    units of `joint_step` radians. Changes add up on the *commanded* pose, are held within the
+    workspace and the joint limits, and are scaled down as a whole where a joint would have to
+    exceed its velocity limit.
+
+    Reward (`dense`): 1 at success, plus the change of a potential, so that it cannot alter which
+    policy is best (Ng, Harada and Russell, "Policy invariance under reward transformations",
+    ICML 1999): r = [success] + Phi(s') - Phi(s), with the stages of ManiSkill's PickCube
+
+        Phi = ( (1 - tanh 5 d) + g + 2 g h ) / 4
+
+    where d is the distance from the point between the fingertips to the nearest object's centre in
+    metres, g is 1 while both fingers press on it, and h in [0, 1] is how far it has been lifted
+    towards `lift_height`. `sparse`: 1 at success, else 0.
+
+    Success: an object pressed on by both fingers and its centre above `lift_height` for
+    `hold_seconds` in a row. Termination: success; or failure, when every object has left the table
+    (`off_table`) or the physics has blown up (`physics`). Truncation: `max_steps` actions.
+
+    info: `is_success`, `reason` (why the episode ended, or None), `object_position` (3,),
+    `end_effector_position` (3,), `grasped`, `reachable` (False where the command could not be
+    followed), `scene_seed`.
+
+    Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
+    file, or None for the defaults. Any key of the config's `env` section can be given by name:
+    `gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")`.
+    `reset(options={"scene_seed": n})` asks for one scene.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        config: Config | Path | str | None = None,
+        **settings: Any,
+    ):
+        self._closed = True  # until everything below has been built
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UserError(
+                f"render_mode {render_mode!r} is unknown; allowed are None, 'human', 'rgb_array'"
+            )
+        config = config if isinstance(config, Config) else load_config(config)
+        self.config = _camera_of_env(with_settings(config, "env", settings))
+        self.settings = self.config.env
+        self.render_mode = render_mode
+        self.metadata = self.metadata | {
+            "render_fps": round(self.config.sim.frequency / self.settings.substeps)
+        }
+        self.objects = load_object_set(
+            self.settings.objects,
+            split=self.config.objects.split,
+            scale=self.config.objects.scale,
+            fit=self.config.objects.fit,
+            density=self.config.objects.density,
+            cache_dir=self.config.cache_folder,
+        )
+        if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            raise UserError(
+                "render_mode='human' opens a window and there is no display here; "
+                "use render_mode='rgb_array'"
+            )
+        self.cell = Cell(self.config, gui=render_mode == "human")
+        self._studio: Studio | None = None
+        self._running = False
+        self._closed = False
+        self._intrinsics = camera_intrinsics(self.config.camera)
+        self.observation_space = spaces.Dict(self._observation_spaces())
+        size = {"ee": 7, "ee_planar": 5, "joint": 8}[self.settings.control]
+        self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+        self._hold_steps = max(
+            1,
+            round(self.settings.hold_seconds * self.config.sim.frequency / self.settings.substeps),
+        )
+        reach = self.config.workspace.size / 2 + _MARGIN
+        x, y = self.config.workspace.center
+        self._lowest = np.array([x - reach, y - reach, _LOWEST_TIP])
+        self._highest = np.array([x + reach, y + reach, _HIGHEST_TIP])
+        self._max_joint_change = (
+            JOINT_VELOCITY
+            * self.config.robot.velocity_scale
+            * self.settings.substeps
+            / self.config.sim.frequency
+        )
+
+    def _observation_spaces(self) -> dict[str, spaces.Space]:
+        side = self.settings.resolution
+        slack = 0.1  # rad: the motors may overshoot a limit a little
+        low = np.concatenate([JOINT_LOWER - slack, -2 * JOINT_VELOCITY, [-0.01]])
+        high = np.concatenate([JOINT_UPPER + slack, 2 * JOINT_VELOCITY, [MAX_OPENING + 0.01]])
+        self._state_low, self._state_high = low.astype(np.float32), high.astype(np.float32)
+        everything = {
+            "rgb": spaces.Box(0, 255, (side, side, 3), np.uint8),
+            "depth": spaces.Box(0.0, self.config.camera.far, (side, side, 1), np.float32),
+            "state": spaces.Box(self._state_low, self._state_high, dtype=np.float32),
+        }
+        return {name: everything[name] for name in self.settings.observations}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode on a new scene. See the class for observation and info."""
+        if self._closed:
+            raise ClosedEnvironmentError("reset() after close(): make a new environment")
+        super().reset(seed=seed)
+        drawn = int(self.np_random.integers(2**31))
+        self._scene_seed = int((options or {}).get("scene_seed", drawn))
+        scene = make_scene(
+            self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
+        )
+        self.cell.load(scene)
+        self._q_command = self.cell.home.copy()
+        self._T_command = forward_kinematics(self._q_command)
+        self._reachable = True
+        self._steps = 0
+        self._held_steps = 0
+        self._running = True
+        self._look()
+        self._potential = self._progress()
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info(None)
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Carry out one action for `substeps` physics steps. See the class for what comes back."""
+        if self._closed:
+            raise ClosedEnvironmentError("step() after close(): make a new environment")
+        if not self._running:
+            raise ResetNeeded("step() needs a running episode: call reset() first")
+        self._command(self._checked(action))
+        self.cell.step(self.settings.substeps)
+        self._steps += 1
+        try:
+            self._look()
+        except PhysicsError:
+            self._running = False
+            return self._blown_up(), 0.0, True, False, self._info("physics")
+        lifted = self._grasped and self._object_position[2] > self.settings.lift_height
+        self._held_steps = self._held_steps + 1 if lifted else 0
+        success = self._held_steps >= self._hold_steps
+        reward = float(success)
+        if self.settings.reward == "dense":
+            before, self._potential = self._potential, self._progress()
+            reward += self._potential - before
+        reason = "success" if success else None if self._any_on_table() else "off_table"
+        terminated = reason is not None
+        truncated = not terminated and self._steps >= self.settings.max_steps
+        if truncated:
+            reason = "max_steps"
+        self._running = not (terminated or truncated)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), reward, terminated, truncated, self._info(reason)
+
+    def render(self) -> np.ndarray | None:
+        """A (480, 640, 3) uint8 picture with detailed meshes in "rgb_array" mode, else None (the
+        window of "human" mode shows the physics as it runs)."""
+        if self.render_mode != "rgb_array":
+            return None
+        if self._closed:
+            raise ClosedEnvironmentError("render() after close(): make a new environment")
+        if self.cell.scene is None:
+            raise ResetNeeded("render() needs a scene: call reset() first")
+        if self._studio is None:
+            self._studio = Studio(self.cell)
+        return self._studio.picture()
+
+    def close(self) -> None:
+        """Disconnect from the physics. Calling it again does nothing."""
+        if not self._closed:
+            self._closed = True
+            if self._studio is not None:
+                self._studio.close()
+            self.cell.close()
+
+    def get_gripper_width(self) -> float:
+        """Distance between the fingertips in metres."""
+        if self._closed:
+            raise ClosedEnvironmentError("get_gripper_width() after close()")
+        if self.cell.scene is None:
+            raise ResetNeeded("get_gripper_width() needs a robot: call reset() first")
+        return self.cell.robot.opening
+
+    # --- Action -----------------------------------------------------------------------------
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, dtype=float)
+        if action.shape != self.action_space.shape:
+            raise InvalidAction(
+                f"action has shape {action.shape}; control={self.settings.control!r} takes "
+                f"{self.action_space.shape}, each entry in [-1, 1]"
+            )
+        if not np.isfinite(action).all():
+            raise InvalidAction(f"action holds a non-finite number: {action.tolist()}")
+        return np.minimum(np.maximum(action, -1.0), 1.0)
+
+    def _command(self, action: np.ndarray) -> None:
+        """Move the commanded pose by an action and send the motors there."""
+        settings, q = self.settings, self._q_command
+        if settings.control == "joint":
+            goal = q + settings.joint_step * action[:7]
+            goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
+        else:
+            self._move_command_pose(action)
+            goal = differential_ik(q, self._T_command, iterations=1)
+        change = goal - q
+        excess = float((abs(change) / self._max_joint_change).max())
+        self._q_command = q + change / max(excess, 1.0)
+        self.cell.robot.drive_arm_to(self._q_command, self.config.robot.velocity_scale)
+        self.cell.robot.command_gripper(MAX_OPENING * (action[-1] + 1) / 2)
+
+    def _move_command_pose(self, action: np.ndarray) -> None:
+        settings, T = self.settings, self._T_command
+        # A command that the arm could not follow is taken back to where the arm got, so that it
+        # does not wind up.
+        reached = forward_kinematics(self._q_command)
+        self._reachable = abs(reached[:3, 3] - T[:3, 3]).max() < _FOLLOW_TOLERANCE
+        if not self._reachable:
+            T[:] = reached
+        position = T[:3, 3] + settings.position_step * action[:3]
+        T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
+        turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
+        if turn.any():
+            T[:3, :3] = (
+                Rotation.from_rotvec(settings.rotation_step * turn)
+                * Rotation.from_matrix(T[:3, :3])
+            ).as_matrix()
+
+    # --- What happened ----------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Read the robot and the nearest object. Raises PhysicsError on a non-finite number."""
+        cell = self.cell
+        q, velocity, opening = cell.robot.joint_state()
+        self._state = np.array([*q, *velocity, opening], dtype=np.float32)
+        tip = pybullet.getLinkState(cell.robot.body, TIP, physicsClientId=cell.client)[0]
+        self._tip = np.array(tip)
+        if not np.isfinite(self._state).all():
+            raise PhysicsError("the robot's state is not finite")
+        positions = [cell.object_position(i) for i in range(len(cell.bodies))]
+        distances = [float(np.linalg.norm(p - self._tip)) for p in positions]
+        nearest = min(range(len(positions)), key=distances.__getitem__)
+        self._object_positions, self._object_position = positions, positions[nearest]
+        self._distance = distances[nearest]
+        self._grasped = cell.robot.holds(cell.bodies[nearest])
+
+    def _progress(self) -> float:
+        """The potential Phi in [0, 1]; see the class."""
+        reach = 1.0 - np.tanh(5.0 * self._distance)
+        if not self._grasped:
+            return float(reach / 4)
+        lift = min(max(self._object_position[2] / self.settings.lift_height, 0.0), 1.0)
+        return float((reach + 1.0 + 2.0 * lift) / 4)
+
+    def _any_on_table(self) -> bool:
+        return any(on_table(position) for position in self._object_positions)
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        observation = {}
+        if "rgb" in self.settings.observations or "depth" in self.settings.observations:
+            cell = self.cell
+            image = render(cell.client, self._intrinsics, cell.camera_pose(), cell.renderer)
+            observation = {"rgb": image.rgb, "depth": image.depth[..., None]}
+        observation["state"] = np.clip(self._state, self._state_low, self._state_high)
+        return {name: observation[name] for name in self.settings.observations}
+
+    def _blown_up(self) -> dict[str, np.ndarray]:
+        """An observation within its space for the end of an episode whose physics failed."""
+        return {
+            name: np.zeros(space.shape, space.dtype).clip(space.low, space.high)
+            for name, space in self.observation_space.items()
+        }
+
+    def _info(self, reason: str | None) -> dict[str, Any]:
+        return {
+            "is_success": reason == "success",
+            "reason": reason,
+            "object_position": self._object_position.copy(),
+            "end_effector_position": self._tip.copy(),
+            "grasped": self._grasped,
+            "reachable": bool(self._reachable),
+            "scene_seed": self._scene_seed,
+        }
+
+
+def _camera_of_env(config: Config) -> Config:
+    """The config with the cell's camera set to what the env observes with."""
+    side = config.env.resolution
+    return with_settings(
+        config, "camera", {"mount": config.env.camera, "width": side, "height": side}
+    )
+
+
+def main() -> None:
+    """A scripted pick: above the object, down, close, up."""
+    env = RobotGraspingEnv(render_mode="rgb_array", control="ee_planar")
+    observation, info = env.reset(seed=0)
+    print("observation:", {name: value.shape for name, value in observation.items()})
+    print("action:", env.action_space)
+    done, step, total = False, 0, 0.0
+    while not done:
+        offset = info["object_position"] - info["end_effector_position"]
+        over_it = np.linalg.norm(offset[:2]) < 0.01
+        down = offset[2] if over_it else offset[2] + 0.12
+        closing = over_it and abs(offset[2]) < 0.01 or info["grasped"] or env.get_gripper_width() < 0.07
+        if closing:
+            offset[:2], down = 0.0, 0.05 if info["grasped"] else 0.0
+        move = np.clip(np.array([*offset[:2], down]) / env.settings.position_step, -1, 1)
+        action = np.array([*move, 0.0, -1.0 if closing else 1.0], dtype=np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, step, done = total + reward, step + 1, terminated or truncated
+        if step % 5 == 0 or done:
+            print(
+                f"step {step:3d}: reward {reward:+.3f}, gripper {env.get_gripper_width():.3f} m, "
+                f"object at {info['object_position'][2]:.3f} m, grasped {info['grasped']}"
+            )
+    print(f"ended by {info['reason']} with return {total:.3f}; picture {env.render().shape}")
+    env.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+"""Procedural solids: eleven families, each object determined by its index alone.
+
+Every one of them can be taken by a hand that opens 0.08 m, however it comes to lie: across the
+whole, across a bar, or across a wall with one finger inside. This module knows no simulator.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+FAMILIES = (
+    "box", "cylinder", "sphere", "capsule", "L", "T", "U", "cross", "ring", "bowl", "mug",
+)  # fmt: skip
+_SEED = 20240501
+_SEGMENTS = 16  # convex pieces of a round wall
+_MASS_RANGE = (0.03, 0.3)
+
+
+@dataclass(frozen=True)
+class NativeShape:
+    """A shape that Bullet collides in closed form, centred at the origin.
+
+    size in metres: box (x, y, z); cylinder (radius, length along z); sphere (radius,);
+    capsule (radius, length along z between the centres of its caps).
+    """
+
+    kind: str
+    size: tuple[float, ...]
+
+    def mesh(self, fine: bool = False) -> trimesh.Trimesh:
+        """A tessellation: coarse as a union of few planes, fine for mass properties."""
+        if self.kind == "box":
+            return trimesh.creation.box(self.size)
+        if self.kind == "sphere":
+            return trimesh.creation.icosphere(5 if fine else 2, self.size[0])
+        radius, length = self.size
+        if self.kind == "cylinder":
+            return trimesh.creation.cylinder(radius, length, sections=512 if fine else 32)
+        # As the hull of two balls: its centre is then ours to choose.
+        ball = trimesh.creation.icosphere(5 if fine else 2, radius).vertices
+        shift = np.array([0.0, 0.0, length / 2])
+        return trimesh.convex.convex_hull(np.concatenate([ball + shift, ball - shift]))
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """One procedural object: its shape (native, or convex parts (V, 3) in metres) and matter.
+
+    density kg/m3, friction against a surface of friction 1, colour RGBA in 0..1.
+    """
+
+    name: str
+    native: NativeShape | None
+    parts: tuple[np.ndarray, ...]
+    density: float
+    friction: float
+    color: tuple[float, float, float, float]
+
+
+def make_primitive(index: int, scale: float = 1.0) -> Primitive:
+    """The object of this index; families take turns, so any run of indices is balanced."""
+    rng = np.random.default_rng([_SEED, index])
+    family = FAMILIES[index % len(FAMILIES)]
+    shape = _SHAPES[family](rng)
+    native = None
+    if isinstance(shape, NativeShape):
+        native = NativeShape(shape.kind, tuple(float(scale * side) for side in shape.size))
+        parts = (np.asarray(native.mesh().vertices),)
+        volume = native.mesh(fine=True).volume
+    else:
+        parts = tuple(scale * part for part in shape)
+        volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)
+    density = float(np.clip(rng.uniform(300, 1500), *(m / volume for m in _MASS_RANGE)))
+    friction = float(rng.uniform(0.4, 1.0))
+    return Primitive(f"{family}_{index:04d}", native, parts, density, friction, random_color(rng))
+
+
+def random_color(rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """A saturated, rather bright colour of any hue."""
+    hue, saturation, value = rng.uniform((0, 0.4, 0.5), (1, 0.9, 0.95))
+    return (*map(float, colorsys.hsv_to_rgb(hue, saturation, value)), 1.0)
+
+
+def _box(low, high) -> np.ndarray:
+    """(8, 3) corners of an axis-aligned box."""
+    corners = np.stack([low, high]).astype(float)
+    return np.stack(np.meshgrid(*corners.T, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _bars(rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """Long side, short side, thickness of the bars, and height; metres."""
+    return tuple(rng.uniform((0.06, 0.045, 0.014, 0.02), (0.11, 0.08, 0.024, 0.045)))
+
+
+def _l_shape(rng) -> list[np.ndarray]:
+    a, b, w, h = _bars(rng)
+    return [_box((0, 0, 0), (a, w, h)), _box((0, w, 0), (w, b, h))]
+
+
+def _t_shape(rng) -> list[np.ndarray]:
+    a, b, w, h = _bars(rng)
+    return [_box((-a / 2, 0, 0), (a / 2, w, h)), _box((-w / 2, w, 0), (w / 2, b, h))]
+
+
+def _u_shape(rng) -> list[np.ndarray]:
+    a, b, w, h = _bars(rng)
+    a = max(a, 2 * w + 0.035)  # a finger must fit between the legs
+    return [
+        _box((-a / 2, 0, 0), (a / 2, w, h)),
+        _box((-a / 2, w, 0), (-a / 2 + w, b, h)),
+        _box((a / 2 - w, w, 0), (a / 2, b, h)),
+    ]
+
+
+def _cross(rng) -> list[np.ndarray]:
+    a, b, w, h = _bars(rng)
+    return [
+        _box((-a / 2, -w / 2, 0), (a / 2, w / 2, h)),
+        _box((-w / 2, w / 2, 0), (w / 2, b / 2, h)),
+        _box((-w / 2, -b / 2, 0), (w / 2, -w / 2, h)),
+    ]
+
+
+def _wall(inner, outer, heights) -> list[np.ndarray]:
+    """A round wall as convex segments.
+
+    inner, outer: radii at the bottom and at the top; heights: of bottom and top. Metres.
+    """
+    angles = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+
+    def corner(radius: float, z: float, k: int) -> np.ndarray:
+        return np.append(radius * circle[k], z)
+
+    return [
+        np.array([
+            corner(radii[end], heights[end], k)
+            for radii in (inner, outer) for end in (0, 1) for k in (segment, segment + 1)
+        ])
+        for segment in range(_SEGMENTS)
+    ]  # fmt: skip
+
+
+def _disc(bottom_radius: float, top_radius: float, z0: float, z1: float) -> np.ndarray:
+    angles = np.arange(_SEGMENTS) * 2 * np.pi / _SEGMENTS
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.concatenate([
+        np.column_stack([radius * circle, np.full(_SEGMENTS, z)])
+        for radius, z in ((bottom_radius, z0), (top_radius, z1))
+    ])  # fmt: skip
+
+
+def _ring(rng) -> list[np.ndarray]:
+    wall, height = rng.uniform((0.008, 0.015), (0.016, 0.035))
+    inner = rng.uniform(0.022, 0.035)  # room for a finger
+    return _wall((inner, inner), (inner + wall, inner + wall), (0, height))
+
+
+def _bowl(rng) -> list[np.ndarray]:
+    wall, base, rim, height = rng.uniform((0.004, 0.02, 0.04, 0.03), (0.007, 0.03, 0.06, 0.055))
+    # The base spans the wall's foot, so that wall and base only touch.
+    foot = base + wall
+    return [
+        _disc(foot, foot, 0, wall),
+        *_wall((base, rim - wall), (foot, rim), (wall, height)),
+    ]
+
+
+def _mug(rng) -> list[np.ndarray]:
+    wall, radius, height = rng.uniform((0.003, 0.025, 0.055), (0.006, 0.032, 0.09))
+    bar = rng.uniform(0.006, 0.009)
+    reach = rng.uniform(0.02, 0.028)
+    low, high = 0.2 * height, 0.85 * height
+    # The wall is flat between its corners: the handle starts at the middle of a flat.
+    flat = radius * np.cos(np.pi / _SEGMENTS)
+    turn = np.pi / _SEGMENTS
+    handle = [
+        _box((flat, -bar / 2, low), (flat + reach, bar / 2, low + bar)),
+        _box((flat, -bar / 2, high - bar), (flat + reach, bar / 2, high)),
+        _box((flat + reach - bar, -bar / 2, low + bar), (flat + reach, bar / 2, high - bar)),
+    ]
+    rotation = np.array([
+        [np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]
+    ])  # fmt: skip
+    inner = radius - wall
+    return [
+        _disc(radius, radius, 0, wall),
+        *_wall((inner, inner), (radius, radius), (wall, height)),
+        *(part @ rotation.T for part in handle),
+    ]
+
+
+# Bounds in metres. Of a convex solid the two smaller sides stay below 0.06: one of them is
+# always across when it lies on a face.
+_SHAPES = {
+    "box": lambda rng: NativeShape(
+        "box", tuple(rng.uniform((0.025, 0.025, 0.03), (0.06, 0.06, 0.12)))
+    ),
+    "cylinder": lambda rng: NativeShape(
+        "cylinder", tuple(rng.uniform((0.0125, 0.03), (0.03, 0.12)))
+    ),
+    "sphere": lambda rng: NativeShape("sphere", (rng.uniform(0.018, 0.03),)),
+    "capsule": lambda rng: NativeShape("capsule", tuple(rng.uniform((0.0125, 0.02), (0.028, 0.08)))),
+    "L": _l_shape,
+    "T": _t_shape,
+    "U": _u_shape,
+    "cross": _cross,
+    "ring": _ring,
+    "bowl": _bowl,
+    "mug": _mug,
+}

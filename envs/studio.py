@@ -1,0 +1,80 @@
+"""Pictures for people: a twin of a cell with detailed meshes, shadows and a scenic camera.
+
+The twin has no physics of its own; it copies the poses of the cell that it shows.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pybullet
+
+from envs.camera import Intrinsics, render
+from envs.cell import Cell
+from envs.panda import ARM, FINGERS
+from utils.transforms import look_at
+
+SCENIC_EYE, SCENIC_TARGET = (1.35, -0.55, 0.75), (0.36, -0.10, 0.24)  # m in W
+_LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
+
+
+class Studio:
+    """Takes pictures of a cell. Close it, or use it in a `with` block."""
+
+    def __init__(self, cell: Cell, width: int = 640, height: int = 480):
+        self._cell = cell
+        self._twin = Cell(cell.config, fine=True)
+        self._intrinsics = Intrinsics(width, height, fov_deg=45.0, near=0.05, far=5.0)
+        self._T_WC = look_at(SCENIC_EYE, SCENIC_TARGET)
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8 picture of the cell as it is now."""
+        cell, twin = self._cell, self._twin
+        if twin.scene is not cell.scene:
+            twin.build(cell.scene)
+        joints = [*ARM, *FINGERS]
+        states = pybullet.getJointStates(cell.robot.body, joints, physicsClientId=cell.client)
+        for joint, state in zip(joints, states):
+            pybullet.resetJointState(
+                twin.robot.body, joint, state[0], physicsClientId=twin.client
+            )
+        for body, copy in zip(cell.bodies, twin.bodies):
+            pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
+            pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=twin.client)
+        return render(twin.client, self._intrinsics, self._T_WC, twin.renderer, _LIGHT).rgb
+
+    def close(self) -> None:
+        self._twin.close()
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+
+class Film:
+    """Films a cell from now on, at `rate` pictures a second of simulated time, until written."""
+
+    def __init__(self, cell: Cell, rate: int = 10, width: int = 480, height: int = 368):
+        self._cell, self._rate = cell, rate
+        self._studio = Studio(cell, width, height)
+        self._pictures: list[np.ndarray] = []
+        self._every = max(1, round(1 / (rate * cell.dt)))
+        cell.on_step = self._on_step
+
+    def _on_step(self, cell: Cell) -> None:
+        if cell.steps % self._every == 0:
+            self._pictures.append(self._studio.picture())
+
+    def write(self, path: Path, speed: float = 2.0) -> None:
+        """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
+        self._cell.on_step = None
+        self._studio.close()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".gif":
+            imageio.mimwrite(path, self._pictures, duration=1000 / (speed * self._rate), loop=0)
+        else:
+            imageio.mimwrite(path, self._pictures, fps=speed * self._rate, quality=6)

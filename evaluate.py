@@ -1,0 +1,270 @@
+"""The scoreboard: policies x scenarios x object sets on the same seeded scenes, with the full arm.
+
+    python evaluate.py
+    python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
+    python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
+
+Prints a table and leaves results.json, results.csv, rounds.jsonl and report.html in
+runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a worker; the workers fill the cores
+
+import argparse
+import multiprocessing
+import platform
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from envs.cell import Cell
+from envs.execution import GraspOutcome
+from envs.objects import ObjectSet, load_object_set
+from envs.rounds import run_round
+from envs.scenes import make_scene
+from envs.studio import Film
+from models.planners import PLANNERS, make_planner
+from utils.config import Config, parse_args, run_script
+from utils.errors import UserError, unknown_choice
+from utils.geometry import GripperGeometry, Workspace
+from utils.overlay import draw_grasp
+from utils.report import GalleryItem, write_report
+from utils.results import (
+    RoundRecord,
+    append_round,
+    interruption,
+    planned_rounds,
+    print_table,
+    read_rounds,
+    summarise,
+    write_csv,
+    write_results,
+)
+from utils.runs import git_state, new_run_folder
+from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
+    check_policies(config)
+    for name in config.evaluate.object_sets:
+        load_objects(name, config)  # an unusable folder is reported before any work is done
+    run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
+    device = f"{platform.machine()} CPU, {worker_count(config)} workers"
+    announce(config, run, device)
+
+    outcome = evaluate(config, run)
+
+    rows = summarise(outcome.rounds, config.seed)
+    complete = interruption(len(outcome.rounds), config) is None
+    for path in filter(None, [run / "results.json", options.results]):
+        write_results(path, rows, config, git_state().commit, device, complete)
+    write_csv(run / "results.csv", rows)
+    write_report(
+        run / "report.html", rows, outcome.rounds, config, outcome.gallery, outcome.films, device
+    )
+    print_table(rows)
+    if not complete:
+        print(f"{interruption(len(outcome.rounds), config)}; go on with --resume {run}")
+    print(f"report: {run / 'report.html'}")
+    return 130 if outcome.interrupted else 0
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--results", type=Path, metavar="FILE", help="also write results.json here")
+
+
+def check_policies(config: Config) -> None:
+    """Raise UserError for a policy that does not exist."""
+    for name in config.evaluate.policies:
+        if name not in PLANNERS:
+            raise unknown_choice("evaluate.policies", name, PLANNERS)
+
+
+def load_objects(name: str, config: Config) -> ObjectSet:
+    settings = config.objects
+    return load_object_set(
+        name,
+        split=settings.split,
+        scale=settings.scale,
+        fit=settings.fit,
+        density=settings.density,
+        cache_dir=config.cache_folder,
+    )
+
+
+def worker_count(config: Config) -> int:
+    return config.evaluate.workers or os.cpu_count() or 1
+
+
+def announce(config: Config, run: Path, device: str) -> None:
+    plan = config.evaluate
+    print(
+        f"{', '.join(plan.policies)} on {', '.join(plan.scenarios)} scenes of "
+        f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
+        f"seed {config.seed}, on {device}; results in {run}",
+        flush=True,
+    )
+
+
+# --- Running rounds in worker processes -----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scene, on which every policy that is still to be scored works in turn."""
+
+    objects: str
+    scenario: str
+    seed: int
+    policies: tuple[str, ...]
+    keep_pictures: bool
+    film_folder: Path | None
+
+
+@dataclass
+class Outcome:
+    """rounds: what was measured; films: (file, caption); interrupted: by Ctrl-C."""
+
+    rounds: list[RoundRecord] = field(default_factory=list)
+    gallery: list[GalleryItem] = field(default_factory=list)
+    films: list[tuple[Path, str]] = field(default_factory=list)
+    interrupted: bool = False
+
+
+def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
+    """What is left to do; every policy gets the same seeds."""
+    plan = config.evaluate
+    known = {(r.policy, r.scenario, r.objects, r.seed) for r in done}
+    for number in range(plan.rounds):
+        seed = config.seed * 100_000 + number
+        for objects in plan.object_sets:
+            for scenario in plan.scenarios:
+                policies = tuple(
+                    p for p in plan.policies if (p, scenario, objects, seed) not in known
+                )
+                if policies:
+                    film = run / "films" if number < plan.videos else None
+                    yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
+
+
+def evaluate(config: Config, run: Path) -> Outcome:
+    """Run every round that rounds.jsonl in `run` does not hold yet, and add it there."""
+    journal = run / "rounds.jsonl"
+    outcome = Outcome(rounds=read_rounds(journal))
+    pool = ProcessPoolExecutor(
+        worker_count(config),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(config,),
+    )
+    progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
+    try:
+        pending = {pool.submit(work, task) for task in tasks(config, outcome.rounds, run)}
+        while pending:
+            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in finished:
+                _collect(future, outcome, journal, progress)
+    except KeyboardInterrupt:
+        outcome.interrupted = True
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a worker process died (out of memory?); {len(outcome.rounds)} rounds are safe in "
+            f"{journal}: go on with --resume {run}, perhaps with evaluate.workers=1"
+        ) from error
+    finally:
+        pool.shutdown(wait=not outcome.interrupted, cancel_futures=True)
+        progress.close()
+    outcome.rounds.sort(key=lambda r: _rank(r, config))
+    outcome.gallery = _balanced(outcome.gallery, config.evaluate.gallery)
+    outcome.films.sort()
+    return outcome
+
+
+def _collect(future: Future, outcome: Outcome, journal: Path, progress: tqdm) -> None:
+    rounds, pictures, films = future.result()
+    for record in rounds:
+        append_round(journal, record)
+    outcome.rounds += rounds
+    outcome.gallery += pictures
+    outcome.films += films
+    progress.update(len(rounds))
+
+
+def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
+    plan = config.evaluate
+    return (
+        plan.object_sets.index(record.objects),
+        plan.scenarios.index(record.scenario),
+        plan.policies.index(record.policy),
+        record.seed,
+    )
+
+
+def _balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
+    """`count` pictures, half of them failures where there are enough: those teach the most."""
+    failures = [p for p in pictures if not p.success]
+    successes = [p for p in pictures if p.success]
+    take = min(len(failures), max(count // 2, count - len(successes)))
+    return failures[:take] + successes[: count - take]
+
+
+_worker_config: Config
+_worker_cell: Cell
+
+
+def _start_worker(config: Config) -> None:
+    global _worker_config, _worker_cell
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    _worker_config, _worker_cell = config, Cell(config)
+
+
+def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[Path, str]]]:
+    """Let each policy of a task work on its scene. Runs in a worker process."""
+    config, cell = _worker_config, _worker_cell
+    scene = make_scene(
+        task.scenario, load_objects(task.objects, config), task.seed, config, cell.client
+    )
+    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    rounds, pictures, films = [], [], []
+    for policy in task.policies:
+        planner = make_planner(policy, GripperGeometry(), workspace, task.seed)
+
+        def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
+            if task.keep_pictures:
+                pictures.append(picture(frame, grasp, outcome, f"{policy}, {task.scenario}"))
+
+        film = Film(cell) if task.film_folder is not None else None
+        rounds.append(
+            run_round(
+                cell, scene, planner, policy=policy, objects=task.objects,
+                max_failures=config.evaluate.max_failures, with_truth=planner.needs_truth,
+                on_attempt=keep,
+            )
+        )  # fmt: skip
+        if film is not None:
+            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}.mp4"
+            film.write(task.film_folder / name)
+            films.append((task.film_folder / name, f"{policy} on {task.scenario}"))
+    return rounds, pictures, films
+
+
+def picture(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, caption: str) -> GalleryItem:
+    """The frame with the grasp drawn in, and how it went."""
+    on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
+    image = draw_grasp(np.asarray(frame.rgb), on_image, frame.K, success=outcome.success)
+    return GalleryItem(image, f"{caption}: {outcome.reason}", outcome.success)
+
+
+if __name__ == "__main__":
+    run_script(main)

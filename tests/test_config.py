@@ -1,0 +1,270 @@
+"""The config: defaults, merging, and one clear sentence for every mistake."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from utils.config import (
+    DEFAULTS,
+    ConfigError,
+    _known_keys,
+    _schema_at,
+    changed_keys,
+    dump_config,
+    load_config,
+    parse_args,
+    run_script,
+)
+from utils.errors import UserError, unknown_choice
+
+
+def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def message(*overrides: str, path: Path | None = None) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, overrides)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_defaults():
+    config = load_config(None)
+    assert config.seed == 0
+    assert config.camera.position == (0.5, 0.0, 0.8)
+    assert config.evaluate.policies == ("random", "heuristic", "oracle")
+    assert config.env.control == "ee"
+    assert config.evaluate.workers is None
+
+
+def test_every_default_has_a_comment():
+    for line in DEFAULTS.read_text(encoding="utf-8").splitlines():
+        if ":" in line and not line.startswith("#") and not line.rstrip().endswith(":"):
+            assert " # " in line, f"no unit or meaning: {line}"
+
+
+def test_defaults_and_schema_have_the_same_keys():
+    def keys(values, prefix=""):
+        for key, value in values.items():
+            yield prefix + key
+            if isinstance(value, dict):
+                yield from keys(value, f"{prefix}{key}.")
+
+    assert set(keys(yaml.safe_load(DEFAULTS.read_text(encoding="utf-8")))) == set(_known_keys())
+
+
+def test_frozen():
+    with pytest.raises(ValidationError):
+        load_config(None).seed = 1
+
+
+def test_file_then_overrides(tmp_path):
+    path = write(tmp_path, "seed: 7\nevaluate:\n  rounds: 50\n  videos: 3\n")
+    config = load_config(path, ["evaluate.rounds=60", "camera.position=[0, 0, 1]"])
+    assert (config.seed, config.evaluate.rounds, config.evaluate.videos) == (7, 60, 3)
+    assert config.evaluate.gallery == load_config(None).evaluate.gallery
+    assert config.camera.position == (0, 0, 1)
+
+
+def test_empty_file_is_the_defaults(tmp_path):
+    assert load_config(write(tmp_path, "# nothing\n")) == load_config(None)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("evaluate.policies=[heuristic,oracle]", ("heuristic", "oracle")),
+        ("evaluate.policies=heuristic,oracle", ("heuristic", "oracle")),
+        ("evaluate.policies=oracle", ("oracle",)),
+        ("evaluate.scenarios=pile", ("pile",)),
+        ("camera.up=0, 1, 0", (0, 1, 0)),
+        ("evaluate.name=007", "007"),
+        ("evaluate.name=null", None),
+        ("evaluate.name=a=b", "a=b"),
+        ("evaluate.workers=2", 2),
+        ("objects.scale=3e-1", 0.3),
+        ("objects.density=1E3", 1000.0),
+        ("camera={near: 0.2, far: 3}", None),
+    ],
+)
+def test_override_values(text, expected):
+    config = load_config(None, [text])
+    if text.startswith("camera={"):
+        assert (config.camera.near, config.camera.far, config.camera.width) == (0.2, 3, 224)
+    else:
+        section, key = text.split("=")[0].split(".")
+        assert getattr(getattr(config, section), key) == expected
+
+
+def test_object_set_may_be_a_folder(tmp_path):
+    config = load_config(None, [f"evaluate.object_sets=box,{tmp_path}"])
+    assert config.evaluate.object_sets == ("box", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("evaluate.roundz=5", ["evaluate.roundz", "unknown", "did you mean evaluate.rounds?"]),
+        ("evalute.rounds=5", ["did you mean evaluate.rounds?"]),
+        ("rounds=5", ["did you mean evaluate.rounds?"]),
+        ("lift_height=1", ["execution.lift_height or env.lift_height"]),
+        ("round=5", ["did you mean evaluate.rounds?"]),
+        ("zzz=5", ["zzz", "allowed here: seed, cache_dir, sim"]),
+        ("sim.zzz=5", ["sim.zzz", "frequency, solver_iterations, renderer"]),
+        ("seed.x=5", ["seed.x", "unknown"]),
+        ("evaluate.rounds=0", ["evaluate.rounds", "got 0", "command line", "whole number >= 1"]),
+        ("evaluate.rounds=ten", ["got 'ten'", "whole number"]),
+        ("evaluate.rounds=1.5", ["got 1.5", "whole number"]),
+        ("evaluate.rounds=true", ["got true", "whole number"]),
+        ("evaluate.rounds=null", ["got null", "whole number"]),
+        ("robot.velocity_scale=1.5", ["got 1.5", "a number > 0 and <= 1"]),
+        ("robot.grip_force=yes", ["got true", "a number > 0"]),
+        ("robot.grip_force=.nan", ["got nan", "a number > 0"]),
+        ("robot.home=[1,2]", ["robot.home", "a list of 7 numbers"]),
+        ("camera.position=[0,a,1]", ["camera.position[1]", "got 'a'", "a list of 3 numbers"]),
+        ("camera.mount=overhed", ["one of overhead, wrist", "did you mean overhead?"]),
+        ("camera.near=5", ["camera: near (5.0) must be smaller than far (2.0)", "command line"]),
+        ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),
+        ("evaluate.scenarios=pil", ["scenarios[0]", "isolated, packed, pile", "mean pile?"]),
+        ("evaluate.scenarios=[]", ["evaluate.scenarios", "got []"]),
+        ("evaluate.scenarios=pile,pile", ["repeated"]),
+        ("evaluate.object_sets=random_urdf", ["existing folder", "did you mean random_urdfs?"]),
+        ("env.objects=bx", ["env.objects", "got 'bx'", "did you mean box?"]),
+        ("objects.scale=-1", ["got -1", "a number > 0, or null"]),
+        ("evaluate.rounds", ["KEY=VALUE", "did you mean evaluate.rounds?"]),
+        ("=5", ["KEY=VALUE"]),
+        ("camera.position=[0,", ["camera.position", "YAML", "a list of 3 numbers"]),
+        ("camera.position=0,]", ["camera.position", "YAML"]),
+    ],
+)
+def test_bad_override(override, parts):
+    text = message(override)
+    for part in parts:
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ("evaluate: [1\n", ["not valid YAML", "line 2"]),
+        ("- 1\n- 2\n", ["got a list", "'key: value'"]),
+        ("just text\n", ["got a str"]),
+        ("sede: 1\n", ["sede: unknown key", "did you mean seed?"]),
+        ("camera:\n  wdith: 3\n", ["camera.wdith", "did you mean camera.width?"]),
+        ("camera:\n", ["camera: got null", "a section with the keys"]),
+        ("seed: 1\nseed: 2\n", ["stands twice", "line 2"]),
+        ("1: 2\n", ["text"]),
+        ("seed: -1\n", ["seed: got -1", ">= 0"]),
+        ("seed: '1'\n", ["seed: got '1'"]),
+        ("seed: -1\nscene:\n  count: 0\n", ["1 more problem"]),
+    ],
+)
+def test_bad_file(tmp_path, content, parts):
+    path = write(tmp_path, content)
+    text = message(path=path)
+    for part in [str(path), *parts]:
+        assert part in text
+
+
+def test_missing_file_names_a_near_one(tmp_path):
+    write(tmp_path, "", "wrist.yaml")
+    assert "did you mean wrist.yaml?" in message(path=tmp_path / "wirst.yaml")
+    assert "check the path" in message(path=tmp_path / "no" / "such.yaml")
+
+
+def test_unreadable_files(tmp_path):
+    assert "cannot read" in message(path=tmp_path)
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\xfa")
+    assert "cannot read" in message(path=binary)
+
+
+def test_every_leaf_explains_a_wrong_type():
+    for key in _known_keys():
+        if "properties" not in _schema_at(key):
+            text = message(f"{key}={{a: 1}}")
+            assert text.startswith(key) and "expected" in text
+
+
+def test_dump_round_trip(tmp_path):
+    config = load_config(None, ["evaluate.name=夹", f"cache_dir={tmp_path}", "objects.fit=0.06"])
+    assert load_config(write(tmp_path, dump_config(config))) == config
+
+
+def test_changed_keys_repeat_a_run():
+    given = ["evaluate.name=007", "scene.count=2", "camera.up=0,1,0", "evaluate.policies=oracle"]
+    config = load_config(None, [*given, "objects.scale=1e-7"])
+    changes = changed_keys(config)
+    assert len(changes) == 5 and "scene.count=2" in changes
+    assert load_config(None, changes) == config
+    assert changed_keys(load_config()) == []
+
+
+def test_cache_folder(monkeypatch, tmp_path):
+    monkeypatch.delenv("ROBOT_GRASPING_CACHE", raising=False)
+    assert load_config(None).cache_folder == Path.home() / ".cache" / "robot_grasping"
+    monkeypatch.setenv("ROBOT_GRASPING_CACHE", str(tmp_path / "env"))
+    assert load_config(None).cache_folder == tmp_path / "env"
+    assert load_config(None, ["cache_dir=~/x"]).cache_folder == Path.home() / "x"
+
+
+def test_parse_args(tmp_path):
+    path = write(tmp_path, "seed: 3\n")
+    config, options = parse_args(
+        ["scene.count=2", "--config", str(path), "evaluate.rounds=4", "--results", "r.json"],
+        "a script",
+        lambda parser: parser.add_argument("--results", type=Path),
+    )
+    assert (config.seed, config.scene.count, config.evaluate.rounds) == (3, 2, 4)
+    assert options.results == Path("r.json") and options.resume is None
+
+
+def test_resume_takes_the_run_s_config(tmp_path):
+    write(tmp_path, "seed: 9\n", "config.yaml")
+    config, options = parse_args(["--resume", str(tmp_path), "evaluate.rounds=4"], "a script")
+    assert (config.seed, config.evaluate.rounds, options.resume) == (9, 4, tmp_path)
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        parse_args(["--resume", str(tmp_path / "none")], "a script")
+
+
+def test_run_script(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "evaluate.roundz=3"])
+
+    def status(main) -> int:
+        with pytest.raises(SystemExit) as caught:
+            run_script(main)
+        return caught.value.code
+
+    assert status(lambda argv: parse_args(argv, "x") and None) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: evaluate.roundz") and error.count("\n") == 1
+
+    def other(argv):
+        raise UserError("two\nlines")
+
+    assert status(other) == 2
+    assert capsys.readouterr().err == "error: two lines\n"
+    assert status(lambda argv: None) == 0
+    assert status(lambda argv: 3) == 3
+
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    assert status(interrupted) == 130
+    with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
+        run_script(lambda argv: 1 / 0)
+
+
+def test_unknown_choice():
+    error = unknown_choice("evaluate.policies", "heuristc", ["random", "heuristic"])
+    assert str(error) == (
+        "evaluate.policies: got 'heuristc', expected one of heuristic, random; "
+        "did you mean heuristic?"
+    )

@@ -1,0 +1,92 @@
+"""Intervals against published tables, SciPy, and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from utils.statistics import paired_difference_interval, wilson_interval
+
+
+@pytest.mark.parametrize(
+    ("successes", "n", "low", "high"),
+    [  # Newcombe, Statistics in Medicine 17 (1998), table I, method 3 (score, no correction)
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_wilson_published(successes, n, low, high):
+    assert wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+@pytest.mark.parametrize(("successes", "n"), [(0, 1), (1, 1), (3, 7), (50, 100), (999, 1000)])
+def test_wilson_is_scipy_s(successes, n, confidence):
+    interval = binomtest(successes, n).proportion_ci(confidence, method="wilson")
+    expected = (interval.low, interval.high)
+    assert wilson_interval(successes, n, confidence) == pytest.approx(expected, abs=1e-12)
+
+
+def test_wilson_edges():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+    assert wilson_interval(0, 9)[0] == 0.0 and wilson_interval(9, 9)[1] == 1.0
+    for bad in [(-1, 3), (4, 3), (1, 0)]:
+        with pytest.raises(ValueError, match="successes"):
+            wilson_interval(*bad)
+    with pytest.raises(ValueError, match="confidence"):
+        wilson_interval(1, 2, 1.0)
+
+
+def test_paired_binary_approaches_the_normal_interval():
+    # 400 pairs: 80 times only a succeeds, 40 times only b. The difference is 0.1 and its standard
+    # error sqrt((80 + 40 - 40^2 / 400) / 400^2) = sqrt(116) / 400 = 0.026926 (closed form).
+    a = np.repeat([1, 1, 0, 0], [200, 80, 40, 80])
+    b = np.repeat([1, 0, 1, 0], [200, 80, 40, 80])
+    result = paired_difference_interval(a, b)
+    assert result.value == pytest.approx(0.1)
+    assert result.low == pytest.approx(0.1 - 1.96 * 0.026926, abs=0.004)
+    assert result.high == pytest.approx(0.1 + 1.96 * 0.026926, abs=0.004)
+    assert result.rounds == 400
+
+
+def test_paired_ratio_of_sums_by_hand():
+    # a: 1/1 and 1/3 give 2/4, not the mean of rates 2/3; b: 1/2 and 0/2 give 1/4.
+    a, b = [(1, 1), (1, 3)], [(1, 2), (0, 2)]
+    result = paired_difference_interval(a, b)
+    assert result.value == pytest.approx(2 / 4 - 1 / 4)
+    # Only three resamples exist: twice the first (1 - 1/2), twice the second (1/3 - 0), both.
+    assert result.low == pytest.approx(0.25)
+    assert result.high == pytest.approx(0.5)
+
+
+def test_pairing_cancels_the_scene():
+    # The same outcomes for both: no difference in any resample, however hard the scenes vary.
+    a = np.random.default_rng(1).integers(0, 2, 50)
+    result = paired_difference_interval(a, a)
+    assert (result.value, result.low, result.high) == (0.0, 0.0, 0.0)
+    unpaired = paired_difference_interval(a, np.roll(a, 1))
+    assert unpaired.high - unpaired.low > 0.2
+
+
+def test_paired_is_seeded_and_antisymmetric():
+    a, b = [(1, 2), (2, 2), (0, 1), (3, 4)], [(0, 1), (2, 3), (1, 1), (1, 1)]
+    assert paired_difference_interval(a, b) == paired_difference_interval(a, b)
+    forward, back = paired_difference_interval(a, b), paired_difference_interval(b, a)
+    assert (forward.low, forward.high) == pytest.approx((-back.high, -back.low))
+
+
+def test_paired_undefined_and_bad_input():
+    assert paired_difference_interval(np.zeros((0, 2)), np.zeros((0, 2))) is None
+    assert paired_difference_interval([(0, 0)], [(1, 1)]) is None
+    with pytest.raises(ValueError, match="rounds"):
+        paired_difference_interval([1, 0], [1])
+    with pytest.raises(ValueError, match="more successes"):
+        paired_difference_interval([(2, 1)], [(1, 1)])
+    with pytest.raises(ValueError, match="shape"):
+        paired_difference_interval(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_resamples_without_an_attempt_are_left_out():
+    result = paired_difference_interval([(0, 0), (1, 1)], [(0, 1), (1, 1)])
+    assert np.isfinite([result.low, result.high]).all()

@@ -1,0 +1,1 @@
+"""Shared tools that know neither the simulated cell (`envs`) nor the networks (`models`)."""

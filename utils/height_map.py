@@ -1,0 +1,186 @@
+"""Orthographic height maps in the world frame, from a depth image or from the true geometry.
+
+A height map answers "how high is the scene above (x, y)?", which is all that a straight descent
+has to know. This module knows no simulator and no network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from utils.geometry import SceneGeometry, Workspace, intersect_lines
+from utils.transforms import RGBDFrame
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Heights over a square grid; cell [row, col] is centred at origin + cell * (col, row) in W.
+
+    height: (R, C) metres in W, the highest surface known in the cell; hidden cells hold the lowest
+        height nearby, as if nothing were there.
+    ceiling: (R, C) metres in W, the highest that hidden matter could reach; equals `height` where
+        the cell was seen.
+    label: (R, C) int, which object the cell belongs to; -1 for the table.
+    centres: (M, 3) each label's centre of mass in W, or an estimate of it.
+    """
+
+    height: np.ndarray
+    ceiling: np.ndarray
+    label: np.ndarray
+    centres: np.ndarray
+    origin: np.ndarray
+    cell: float
+    table_height: float
+
+    def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column (...) of the cells that hold points (..., 2); outside, the nearest cell."""
+        col, row = np.moveaxis(np.rint((xy - self.origin) / self.cell).astype(np.intp), -1, 0)
+        rows, cols = self.height.shape
+        return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+
+
+def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (R, C, 2) of the cells over the workspace widened by `margin`, and the first one."""
+    half = workspace.size / 2 + margin
+    count = int(np.floor(2 * half / cell)) + 1
+    steps = (np.arange(count) - (count - 1) / 2) * cell
+    x, y = np.meshgrid(workspace.centre[0] + steps, workspace.centre[1] + steps)
+    points = np.stack([x, y], axis=-1)
+    return points, points[0, 0]
+
+
+def height_map_from_frame(
+    frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = 0.08
+) -> HeightMap:
+    """Height map of what a depth image shows; uses nothing of the frame but depth, K and T_WC.
+
+    Labels are the pieces between height discontinuities; their centres are volume centroids of the
+    columns between the table and the visible surface.
+    """
+    grid, origin = grid_points(workspace, margin, cell)
+    seen = _splat(_surface_points(frame), grid.shape[:2], origin, cell)
+    hidden = ~np.isfinite(seen)
+    table = workspace.table_height
+    # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
+    lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
+    height = np.maximum(np.where(hidden, np.where(np.isfinite(lowest), lowest, table), seen), table)
+    # The rays that graze an edge bound what may stand in its shadow.
+    ceiling = _splat(_grazing_points(frame, cell), grid.shape[:2], origin, cell)
+    ceiling = np.where(hidden, np.maximum(ceiling, height), height)
+    height, ceiling = height.astype(np.float32), ceiling.astype(np.float32)
+    label = label_pieces(height, table, cell)
+    centres = _column_centroids(height - table, label, grid, table)
+    return HeightMap(height, ceiling, label, centres, origin, cell, table)
+
+
+def height_map_from_scene(
+    scene: SceneGeometry, workspace: Workspace, cell: float = 0.0015, margin: float = 0.08
+) -> HeightMap:
+    """Exact height map: vertical lines through the cells' centres against every convex solid."""
+    grid, origin = grid_points(workspace, margin, cell)
+    height = np.full(grid.shape[:2], scene.table_height)
+    label = np.full(grid.shape[:2], -1)
+    for number, thing in enumerate(scene.objects):
+        for solid in thing.solids:
+            low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
+            high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
+            low, high = np.maximum(low, 0), np.maximum(high, 0)
+            window = np.s_[low[1] : high[1], low[0] : high[0]]
+            base = grid[window]
+            if base.size == 0:
+                continue
+            origins = np.concatenate([base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1)
+            top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
+            label[window] = np.where(top > height[window], number, label[window])
+            height[window] = np.maximum(top, height[window])
+    height = height.astype(np.float32)
+    centres = np.array([thing.centre_of_mass for thing in scene.objects]).reshape(-1, 3)
+    return HeightMap(height, height, label, centres, origin, cell, scene.table_height)
+
+
+def label_pieces(
+    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = 0.004
+) -> np.ndarray:
+    """(R, C) labels of the pieces that rise over `floor`, cut where neighbours differ by `step`.
+
+    Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece.
+    """
+    above = height > table + floor
+    flat = np.arange(height.size).reshape(height.shape)
+    links = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        joined = above[a] & above[b] & (np.abs(height[a] - height[b]) < step)
+        links.append(np.stack([flat[a][joined], flat[b][joined]]))
+    i, j = np.concatenate(links, axis=1)
+    graph = coo_matrix((np.ones(len(i), bool), (i, j)), shape=(height.size,) * 2)
+    raw = connected_components(graph, directed=False)[1].reshape(height.shape)
+    size = np.bincount(raw[above], minlength=raw.max() + 1)
+    large = above & (size[raw] * cell**2 > 0.6e-4)
+    label = np.full(height.shape, -1)
+    if not large.any():
+        return label
+    label[large] = np.unique(raw[large], return_inverse=True)[1]
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~large).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner = np.zeros(nearest.max() + 1, dtype=int)
+    owner[nearest[large]] = label[large]
+    return np.where(above, owner[nearest], -1)
+
+
+def _column_centroids(rise: np.ndarray, label: np.ndarray, grid: np.ndarray, table: float) -> np.ndarray:
+    """(M, 3) centroids of the columns under each labelled piece."""
+    count = label.max() + 1
+    on = label >= 0
+    weight = np.bincount(label[on], rise[on], count)
+    x, y = (np.bincount(label[on], rise[on] * grid[on][:, k], count) / weight for k in (0, 1))
+    z = np.bincount(label[on], rise[on] ** 2, count) / (2 * weight)
+    return np.column_stack([x, y, table + z])
+
+
+def _splat(points: np.ndarray, shape: tuple[int, int], origin: np.ndarray, cell: float) -> np.ndarray:
+    """(R, C) highest z of the points (N, 3) in each cell; -inf where there is none."""
+    col, row = np.rint((points[:, :2] - origin) / cell).astype(int).T
+    inside = (row >= 0) & (row < shape[0]) & (col >= 0) & (col < shape[1])
+    height = np.full(shape, -np.inf)
+    np.maximum.at(height.reshape(-1), row[inside] * shape[1] + col[inside], points[inside, 2])
+    return height
+
+
+def _rays(frame: RGBDFrame, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(..., 3) directions in W of pixels' rays, scaled to unit depth."""
+    K = frame.K
+    ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    return ray @ frame.T_WC[:3, :3].T
+
+
+def _surface_points(frame: RGBDFrame, split: int = 2) -> np.ndarray:
+    """(N, 3) points in W: each pixel with a depth stands for split x split points of its square.
+
+    A pixel covers about 2 mm of the table: single points would leave gaps in a 2 mm grid.
+    """
+    depth = frame.depth.astype(float)
+    sub = (np.arange(split) + 0.5) / split - 0.5
+    v, u, dv, du = np.meshgrid(np.arange(depth.shape[0]), np.arange(depth.shape[1]), sub, sub, indexing="ij")
+    points = _rays(frame, u + du, v + dv) * depth[:, :, None, None, None] + frame.T_WC[:3, 3]
+    return points[depth > 0].reshape(-1, 3)
+
+
+def _grazing_points(frame: RGBDFrame, cell: float, jump: float = 0.006) -> np.ndarray:
+    """(N, 3) points in W on the rays between neighbouring pixels whose depths differ by a jump."""
+    points = frame.points()
+    found = [np.empty((0, 3))]
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        edge = np.abs(frame.depth[a] - frame.depth[b]) > jump
+        edge &= (frame.depth[a] > 0) & (frame.depth[b] > 0)
+        near, far = points[a][edge], points[b][edge]
+        if len(near):
+            span = np.linalg.norm((far - near)[:, :2], axis=1).max()
+            share = np.linspace(0, 1, int(np.clip(2 * span / cell, 2, 60)))[:, None, None]
+            found.append((near + share * (far - near)).reshape(-1, 3))
+    return np.concatenate(found)

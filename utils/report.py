@@ -1,0 +1,184 @@
+"""report.html: one self-contained page that shows how an evaluation went.
+
+Figures come from `utils.results`, the layout from report.html.j2 next to this file; here they are
+only brought together. The page loads nothing from anywhere: images and videos are inside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from utils.config import Config, changed_keys, dump_config
+from utils.errors import UserError
+from utils.files import write_atomic
+from utils.results import (
+    FAILURES,
+    SUCCESS,
+    Comparison,
+    RoundRecord,
+    Row,
+    compare,
+    failures_in_words,
+    interruption,
+)
+from utils.runs import git_state
+from utils.statistics import Difference
+
+VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
+FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
+
+
+@dataclass(frozen=True)
+class GalleryItem:
+    """A frame with its grasp already drawn on it: (H, W, 3) uint8 RGB."""
+
+    image: np.ndarray
+    caption: str
+    success: bool
+
+
+def write_report(
+    path: Path,
+    rows: Sequence[Row],
+    rounds: Sequence[RoundRecord],
+    config: Config,
+    gallery: Sequence[GalleryItem] = (),
+    videos: Sequence[tuple[Path, str]] = (),
+    device: str = "",
+) -> None:
+    """Write the page to `path`; videos are (gif, mp4 or webm file, caption).
+
+    Raises UserError on a video file that is missing or of another type.
+    """
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters |= {"percent": _percent, "number": _number}
+    git = git_state()
+    page = templates.get_template("report.html.j2").render(
+        groups=_groups(rows),
+        policies=_in_order(row.policy for row in rows),
+        comparisons=[_compared(c) for c in compare(rounds, config.seed)],
+        few_rounds=FEW_ROUNDS,
+        labels={SUCCESS: "success", **FAILURES},
+        failures_in_words=failures_in_words,
+        rows=rows,
+        totals={
+            "rounds": len(rounds),
+            "grasps": sum(row.attempts for row in rows),
+        },
+        interruption=interruption(len(rounds), config),
+        gallery=[(_png(item.image), item.caption, item.success) for item in gallery],
+        videos=[(*_video(Path(file)), caption) for file, caption in videos],
+        command=shlex.join(["python", "evaluate.py", *changed_keys(config)]),
+        seed=config.seed,
+        commit=git.commit,
+        dirty=git.dirty,
+        device=device,
+        config=dump_config(config),
+        date=datetime.now().strftime("%Y-%m-%d %H:%M"),
+    )
+    write_atomic(path, page)
+
+
+def _in_order(names) -> list[str]:
+    return list(dict.fromkeys(names))
+
+
+def _groups(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The rows by (scenario, objects), each with its best row and its stacked outcomes."""
+    cells: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        cells.setdefault((row.scenario, row.objects), []).append(row)
+    return [
+        {
+            "scenario": scenario,
+            "objects": Path(objects).name or objects,  # a folder by its last part
+            "rows": cell,
+            "best": max(cell, key=lambda row: -1 if row.success_rate is None else row.success_rate),
+            "outcomes": [(row, _outcomes(row)) for row in cell],
+        }
+        for (scenario, objects), cell in cells.items()
+    ]
+
+
+def _outcomes(row: Row) -> list[dict[str, Any]]:
+    """Segments of a bar that holds every call of the planner: successes, then failures."""
+    counts = {SUCCESS: row.successes, **row.failures}
+    calls = sum(counts.values())
+    segments, start = [], 0
+    for reason, count in counts.items():
+        if count:
+            share = {"x": 100 * start / calls, "width": 100 * count / calls}
+            segments.append({"reason": reason, "count": count, **share})
+            start += count
+    return segments
+
+
+def _compared(comparison: Comparison) -> dict[str, Any]:
+    return {
+        "pair": comparison,
+        "objects": Path(comparison.objects).name or comparison.objects,
+        "measures": [
+            (name, difference, _verdict(difference))
+            for name, difference in (
+                ("success", comparison.success),
+                ("cleared", comparison.cleared),
+            )
+        ],
+    }
+
+
+def _verdict(difference: Difference | None) -> str:
+    """A word for a difference: only an interval that leaves out zero decides."""
+    if difference is None:
+        return "undefined"
+    if difference.rounds < FEW_ROUNDS:
+        return "few rounds"
+    if difference.low > 0:
+        return "better"
+    return "worse" if difference.high < 0 else "undecided"
+
+
+def _png(image: np.ndarray) -> str:
+    return _data_url(iio.imwrite("<bytes>", image, extension=".png"), "image/png")
+
+
+def _video(path: Path) -> tuple[str, bool]:
+    """The file as a data URL, and whether it is an image (a GIF) to the browser."""
+    kind = VIDEO_TYPES.get(path.suffix.lower())
+    if kind is None:
+        raise UserError(f"{path}: not a video for the report, expected {', '.join(VIDEO_TYPES)}")
+    try:
+        return _data_url(path.read_bytes(), kind), kind.startswith("image/")
+    except OSError as error:
+        raise UserError(f"{path}: cannot read this video: {error.strerror}") from error
+
+
+def _data_url(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _percent(rate: float | None, sign: bool = False) -> str:
+    """A rate as whole percent; a true minus, because a hyphen is hard to see."""
+    if rate is None:
+        return "–"
+    return f"{100 * rate:{'+' if sign else ''}.0f}".replace("-", "−")
+
+
+def _number(value: float | None, digits: int = 0) -> str:
+    return "–" if value is None else f"{value:,.{digits}f}"

@@ -1,0 +1,354 @@
+"""What an evaluation records, and the figures that are drawn from the records.
+
+Records come from the cell (`envs.execution` judges, `evaluate.py` collects); this module only
+counts. Success rate and cleared rate are VGN's (Breyer et al., CoRL 2020): successes / executed
+grasps, and objects removed / objects placed, both over all rounds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+
+from utils.config import Config
+from utils.errors import UserError
+from utils.files import write_atomic
+from utils.statistics import Difference, paired_difference_interval, wilson_interval
+from utils.transforms import ImageGrasp
+
+SCHEMA = 1  # version of results.json
+SUCCESS = "success"
+NO_PLAN = "no_plan"
+FAILURES = {  # reason: what a reader sees, in the order in which a grasp can fail
+    NO_PLAN: "no plan",
+    "ik": "IK",
+    "collision": "collision on approach",
+    "missed": "missed",
+    "slipped": "slipped",
+    "dropped": "dropped",
+}
+ENDINGS = {  # why a round ended
+    "cleared": "every object removed",
+    NO_PLAN: "the planner found no grasp",
+    "failures": "too many failures in a row",
+    "lost": "the objects that were left fell off the table",
+    "physics": "the simulation blew up",
+}
+
+
+@dataclass(frozen=True)
+class AttemptRecord:
+    """One call of a planner and, unless it found nothing, the grasp that was executed.
+
+    reason: "success" or a key of FAILURES; a "no_plan" is a failure but not an executed grasp.
+    plan_seconds: wall-clock time of the planner. sim_seconds: simulated time of the execution.
+    grasp: where it was on the image, for pictures.
+    """
+
+    success: bool
+    reason: str
+    plan_seconds: float
+    sim_seconds: float
+    grasp: ImageGrasp | None = None
+
+    def __post_init__(self) -> None:
+        if self.reason != SUCCESS and self.reason not in FAILURES:
+            raise ValueError(f"reason {self.reason!r} is not {SUCCESS} or in {list(FAILURES)}")
+        if self.success != (self.reason == SUCCESS):
+            raise ValueError(f"success={self.success} contradicts reason={self.reason!r}")
+
+    @property
+    def executed(self) -> bool:
+        return self.reason != NO_PLAN
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """One scene worked on by one policy until `ended` (a key of ENDINGS).
+
+    seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, seed).
+    A round that ended with "no_plan" has an attempt with that reason at its end.
+    """
+
+    policy: str
+    scenario: str
+    objects: str
+    seed: int
+    objects_total: int
+    objects_cleared: int
+    attempts: tuple[AttemptRecord, ...]
+    ended: str
+
+    def __post_init__(self) -> None:
+        if self.ended not in ENDINGS:
+            raise ValueError(f"ended {self.ended!r} is not one of {list(ENDINGS)}")
+        if not 0 <= self.objects_cleared <= self.objects_total:
+            raise ValueError(f"cleared {self.objects_cleared} of {self.objects_total} objects")
+        last = self.attempts[-1].reason if self.attempts else None
+        if (self.ended == NO_PLAN) != (last == NO_PLAN):
+            raise ValueError(f"a round that ended with {self.ended!r} has {last!r} at its end")
+
+    @property
+    def executed(self) -> int:
+        return sum(attempt.executed for attempt in self.attempts)
+
+    @property
+    def successes(self) -> int:
+        return sum(attempt.success for attempt in self.attempts)
+
+
+@dataclass(frozen=True)
+class Row:
+    """The figures of one policy on one scenario and object set. None: undefined.
+
+    attempts: executed grasps. Intervals: Wilson, 95 %, each attempt (object) taken as independent.
+    plan_ms_median: over every call of the planner, those that found nothing included.
+    sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
+    """
+
+    policy: str
+    scenario: str
+    objects: str
+    seed: int
+    rounds: int
+    attempts: int
+    successes: int
+    objects_total: int
+    objects_cleared: int
+    success_rate: float | None
+    success_ci95: tuple[float, float]
+    cleared_rate: float | None
+    cleared_ci95: tuple[float, float]
+    plan_ms_median: float | None
+    sim_seconds_per_pick: float | None
+    picks_per_hour: float | None
+    failures: dict[str, int]
+
+
+def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
+    """One row for each (policy, scenario, objects), in the order of their first round."""
+    groups: dict[tuple[str, str, str], list[RoundRecord]] = {}
+    for record in rounds:
+        groups.setdefault((record.policy, record.scenario, record.objects), []).append(record)
+    return [_row(key, records, seed) for key, records in groups.items()]
+
+
+def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) -> Row:
+    calls = [attempt for record in rounds for attempt in record.attempts]
+    attempts = sum(call.executed for call in calls)
+    successes = sum(call.success for call in calls)
+    total = sum(record.objects_total for record in rounds)
+    cleared = sum(record.objects_cleared for record in rounds)
+    reasons = Counter(call.reason for call in calls)
+    seconds = sum(call.sim_seconds for call in calls)
+    per_pick = seconds / successes if successes else None
+    return Row(
+        *key,
+        seed=seed,
+        rounds=len(rounds),
+        attempts=attempts,
+        successes=successes,
+        objects_total=total,
+        objects_cleared=cleared,
+        success_rate=successes / attempts if attempts else None,
+        success_ci95=wilson_interval(successes, attempts),
+        cleared_rate=cleared / total if total else None,
+        cleared_ci95=wilson_interval(cleared, total),
+        plan_ms_median=1000 * median(call.plan_seconds for call in calls) if calls else None,
+        sim_seconds_per_pick=per_pick,
+        picks_per_hour=3600 / per_pick if per_pick else None,
+        failures={reason: reasons[reason] for reason in FAILURES},
+    )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two policies on the rounds that both have worked on; a difference is first - second."""
+
+    first: str
+    second: str
+    scenario: str
+    objects: str
+    success: Difference | None
+    cleared: Difference | None
+
+
+def compare(rounds: Iterable[RoundRecord], seed: int) -> list[Comparison]:
+    """Every pair of policies, the later one first, on each scenario and object set they share."""
+    cells: dict[tuple[str, str], dict[str, dict[int, RoundRecord]]] = {}
+    for record in rounds:
+        policies = cells.setdefault((record.scenario, record.objects), {})
+        policies.setdefault(record.policy, {})[record.seed] = record
+    comparisons = []
+    for (scenario, objects), policies in cells.items():
+        names = list(policies)
+        for i, second in enumerate(names):
+            for first in names[i + 1 :]:
+                shared = [s for s in policies[first] if s in policies[second]]
+                a, b = ([policies[name][s] for s in shared] for name in (first, second))
+                success = _difference(a, b, "successes", "executed", seed)
+                cleared = _difference(a, b, "objects_cleared", "objects_total", seed)
+                comparisons.append(Comparison(first, second, scenario, objects, success, cleared))
+    return comparisons
+
+
+def _difference(
+    a: Sequence[RoundRecord], b: Sequence[RoundRecord], top: str, bottom: str, seed: int
+) -> Difference | None:
+    counts = [[(getattr(r, top), getattr(r, bottom)) for r in side] or [(0, 0)] for side in (a, b)]
+    return paired_difference_interval(*counts, seed=seed)
+
+
+def planned_rounds(config: Config) -> int:
+    """How many rounds the whole evaluation has."""
+    plan = config.evaluate
+    cells = len(plan.policies) * len(plan.scenarios) * len(plan.object_sets)
+    return plan.rounds * cells
+
+
+def interruption(rounds_done: int, config: Config) -> str | None:
+    """'interrupted: N of M rounds', or None for a complete evaluation."""
+    planned = planned_rounds(config)
+    return f"interrupted: {rounds_done} of {planned} rounds" if rounds_done < planned else None
+
+
+# --- The journal: one round a line, so that an interrupted evaluation can go on ----------------
+
+
+def append_round(path: Path, record: RoundRecord) -> None:
+    """Add a finished round to the journal."""
+    content = asdict(record)
+    for attempt in content["attempts"]:
+        if attempt["grasp"] is not None:
+            attempt["grasp"]["pixel"] = [float(x) for x in attempt["grasp"]["pixel"]]
+    with path.open("a", encoding="utf-8") as journal:
+        journal.write(json.dumps(content, allow_nan=False) + "\n")
+
+
+def read_rounds(path: Path) -> list[RoundRecord]:
+    """The rounds of a journal; an empty list where there is none yet.
+
+    A last line cut short by a crash is left out; any other line that is not a round raises
+    UserError.
+    """
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8").split("\n")
+    rounds = []
+    for number, line in enumerate(lines[:-1], start=1):  # what follows the last newline is cut
+        try:
+            content = json.loads(line)
+            attempts = tuple(
+                AttemptRecord(**(a | {"grasp": a["grasp"] and ImageGrasp(**a["grasp"])}))
+                for a in content.pop("attempts")
+            )
+            rounds.append(RoundRecord(**content, attempts=attempts))
+        except (ValueError, TypeError, KeyError) as error:
+            raise UserError(
+                f"{path}, line {number}: not a recorded round ({error}); delete the line or start "
+                "a new run without --resume"
+            ) from error
+    return rounds
+
+
+# --- Writing --------------------------------------------------------------------------------
+
+
+def write_results(
+    path: Path,
+    rows: Sequence[Row],
+    config: Config,
+    commit: str | None,
+    device: str,
+    complete: bool,
+) -> None:
+    """results.json: strict JSON (ValueError on a NaN), written whole or not at all."""
+    content = {
+        "schema": SCHEMA,
+        "complete": complete,
+        "commit": commit,
+        "config": config.model_dump(mode="json"),
+        "device": device,
+        "rows": [asdict(row) for row in rows],
+    }
+    write_json_atomic(path, content)
+
+
+def write_json_atomic(path: Path, content: Mapping) -> None:
+    """Indented strict JSON; raises ValueError on NaN or infinity before touching the file."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    write_atomic(path, text + "\n")
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """A spreadsheet of the rows: intervals as two columns, failures as one column a reason."""
+    flat = [_flat(row) for row in rows]
+    text = io.StringIO(newline="")
+    if flat:
+        writer = csv.DictWriter(text, flat[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+    write_atomic(path, text.getvalue())
+
+
+def _flat(row: Row) -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for name, value in asdict(row).items():
+        if name.endswith("_ci95"):
+            flat[f"{name}_low"], flat[f"{name}_high"] = value
+        elif name == "failures":
+            flat |= {f"failures_{reason}": count for reason, count in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def print_table(rows: Sequence[Row]) -> None:
+    """The rows as aligned text on stdout."""
+    print(format_table(rows))
+
+
+def format_table(rows: Sequence[Row]) -> str:
+    """The rows as aligned plain text."""
+    header = ("policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed")
+    lines = [header, *(_cells(row) for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    lines.insert(1, tuple("-" * width for width in widths))
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if i in (5, 6) else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    def share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
+        if rate is None:
+            return "-"
+        low, high = interval
+        return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
+
+    return (
+        row.policy,
+        row.scenario,
+        row.objects,
+        share(row.success_rate, row.success_ci95, row.successes, row.attempts),
+        share(row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total),
+        "-" if row.plan_ms_median is None else f"{row.plan_ms_median:.1f}",
+        "-" if row.picks_per_hour is None else f"{row.picks_per_hour:.0f}",
+        failures_in_words(row),
+    )
+
+
+def failures_in_words(row: Row) -> str:
+    """'3 missed, 1 slipped', most frequent first; 'none' without a failure."""
+    counts = sorted(row.failures.items(), key=lambda item: -item[1])
+    return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"

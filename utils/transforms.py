@@ -1,0 +1,216 @@
+"""Frames, poses and grasps: the conventions that every other module relies on.
+
+Frames: W world (robot base, z up, x away from the robot), C camera optical frame (x right,
+y down, z forward), E point between the fingertips (z along the approach, y along the closing
+line). `T_AB` is the 4x4 matrix that takes a point in B to A. Quaternions are (x, y, z, w).
+Lengths are metres, angles radians. Pixels are (u, v) = (column, row); integer coordinates lie
+at pixel centres.
+
+This module knows no simulator and no network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A planar (top-down) grasp in the world frame.
+
+    position: (3,) centre of the fingertips at the moment of closing, metres in W.
+    angle: direction of the closing line about +z from the x axis, radians, modulo pi.
+    width: opening between the fingertips before closing, metres.
+    quality: the planner's own score; higher is better. Only comparable within one planner.
+    """
+
+    position: np.ndarray
+    angle: float
+    width: float
+    quality: float
+
+    def __post_init__(self) -> None:
+        position = np.asarray(self.position, dtype=float)
+        if position.shape != (3,):
+            raise ValueError(f"Grasp.position must have shape (3,), got {position.shape}")
+        numbers = np.append(position, (self.angle, self.width, self.quality))
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"Grasp holds a non-finite number: {self!r}")
+        if self.width < 0:
+            raise ValueError(f"Grasp.width must not be negative, got {self.width}")
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "angle", wrap_to_pi_range(self.angle))
+
+    @property
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along which the fingers close."""
+        return np.array([np.cos(self.angle), np.sin(self.angle), 0.0])
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) T_WE of the gripper at the moment of closing: z down, y along the closing line."""
+        return top_down_pose(self.position, self.angle)
+
+
+@dataclass(frozen=True)
+class ImageGrasp:
+    """A planar grasp on an image.
+
+    pixel: (2,) centre (u, v), may be fractional.
+    angle: direction of the closing line in the image, from +u (right) towards +v (down),
+        radians, modulo pi.
+    depth: distance of the fingertips' centre along the optical axis, metres.
+    width: opening between the fingertips, metres (not pixels).
+    """
+
+    pixel: np.ndarray
+    angle: float
+    depth: float
+    width: float
+    quality: float
+
+
+@dataclass(frozen=True)
+class RGBDFrame:
+    """What a camera saw, with everything needed to turn a pixel into a point.
+
+    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; 0 means unknown.
+    K: (3, 3) pinhole matrix in pixels. T_WC: (4, 4) camera pose in the world.
+    segmentation: (H, W) int32, the index of the object seen at each pixel in scene order, -1 for
+        table and background, -2 for the robot; or None. Labels and pictures use it; planners that
+        claim to see only the depth image must not.
+    truth: the scene's true geometry, given only to privileged planners; otherwise None.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    K: np.ndarray
+    T_WC: np.ndarray
+    segmentation: np.ndarray | None = None
+    truth: "SceneGeometry | None" = None  # noqa: F821  (utils.geometry, not needed at run time)
+
+    def points(self) -> np.ndarray:
+        """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
+        height, width = self.depth.shape
+        v, u = np.mgrid[0:height, 0:width]
+        depth = np.where(self.depth > 0, self.depth, np.nan).astype(float)
+        return deproject(np.stack([u, v], axis=-1), depth, self.K, self.T_WC)
+
+    def without_truth(self) -> "RGBDFrame":
+        """The same frame as an unprivileged planner may see it."""
+        return replace(self, segmentation=None, truth=None)
+
+
+def wrap_to_pi_range(angle: float) -> float:
+    """The representative of an undirected line's angle in [0, pi)."""
+    wrapped = float(np.mod(angle, np.pi))
+    return 0.0 if wrapped >= np.pi else wrapped
+
+
+def angle_difference(a, b):
+    """Smallest difference of two undirected lines' angles, in [0, pi/2]. Accepts arrays."""
+    difference = np.mod(np.asarray(a) - np.asarray(b), np.pi)
+    return np.minimum(difference, np.pi - difference)
+
+
+def pose_matrix(position, quaternion) -> np.ndarray:
+    """(4, 4) transform from a position (3,) and a quaternion (x, y, z, w)."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+def position_quaternion(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and quaternion (x, y, z, w) of a (4, 4) transform."""
+    return T[:3, 3].copy(), Rotation.from_matrix(T[:3, :3]).as_quat()
+
+
+def inverse_pose(T: np.ndarray) -> np.ndarray:
+    """Inverse of a rigid (4, 4) transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Apply a (4, 4) transform to points (..., 3)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def top_down_pose(position, angle: float) -> np.ndarray:
+    """(4, 4) T_WE of a gripper pointing straight down whose fingers close along `angle`."""
+    c, s = np.cos(angle), np.sin(angle)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[-s, c, 0.0], [c, s, 0.0], [0.0, 0.0, -1.0]])
+    T[:3, 3] = position
+    return T
+
+
+def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """(4, 4) T_WC of a camera at `eye` whose optical axis passes through `target`.
+
+    `up` is the world direction that points up in the image; it may not be parallel to the view.
+    """
+    eye, target, up = (np.asarray(x, dtype=float) for x in (eye, target, up))
+    forward = target - eye
+    distance = np.linalg.norm(forward)
+    if distance < 1e-9:
+        raise ValueError("look_at: eye and target are the same point")
+    forward = forward / distance
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(up), 1e-12):
+        raise ValueError("look_at: `up` is parallel to the line of sight")
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye
+    return T
+
+
+def deproject(pixels, depth, K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
+    """Points in W (..., 3) of pixels (..., 2) at depths (...) along the optical axis."""
+    pixels, depth = np.asarray(pixels, dtype=float), np.asarray(depth, dtype=float)
+    x = (pixels[..., 0] - K[0, 2]) / K[0, 0] * depth
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1] * depth
+    return transform_points(T_WC, np.stack([x, y, depth], axis=-1))
+
+
+def project(points, K: np.ndarray, T_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (..., 2) and depths (...) of points in W (..., 3). Pixels behind the camera are NaN."""
+    in_camera = transform_points(inverse_pose(T_WC), np.asarray(points, dtype=float))
+    depth = in_camera[..., 2]
+    safe = np.where(depth > 1e-9, depth, np.nan)
+    u = K[0, 0] * in_camera[..., 0] / safe + K[0, 2]
+    v = K[1, 1] * in_camera[..., 1] / safe + K[1, 2]
+    return np.stack([u, v], axis=-1), depth
+
+
+def grasp_to_image(grasp: Grasp, K: np.ndarray, T_WC: np.ndarray) -> ImageGrasp:
+    """A world grasp as it appears in the image. Inverse of `image_to_grasp`.
+
+    The image angle is that of the closing line's projection at the grasp's centre.
+    """
+    pixel, depth = project(grasp.position, K, T_WC)
+    direction = inverse_pose(T_WC)[:3, :3] @ grasp.closing_direction
+    x, y = (pixel - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1])
+    # Derivative of the projection along the closing line (up to the positive factor 1 / depth).
+    du = K[0, 0] * (direction[0] - x * direction[2])
+    dv = K[1, 1] * (direction[1] - y * direction[2])
+    angle = wrap_to_pi_range(np.arctan2(dv, du))
+    return ImageGrasp(pixel, angle, float(depth), grasp.width, grasp.quality)
+
+
+def image_to_grasp(grasp: ImageGrasp, K: np.ndarray, T_WC: np.ndarray) -> Grasp:
+    """The top-down world grasp whose closing line projects to the image grasp's line."""
+    position = deproject(grasp.pixel, grasp.depth, K, T_WC)
+    # The plane through the optical centre and the image line, cut with the horizontal plane.
+    centre = np.array([*((grasp.pixel - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1])), 1.0])
+    along = np.array([np.cos(grasp.angle) / K[0, 0], np.sin(grasp.angle) / K[1, 1], 0.0])
+    normal = T_WC[:3, :3] @ np.cross(centre, along)
+    closing = np.cross(normal, (0.0, 0.0, 1.0))
+    return Grasp(position, np.arctan2(closing[1], closing[0]), grasp.width, grasp.quality)
