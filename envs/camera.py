@@ -101,7 +101,7 @@ def render(
     bodies = np.asarray(bodies, dtype=np.int32).reshape(height, width)
     near, far = intrinsics.near, intrinsics.far
     depth = near * far / (far - (far - near) * z_buffer)
-    depth[z_buffer >= 1.0] = 0.0
+    depth[depth >= far * (1 - 1e-5)] = 0.0  # the cleared z-buffer, not quite 1 in single precision
     return Image(np.ascontiguousarray(rgba[:, :, :3]), depth, bodies)
 
 

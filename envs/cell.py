@@ -71,11 +71,12 @@ class Cell:
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
+        client, on_step = self.client, self.on_step
         for _ in range(count):
-            pybullet.stepSimulation(physicsClientId=self.client)
+            pybullet.stepSimulation(physicsClientId=client)
             self.steps += 1
-            if self.on_step is not None:
-                self.on_step(self)
+            if on_step is not None:
+                on_step(self)
 
     @property
     def seconds(self) -> float:

@@ -27,7 +27,7 @@ from envs.panda import (
     JOINT_VELOCITY,
     MAX_OPENING,
     TIP,
-    differential_ik,
+    ServoStep,
     forward_kinematics,
 )
 from envs.scenes import make_scene
@@ -256,19 +256,19 @@ class RobotGraspingEnv(gymnasium.Env):
             goal = q + settings.joint_step * action[:7]
             goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
         else:
-            self._move_command_pose(action)
-            goal = differential_ik(q, self._T_command, iterations=1)
+            servo = ServoStep(q)
+            self._move_command_pose(action, servo.reached)
+            goal = servo.towards(self._T_command)
         change = goal - q
         excess = float((abs(change) / self._max_joint_change).max())
         self._q_command = q + change / max(excess, 1.0)
         self.cell.robot.drive_arm_to(self._q_command, self.config.robot.velocity_scale)
         self.cell.robot.command_gripper(MAX_OPENING * (action[-1] + 1) / 2)
 
-    def _move_command_pose(self, action: np.ndarray) -> None:
+    def _move_command_pose(self, action: np.ndarray, reached: np.ndarray) -> None:
         settings, T = self.settings, self._T_command
         # A command that the arm could not follow is taken back to where the arm got, so that it
         # does not wind up.
-        reached = forward_kinematics(self._q_command)
         self._reachable = abs(reached[:3, 3] - T[:3, 3]).max() < _FOLLOW_TOLERANCE
         if not self._reachable:
             T[:] = reached
@@ -276,10 +276,8 @@ class RobotGraspingEnv(gymnasium.Env):
         T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if turn.any():
-            T[:3, :3] = (
-                Rotation.from_rotvec(settings.rotation_step * turn)
-                * Rotation.from_matrix(T[:3, :3])
-            ).as_matrix()
+            R = Rotation.from_rotvec(settings.rotation_step * turn).as_matrix()
+            T[:3, :3] = R @ T[:3, :3]
 
     # --- What happened ----------------------------------------------------------------------
 

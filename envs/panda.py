@@ -153,14 +153,20 @@ def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: floa
     return step * (max_step / largest) if largest > max_step else step
 
 
-def differential_ik(q: np.ndarray, target: np.ndarray, iterations: int = 2) -> np.ndarray:
-    """A few damped steps from q (7,) towards a near target pose: cheap enough for every control
-    step. Joint limits hold; the remaining error is the caller's to see by forward kinematics."""
-    for _ in range(iterations):
-        T, jacobian = _chain(q)
-        q = q + _damped_step(jacobian, pose_error(T, target), q, None)
-        q = np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
-    return q
+class ServoStep:
+    """One cheap step of inverse kinematics for every control period of a streamed pose command.
+
+    The kinematic chain is walked once: `reached` is (4, 4) T_WE at `q` (7,), and `towards` gives
+    the joint positions (7,) one damped step nearer to a target pose, within the joint limits.
+    """
+
+    def __init__(self, q: np.ndarray):
+        self.q = q
+        self.reached, self._jacobian = _chain(q)
+
+    def towards(self, target: np.ndarray) -> np.ndarray:
+        step = _damped_step(self._jacobian, pose_error(self.reached, target), self.q, None)
+        return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
 
 
 @dataclass(frozen=True)

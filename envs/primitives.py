@@ -161,7 +161,7 @@ def _ring(rng) -> list[np.ndarray]:
 
 
 def _bowl(rng) -> list[np.ndarray]:
-    wall, base, rim, height = rng.uniform((0.004, 0.02, 0.04, 0.03), (0.007, 0.03, 0.06, 0.055))
+    wall, base, rim, height = rng.uniform((0.004, 0.02, 0.04, 0.03), (0.007, 0.026, 0.06, 0.055))
     # The base spans the wall's foot, so that wall and base only touch.
     foot = base + wall
     return [
@@ -204,7 +204,9 @@ _SHAPES = {
         "cylinder", tuple(rng.uniform((0.0125, 0.03), (0.03, 0.12)))
     ),
     "sphere": lambda rng: NativeShape("sphere", (rng.uniform(0.018, 0.03),)),
-    "capsule": lambda rng: NativeShape("capsule", tuple(rng.uniform((0.0125, 0.02), (0.028, 0.08)))),
+    "capsule": lambda rng: NativeShape(
+        "capsule", tuple(rng.uniform((0.0125, 0.02), (0.028, 0.08)))
+    ),
     "L": _l_shape,
     "T": _t_shape,
     "U": _u_shape,

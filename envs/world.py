@@ -52,9 +52,10 @@ def add_table(client: int) -> int:
     """The table, its top at z = 0. Returns its body number."""
     half = [*(TABLE_SIZE / 2), _TABLE_THICKNESS / 2]
     table = static_box(client, half, [*TABLE_CENTRE, -_TABLE_THICKNESS / 2], _TABLE_COLOUR)
-    # Friction multiplies in Bullet: 1 here leaves each object's own coefficient.
+    # Bullet combines lateral friction as the product, and rolling friction as the sum of each
+    # body's times the other's lateral one: with 1 and 0 here the object's own coefficients count.
     pybullet.changeDynamics(
-        table, -1, lateralFriction=1.0, rollingFriction=1.0, spinningFriction=1.0,
+        table, -1, lateralFriction=1.0, rollingFriction=0.0, spinningFriction=0.0,
         physicsClientId=client,
     )  # fmt: skip
     return table

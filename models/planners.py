@@ -12,7 +12,7 @@ The oracle judges the best ones by exact line-solid intersections, also with the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Callable, Protocol
 
 import cv2
@@ -41,10 +41,12 @@ class SearchSettings:
     level_step: float = 0.006  # between the heights of the fingertips that are tried
     table_clearance: float = 0.004  # under the fingertips
     clearance: float = 0.003  # over whatever lies under fingers and palm
-    rooms: tuple[float, ...] = (0.003, 0.005, 0.008, 0.012)  # room beside each contact when open
+    rooms: tuple[float, ...] = (0.004, 0.006, 0.008, 0.012)  # room beside each contact when open
+    inner_margin: float = 0.0015  # of that room, free of matter beside the descending finger
     min_engagement: float = 0.006  # the object must rise this far over the fingertips
     good_engagement: float = 0.022  # and gains nothing beyond this
     max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
+    min_facing: float = 0.75  # cosine of an edge's gradient against the closing line, dense stage
     reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again
@@ -86,6 +88,12 @@ class Candidates:
         order = np.argsort(-self.score, kind="stable")[:count]
         return self.take(order[self.score[order] > 0])
 
+    def better(self, other: "Candidates") -> "Candidates":
+        """Of each pair of candidates the one with the higher score."""
+        wins = other.score > self.score
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        return Candidates(*(np.where(wins[:, None] if a.ndim == 2 else wins, b, a) for a, b in pairs))
+
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) unit vectors along the closing line and across it."""
         along = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
@@ -115,15 +123,37 @@ class Candidates:
 def search(
     heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
 ) -> Candidates:
-    """Feasible candidates on a height map, measured and scored, best first; may be empty."""
+    """Feasible candidates on a height map, measured and scored, best first; may be empty.
+
+    Where nothing meets the margins, a second search gives some of them up: a poor attempt may clear
+    an object, none ends the round.
+    """
+    found = _search_once(heights, gripper, workspace, settings)
+    if len(found) == 0:
+        daring = replace(
+            settings,
+            clearance=0.0015,
+            rooms=(0.003, *settings.rooms),
+            inner_margin=0.0,
+            min_engagement=0.004,
+            max_wedge=np.deg2rad(38),
+            min_facing=0.6,
+        )
+        found = _search_once(heights, gripper, workspace, daring)
+    return found
+
+
+def _search_once(
+    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+) -> Candidates:
     found = dense_candidates(heights, gripper, workspace, settings).best(settings.shortlist)
     if len(found) == 0:
         return found
     found = measure(found, heights, gripper, settings).best(settings.finalists)
     for _ in range(2):
-        found.angle = np.mod(found.angle + found.turn, np.pi)
-        found = measure(found, heights, gripper, settings).best(settings.finalists)
-    return found
+        turned = replace(found, angle=np.mod(found.angle + found.turn, np.pi))
+        found = found.better(measure(turned, heights, gripper, settings))
+    return found.best(len(found))
 
 
 def dense_candidates(
@@ -142,7 +172,6 @@ def dense_candidates(
     finger = np.ones((2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8)
     palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
-    offset = (settings.rooms[0] + thickness / 2) / cell  # from the contact to the finger's middle
     parts = [Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))]
     for angle in np.arange(settings.angles) * np.pi / settings.angles if len(levels) else ():
         along = np.array([np.cos(angle), np.sin(angle)])
@@ -154,14 +183,15 @@ def dense_candidates(
             borderValue=heights.table_height,
         )  # fmt: skip
         level, row, first, last = _runs(turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell)
-        tip = levels[level]
-        left, right = (
-            np.clip(np.rint(column).astype(int), 0, size - 1) for column in (first - offset, last + offset)
-        )
+        tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
-        centre = np.rint((first + last) / 2).astype(int)
         limit = tip - settings.clearance
-        free = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
+        free = np.zeros(len(tip), bool)
+        for room in settings.rooms:  # a sloping flank asks for more of it
+            offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
+            left, right = (np.clip(np.rint(at).astype(int), 0, size - 1) for at in (first - offset, last + offset))
+            fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
+            free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
         free &= under_palm[row, centre] < limit + gripper.palm_height
         row, first, last, tip = row[free], first[free], last[free], tip[free]
 
@@ -178,7 +208,7 @@ def dense_candidates(
         arm = np.abs((heights.centres[inside, :2] - xy) @ across) if len(heights.centres) else 0.0
         rise = turned[row, first] - tip
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
-        score *= reach * (facing > 0.75) * np.clip(rise / settings.good_engagement, 0.2, 1)
+        score *= reach * (facing > settings.min_facing) * np.clip(rise / settings.good_engagement, 0.2, 1)
         parts.append(
             Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
         )
@@ -256,8 +286,11 @@ def measure(
     obstacles = cv2.dilate(heights.height, np.ones((3, 3)))[where].max(axis=2)
     for candidate_room in settings.rooms:
         half = np.minimum(width / 2 + candidate_room, gripper.max_opening / 2)
-        passage = (near < half[:, None]) & (near > width[:, None] / 2 + settings.rooms[0])
-        under = np.where(passage, 0.0, gripper.finger_underside(near - half[:, None]))
+        outward = near - half[:, None]
+        # Between contact and finger only the closing pads pass, over anything below the tips.
+        sill = np.where(near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf)
+        below_finger = gripper.finger_underside(np.maximum(outward, 0))
+        under = np.where(outward < -settings.inner_margin, sill, below_finger)
         fits = (obstacles - under).max(axis=1) <= tip - settings.clearance
         fits &= half >= width / 2 + settings.rooms[0] - 1e-9
         free |= fits

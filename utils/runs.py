@@ -33,7 +33,9 @@ class GitState(NamedTuple):
     dirty: bool | None
 
 
-def new_run_folder(script: str, name: str | None, config: Config, root: Path = Path("runs")) -> Path:
+def new_run_folder(
+    script: str, name: str | None, config: Config, root: Path = Path("runs")
+) -> Path:
     """Make root/<script>/<time>-<name>/ with config.yaml and environment.json; returns its path.
 
     The time is local, to the second; a number is added where that folder already exists.

@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import norm
 
 
-def wilson_interval(
-    successes: int, n: int, confidence: float = 0.95
-) -> tuple[float, float]:
+def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a success rate, (low, high) in [0, 1]; n = 0 gives (0, 1).
 
     It assumes independent trials. E. B. Wilson, "Probable inference, the law of succession, and

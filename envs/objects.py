@@ -1,0 +1,544 @@
+"""The things to be grasped: object sets, and how one object enters a physics client.
+
+A set is named (`box`, `primitives`, `random_urdfs`) or is any folder of URDF and mesh files. Every
+object is one rigid body whose frame has its origin at the centre of mass and the axes of its
+source. This module knows neither robot nor scene.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+import numpy as np
+import pybullet
+import pybullet_data
+import trimesh
+import yourdfpy
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from envs.meshes import (
+    ObjectError,
+    checked_mesh,
+    decompose,
+    load_mesh,
+    mass_properties,
+    write_mesh_obj,
+    write_parts_obj,
+)
+from envs.primitives import NativeShape, make_primitive, random_color
+from utils.geometry import ConvexSolid
+
+NAMED_SETS = ("box", "primitives", "random_urdfs")
+SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
+PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
+BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
+RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
+
+# Of solid plastic. A random_urdfs object (median 37 cm3 at scale 0.65) then weighs 40 g.
+DEFAULT_DENSITY = 1000.0
+# Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
+MIN_MASS = 0.02
+DEFAULT_FRICTION = 0.7  # of a file that states none
+HAND_OPENING = 0.08
+LARGEST_EXTENT = 0.5
+# A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
+# Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
+ROLLING_FRICTION = 0.0005
+
+
+@dataclass(frozen=True)
+class FineVisual:
+    """The original mesh: a vertex v of the file is at rotation(quaternion) @ (scale * v) + position
+    in the body frame (metres; quaternion x, y, z, w)."""
+
+    path: Path
+    scale: tuple[float, float, float]
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """One rigid object. Lengths are metres in the body frame: origin at the centre of mass of
+    uniform density, axes as in the source.
+
+    parts: vertex arrays (V, 3) of the convex parts.
+    mass: kg. inertia: (3,) moments about the body axes, kg m2.
+    friction: lateral coefficient. rolling_friction, spinning_friction: metres.
+    color: RGBA in 0..1.
+    collision: a native shape, or an OBJ file with one `o` group for each convex part.
+    fine_visual: the original mesh for pictures, None where the collision shape is the original.
+    extents: (3,) sides of the bounding box along the body axes.
+    """
+
+    name: str
+    parts: tuple[np.ndarray, ...]
+    mass: float
+    inertia: np.ndarray
+    friction: float
+    color: tuple[float, float, float, float]
+    collision: NativeShape | Path
+    fine_visual: FineVisual | None
+    extents: np.ndarray
+    rolling_friction: float = 0.0
+    spinning_friction: float = 0.0
+
+    def geometry(self) -> tuple[ConvexSolid, ...]:
+        """The convex parts as solids, in the body frame."""
+        return self._solids
+
+    @cached_property
+    def _solids(self) -> tuple[ConvexSolid, ...]:
+        return tuple(ConvexSolid.from_vertices(part) for part in self.parts)
+
+
+def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = False) -> int:
+    """Put an object into a physics client; returns its body id.
+
+    position (3,) of the centre of mass in W; quaternion (x, y, z, w). With `fine` the camera sees
+    the original mesh, otherwise exactly what the physics touches.
+    """
+    # The shapes live until `resetSimulation`, even if the body is removed (bullet3 #2086).
+    body = pybullet.createMultiBody(
+        baseMass=model.mass,
+        baseCollisionShapeIndex=_collision_shape(client, model),
+        baseVisualShapeIndex=_visual_shape(client, model, fine),
+        basePosition=np.asarray(position, dtype=float).tolist(),
+        baseOrientation=np.asarray(quaternion, dtype=float).tolist(),
+        physicsClientId=client,
+    )
+    pybullet.changeDynamics(
+        body,
+        -1,
+        localInertiaDiagonal=model.inertia.tolist(),
+        lateralFriction=model.friction,
+        rollingFriction=model.rolling_friction,
+        spinningFriction=model.spinning_friction,
+        restitution=0.0,
+        linearDamping=0.04,
+        angularDamping=0.04,
+        physicsClientId=client,
+    )
+    if isinstance(model.collision, Path):
+        # Bullet grows hulls by 1 mm: objects would hover above what the camera sees.
+        pybullet.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=client)
+    return body
+
+
+class ObjectSet(ABC, Sequence[ObjectModel]):
+    """A sequence of objects, each made when first asked for and then kept in memory."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._models: dict[int, ObjectModel] = {}
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def _build(self, index: int) -> ObjectModel:
+        """Make the object; raises ObjectError if it cannot be made."""
+
+    def __getitem__(self, index: int) -> ObjectModel:
+        index = range(len(self))[index]  # negative indices, and IndexError past the end
+        if index not in self._models:
+            self._models[index] = self._build(index)
+        return self._models[index]
+
+
+def load_object_set(
+    name_or_path: str,
+    *,
+    split: Literal["train", "test"] = "test",
+    scale: float | None = None,
+    fit: float | None = None,
+    density: float = DEFAULT_DENSITY,
+    cache_dir: str | Path,
+) -> ObjectSet:
+    """A named set, or every URDF and mesh file below a folder (whose units must be metres).
+
+    split: of `primitives` and `random_urdfs`; the others hold the same objects in both.
+    scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
+    fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
+        so that the middle side of its oriented bounding box has this many metres.
+    density: kg/m3 of the objects of `random_urdfs` or of a folder; `box` and `primitives` have
+        their own. No object weighs less than 0.02 kg.
+    cache_dir: where convex parts are kept.
+    Raises ObjectError for an unknown name, a missing or empty folder, a split or number that is
+    not allowed; a broken mesh raises it when its object is asked for.
+    """
+    cache_dir = Path(cache_dir)
+    if split not in ("train", "test"):
+        raise ObjectError(f"objects.split is {split!r}; allowed are 'train' and 'test'")
+    for key, value in {"scale": scale, "fit": fit, "density": density}.items():
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ObjectError(f"objects.{key} is {value}; it must be a number above 0")
+    if name_or_path in ("box", "primitives"):
+        if fit is not None:
+            raise ObjectError(
+                f"objects.fit does not apply to the set {name_or_path!r}, whose sizes are known; "
+                "leave it out or use objects.scale"
+            )
+        if name_or_path == "box":
+            return BoxSet(scale or 1.0)
+        return PrimitiveSet(split, scale or 1.0, cache_dir)
+    if name_or_path == "random_urdfs":
+        default = RANDOM_URDFS_SCALE if fit is None else 1.0
+        return FileSet(
+            "random_urdfs", _random_urdf_files(split), scale or default, fit, density, cache_dir
+        )
+    folder = Path(name_or_path).expanduser()
+    files = _object_files(folder)
+    return FileSet(folder.resolve().name, files, scale or 1.0, fit, density, cache_dir)
+
+
+def prepare(objects: ObjectSet, workers: int) -> None:
+    """Make every object of a set, in parallel processes, so that the cache holds it."""
+    if workers <= 1:
+        for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
+            objects[index]
+        return
+    # "spawn": a forked copy of a process that runs physics or torch threads may hang.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        models = pool.map(objects.__getitem__, range(len(objects)), chunksize=4)
+        bar = tqdm(models, total=len(objects), desc=f"objects {objects.name}")
+        objects._models.update(enumerate(bar))
+
+
+# --- the sets -------------------------------------------------------------------------------
+
+
+class BoxSet(ObjectSet):
+    """The tutorial's red cube: half extent 0.03 m, 0.1 kg."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__("box")
+        self.scale = scale
+
+    def __len__(self) -> int:
+        return 1
+
+    def _build(self, index: int) -> ObjectModel:
+        side = 0.06 * self.scale
+        color = (1.0, 0.2, 0.2, 1.0)
+        return _native_model("cube", NativeShape("box", (side,) * 3), 0.1 / side**3, 0.5, color)
+
+
+class PrimitiveSet(ObjectSet):
+    """Procedural solids of eleven families, see `envs.primitives`: 900 to train, 100 to test."""
+
+    def __init__(self, split: str, scale: float, cache_dir: Path) -> None:
+        super().__init__("primitives")
+        train, test = range(PRIMITIVES_TRAIN), range(PRIMITIVES_TRAIN, PRIMITIVES_TOTAL)
+        self.indices = train if split == "train" else test
+        self.scale, self.cache_dir = scale, cache_dir
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def _build(self, index: int) -> ObjectModel:
+        shape = make_primitive(self.indices[index], self.scale)
+        if shape.native is not None:
+            return _native_model(
+                shape.name, shape.native, shape.density, shape.friction, shape.color
+            )
+        hulls = [trimesh.convex.convex_hull(part) for part in shape.parts]
+        solid = trimesh.util.concatenate(hulls)  # the parts touch but do not overlap
+        centre = np.asarray(solid.center_mass)
+        parts = tuple(part - centre for part in shape.parts)
+        return ObjectModel(
+            name=shape.name,
+            parts=parts,
+            mass=shape.density * float(solid.volume),
+            inertia=shape.density * np.diag(solid.moment_inertia),
+            friction=shape.friction,
+            color=shape.color,
+            collision=write_parts_obj(parts, self.cache_dir),
+            fine_visual=None,
+            extents=np.ptp(np.concatenate(parts), axis=0),
+        )
+
+
+class FileSet(ObjectSet):
+    """URDF and mesh files, one object each."""
+
+    def __init__(
+        self,
+        name: str,
+        files: Sequence[Path],
+        scale: float,
+        fit: float | None,
+        density: float,
+        cache_dir: Path,
+    ) -> None:
+        super().__init__(name)
+        self.files = tuple(files)
+        self.scale, self.fit, self.density, self.cache_dir = scale, fit, density, cache_dir
+        self._warned = False
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def _build(self, index: int) -> ObjectModel:
+        path = self.files[index]
+        model = load_object(
+            path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
+        )
+        # random_urdfs is known to hold a few that no hand can take; of a folder it is a surprise.
+        ungraspable = model.extents.min() > HAND_OPENING or model.extents.max() > LARGEST_EXTENT
+        if ungraspable and not self._warned:
+            self._warned = True
+            sides = " x ".join(f"{side:.3g}" for side in model.extents)
+            warnings.warn(
+                f"object {path} measures {sides} m, too large for a hand that opens "
+                f"{HAND_OPENING} m (and so may others be); set objects.fit, for example to 0.06, "
+                "or objects.scale",
+                stacklevel=3,
+            )
+        return model
+
+
+def load_object(
+    path: str | Path,
+    *,
+    scale: float = 1.0,
+    fit: float | None = None,
+    density: float = DEFAULT_DENSITY,
+    cache_dir: str | Path,
+) -> ObjectModel:
+    """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
+
+    scale, fit, density: as in `load_object_set`. Raises ObjectError naming the file.
+    """
+    path, cache_dir = Path(path), Path(cache_dir)
+    source = _read_urdf(path) if path.suffix.lower() == ".urdf" else _Source(load_mesh(path))
+    parts = decompose(source.mesh, cache_dir, str(path))
+    solid = mass_properties(source.mesh, parts)
+    if fit is not None:
+        scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
+    parts = tuple(scale * (part - solid.centre_of_mass) for part in parts)
+    true_mass = density * solid.volume * scale**3
+    mass = max(true_mass, MIN_MASS)
+    return ObjectModel(
+        name=path.stem,
+        parts=parts,
+        mass=mass,
+        inertia=np.diag(solid.inertia) * density * scale**5 * (mass / true_mass),
+        friction=source.friction,
+        color=source.color or random_color(np.random.default_rng(list(path.stem.encode()))),
+        collision=write_parts_obj(parts, cache_dir),
+        fine_visual=_fine_visual(path, source, scale, solid.centre_of_mass, cache_dir),
+        extents=np.ptp(np.concatenate(parts), axis=0),
+    )
+
+
+def _native_model(name, shape: NativeShape, density, friction, color) -> ObjectModel:
+    solid = shape.mesh(fine=True)
+    vertices = np.asarray(shape.mesh().vertices)
+    return ObjectModel(
+        name=name,
+        parts=(vertices,),
+        mass=density * float(solid.volume),
+        inertia=density * np.diag(solid.moment_inertia),
+        friction=friction,
+        color=color,
+        collision=shape,
+        fine_visual=None,
+        extents=np.asarray(solid.extents),
+        rolling_friction=0.0 if shape.kind == "box" else ROLLING_FRICTION,
+    )
+
+
+# --- files ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What a file says. visual: (mesh file, scale (3,), T (4, 4)) if there is just one, as read by
+    PyBullet; otherwise the mesh itself is what there is to see."""
+
+    mesh: trimesh.Trimesh
+    friction: float = DEFAULT_FRICTION
+    color: tuple[float, float, float, float] | None = None
+    visual: tuple[Path, np.ndarray, np.ndarray] | None = None
+    visual_mesh: trimesh.Trimesh | None = None
+
+
+def _random_urdf_files(split: str) -> list[Path]:
+    """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
+    folder = Path(pybullet_data.getDataPath()) / "random_urdfs"
+    numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
+    return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
+
+
+def _object_files(folder: Path) -> list[Path]:
+    """Sorted URDF and mesh files below a folder, without the meshes that its URDFs refer to."""
+    if not folder.is_dir():
+        raise ObjectError(
+            f"objects: {str(folder)!r} is neither one of the sets {', '.join(NAMED_SETS)} nor an "
+            "existing folder"
+        )
+    files = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+    )
+    referred: set[Path] = set()
+    for path in files:
+        if path.suffix.lower() == ".urdf":
+            for mesh in _parse_xml(path).iter("mesh"):
+                referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
+    files = [path for path in files if path.resolve() not in referred]
+    if not files:
+        raise ObjectError(
+            f"objects: folder {folder} holds no object; "
+            f"put in files ending in {', '.join(SUFFIXES)}"
+        )
+    return files
+
+
+def _parse_xml(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
+
+
+def _resolve_mesh(filename: str, urdf: Path) -> str:
+    """The file that a URDF's mesh element means: relative to it, or in a package around it."""
+    if filename.startswith("package://"):
+        inside = Path(filename.removeprefix("package://"))
+        for base in urdf.resolve().parents:
+            for candidate in (base / inside, base / Path(*inside.parts[1:])):
+                if candidate.is_file():
+                    return str(candidate)
+    return str(urdf.parent / filename.removeprefix("file://"))
+
+
+def _read_urdf(path: Path) -> _Source:
+    xml = _parse_xml(path)
+    for element in xml.iter("mesh"):
+        # Checked first: its message names the mesh, which yourdfpy's may not.
+        load_mesh(_resolve_mesh(element.get("filename", ""), path))
+    try:
+        robot = yourdfpy.URDF.load(
+            str(path),
+            build_collision_scene_graph=True,
+            load_collision_meshes=True,
+            filename_handler=lambda fname: _resolve_mesh(fname, path),
+        )
+        # A link is solid where it collides; without any collision geometry, where it shows.
+        scene = robot.collision_scene if robot.collision_scene.geometry else robot.scene
+        mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
+        friction = xml.find(".//contact/lateral_friction")  # yourdfpy leaves <contact> out
+        friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
+    except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
+        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
+    if len(mesh.faces) == 0:
+        raise ObjectError(f"URDF {path} has neither collision nor visual geometry; add some")
+    shown = [(link, item) for link in robot.robot.links for item in link.visuals]
+    return _Source(
+        mesh=checked_mesh(mesh, str(path)),
+        friction=friction,
+        color=_urdf_color(shown, robot),
+        visual=_single_visual(shown, robot, path),
+        visual_mesh=visual if len(visual.faces) else None,
+    )
+
+
+def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:
+    named = {material.name: material for material in robot.robot.materials}
+    for _, item in shown:
+        material = item.material and named.get(item.material.name, item.material)
+        color = (item.material and item.material.color) or (material and material.color)
+        if color is not None:
+            return tuple(float(c) for c in color.rgba)
+    return None
+
+
+def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
+    if len(shown) != 1 or shown[0][1].geometry.mesh is None:
+        return None
+    link, item = shown[0]
+    file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
+    scale = item.geometry.mesh.scale
+    scale = np.broadcast_to(1.0 if scale is None else scale, 3)
+    origin = np.eye(4) if item.origin is None else item.origin
+    return file, scale, robot.get_transform(link.name) @ origin
+
+
+def _fine_visual(path: Path, source: _Source, scale: float, centre, cache_dir: Path) -> FineVisual:
+    if source.visual is not None:
+        file, file_scale, T = source.visual
+    elif source.visual_mesh is not None:
+        file, file_scale, T = write_mesh_obj(source.visual_mesh, cache_dir), np.ones(3), np.eye(4)
+    else:
+        file, file_scale, T = path, np.ones(3), np.eye(4)
+    if file.suffix.lower() != ".obj":  # what PyBullet makes of the others differs from trimesh
+        file = write_mesh_obj(load_mesh(file), cache_dir)
+    return FineVisual(
+        path=file,
+        scale=tuple((scale * file_scale).tolist()),
+        position=tuple((scale * (T[:3, 3] - centre)).tolist()),
+        quaternion=tuple(Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
+    )
+
+
+# --- PyBullet shapes ------------------------------------------------------------------------
+
+
+def _collision_shape(client: int, model: ObjectModel) -> int:
+    shape = model.collision
+    if isinstance(shape, NativeShape):
+        kind, size = _native_arguments(shape, "height")
+        return pybullet.createCollisionShape(kind, physicsClientId=client, **size)
+    return pybullet.createCollisionShape(
+        pybullet.GEOM_MESH, fileName=str(shape), physicsClientId=client
+    )
+
+
+def _visual_shape(client: int, model: ObjectModel, fine: bool) -> int:
+    shape = model.collision
+    if isinstance(shape, NativeShape):
+        kind, size = _native_arguments(shape, "length")
+        return pybullet.createVisualShape(
+            kind, rgbaColor=model.color, physicsClientId=client, **size
+        )
+    visual = model.fine_visual
+    if not fine or visual is None:
+        return pybullet.createVisualShape(
+            pybullet.GEOM_MESH, fileName=str(shape), rgbaColor=model.color, physicsClientId=client
+        )
+    return pybullet.createVisualShape(
+        pybullet.GEOM_MESH,
+        fileName=str(visual.path),
+        meshScale=visual.scale,
+        visualFramePosition=visual.position,
+        visualFrameOrientation=visual.quaternion,
+        # The colour multiplies a texture: white leaves it as it is.
+        rgbaColor=(1, 1, 1, 1) if _has_texture(visual.path) else model.color,
+        physicsClientId=client,
+    )
+
+
+def _native_arguments(shape: NativeShape, length_name: str) -> tuple[int, dict]:
+    """PyBullet calls a cylinder's length "height" when it collides and "length" when it shows."""
+    if shape.kind == "box":
+        return pybullet.GEOM_BOX, {"halfExtents": [side / 2 for side in shape.size]}
+    if shape.kind == "sphere":
+        return pybullet.GEOM_SPHERE, {"radius": shape.size[0]}
+    kinds = {"cylinder": pybullet.GEOM_CYLINDER, "capsule": pybullet.GEOM_CAPSULE}
+    return kinds[shape.kind], {"radius": shape.size[0], length_name: shape.size[1]}
+
+
+def _has_texture(path: Path) -> bool:
+    material = path.with_suffix(".mtl")
+    return material.is_file() and "map_Kd" in material.read_text(errors="replace")

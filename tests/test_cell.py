@@ -1,0 +1,181 @@
+"""The cell: scenes as pure functions of their seeds, execution and its judgement."""
+
+import numpy as np
+import pybullet
+import pytest
+
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Cell
+from envs.execution import execute_grasp
+from envs.objects import load_object_set
+from envs.rounds import run_round
+from envs.scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
+from envs.world import BIN_CENTRE, BIN_HALF_SIZE
+from utils.config import with_settings
+from utils.transforms import Grasp
+
+
+@pytest.fixture(scope="module")
+def cell(config):
+    with Cell(config) as cell:
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def primitives(config):
+    return load_object_set("primitives", cache_dir=config.cache_folder)
+
+
+def cube_scene(box_set, position=(0.5, 0.0, 0.03), yaw=0.0) -> Scene:
+    """One 6 cm cube lying flat at a known place."""
+    quaternion = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
+    return Scene("isolated", 0, (Placement(box_set[0], np.array(position), quaternion),))
+
+
+def cube_grasp(angle=0.0, offset=(0.0, 0.0, 0.0), width=0.08) -> Grasp:
+    return Grasp(np.array([0.5, 0.0, 0.03]) + offset, angle, width, 1.0)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scene_is_a_pure_function_of_its_seed(layout, primitives, config, cell):
+    first = make_scene(layout, primitives, 7, config)
+    make_scene("pile", primitives, 8, config, cell.client)  # other work in between
+    again = make_scene(layout, primitives, 7, config, cell.client)
+    other = make_scene(layout, primitives, 9, config)
+    assert len(first.placements) == (1 if layout == "isolated" else config.scene.count)
+    for a, b in zip(first.placements, again.placements):
+        assert a.model.name == b.model.name
+        np.testing.assert_array_equal(a.position, b.position)
+        np.testing.assert_array_equal(a.quaternion, b.quaternion)
+    assert any((a.position != b.position).any() for a, b in zip(first.placements, other.placements))
+    for placement in first.placements:
+        offset = abs(placement.position[:2] - config.workspace.center)
+        assert offset.max() <= config.workspace.size / 2 and placement.position[2] > 0
+
+
+def test_packed_objects_stand_apart(primitives, config, cell):
+    scene = make_scene("packed", primitives, 3, config)
+    cell.load(scene)
+    for i, a in enumerate(cell.bodies):
+        for b in cell.bodies[:i]:
+            assert not pybullet.getContactPoints(a, b, physicsClientId=cell.client)
+
+
+def test_impossible_scene_is_refused(box_set, config):
+    crowded = with_settings(config, "scene", {"count": 50})
+    with pytest.raises(SceneError, match="scene.count"):
+        make_scene("packed", box_set, 0, crowded)
+    with pytest.raises(SceneError, match="isolated, packed, pile"):
+        make_scene("heap", box_set, 0, config)
+
+
+def test_frame_shows_the_cube_where_it_is(cell, box_set):
+    cell.load(cube_scene(box_set))
+    frame = cell.frame(with_truth=True)
+    on_cube = frame.segmentation == 0
+    top = frame.points()[on_cube & (frame.points()[..., 2] > 0.059)]
+    np.testing.assert_allclose(top.mean(axis=0), [0.5, 0.0, 0.06], atol=1e-3)
+    np.testing.assert_allclose(np.ptp(top, axis=0)[:2], 0.06, atol=4e-3)
+    assert (frame.segmentation == TABLE_OR_BACKGROUND).any()
+    assert not (frame.segmentation == ROBOT).any(), "the robot at home is in the overhead view"
+    assert cell.frame().truth is None
+    vertices = np.vstack([s.vertices for s in frame.truth.objects[0].solids])
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), 0.06, atol=1e-3)
+
+
+def test_wrist_camera_sees_the_workspace(config, box_set):
+    wrist = with_settings(config, "camera", {"mount": "wrist"})
+    with Cell(wrist) as cell:
+        cell.load(cube_scene(box_set, position=(0.42, 0.0, 0.03)))
+        frame = cell.frame()
+        cube = frame.points()[(frame.segmentation == 0) & (frame.points()[..., 2] > 0.059)]
+        np.testing.assert_allclose(cube.mean(axis=0), [0.42, 0.0, 0.06], atol=3e-3)
+
+
+def test_good_grasp_succeeds_and_the_cube_ends_in_the_bin(cell, box_set):
+    cell.load(cube_scene(box_set))
+    outcome = execute_grasp(cell, cube_grasp())
+    assert outcome.reason == "success" and outcome.success and outcome.object_index == 0
+    assert 3 < outcome.sim_seconds < 12
+    assert not cell.remaining
+    assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
+    np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("grasp", "reason"),
+    [
+        (cube_grasp(offset=(0.15, 0, 0)), "missed"),
+        (cube_grasp(angle=np.pi / 4), "collision"),  # 8.5 cm across the diagonal
+        (cube_grasp(width=0.03), "collision"),  # the fingers come down on its top
+        (cube_grasp(offset=(0, 0, -0.05)), "collision"),  # into the table
+        (Grasp(np.array([1.5, 0.0, 0.03]), 0.0, 0.08, 1.0), "ik"),
+    ],
+)
+def test_failures_are_named(cell, box_set, grasp, reason):
+    cell.load(cube_scene(box_set))
+    outcome = execute_grasp(cell, grasp)
+    assert outcome.reason == reason and not outcome.success
+    assert cell.remaining == {0}
+    np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
+
+
+def test_a_frictionless_object_slips(cell, box_set):
+    cell.load(cube_scene(box_set))
+    # Pads and cube without any friction: the lift leaves the cube behind.
+    for body, link in ((cell.bodies[0], -1), (cell.robot.body, 9), (cell.robot.body, 10)):
+        pybullet.changeDynamics(
+            body, link, lateralFriction=0.0, spinningFriction=0.0, rollingFriction=0.0,
+            physicsClientId=cell.client,
+        )  # fmt: skip
+    assert execute_grasp(cell, cube_grasp()).reason == "slipped"
+
+
+def test_an_object_flung_upwards_is_no_success(cell, box_set):
+    cell.load(cube_scene(box_set))
+    pybullet.resetBaseVelocity(cell.bodies[0], [0, 0, 4], [0, 0, 0], physicsClientId=cell.client)
+    cell.step(24)
+    assert cell.object_position(0)[2] > cell.config.execution.lift_height
+    assert cell.held_object() is None
+
+
+def test_lost_objects_are_retired(cell, box_set):
+    cell.load(cube_scene(box_set))
+    pybullet.resetBasePositionAndOrientation(
+        cell.bodies[0], [0.5, 0.0, -0.5], [0, 0, 0, 1], physicsClientId=cell.client
+    )
+    assert cell.retire_lost_objects() == [0] and not cell.remaining
+
+
+def test_rounds_are_deterministic_whatever_came_before(cell, config, primitives):
+    scene = make_scene("pile", primitives, 5, config)
+    from models.planners import make_planner
+    from utils.geometry import GripperGeometry, Workspace
+
+    def play():
+        plan = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
+        record = run_round(cell, scene, plan, policy="h", objects="p", max_failures=2)
+        poses = [cell.object_pose(i) for i in range(len(cell.bodies))]
+        return [(a.reason, a.sim_seconds) for a in record.attempts], np.array(poses)
+
+    reasons, poses = play()
+    cell.load(make_scene("packed", primitives, 6, config))
+    cell.step(100)
+    again, poses_again = play()
+    assert reasons == again
+    np.testing.assert_array_equal(poses, poses_again)
+
+
+def _planner_that_returns(grasps):
+    return lambda frame: list(grasps)
+
+
+def test_stop_rule(cell, box_set):
+    scene = cube_scene(box_set)
+    settings = {"policy": "x", "objects": "box", "max_failures": 2}
+    cleared = run_round(cell, scene, _planner_that_returns([cube_grasp()]), **settings)
+    assert (cleared.ended, cleared.objects_cleared, cleared.successes) == ("cleared", 1, 1)
+    nothing = run_round(cell, scene, _planner_that_returns([]), **settings)
+    assert (nothing.ended, nothing.executed, nothing.objects_cleared) == ("no_plan", 0, 0)
+    miss = cube_grasp(offset=(0.13, 0, 0))
+    failed = run_round(cell, scene, _planner_that_returns([miss]), **settings)
+    assert (failed.ended, failed.executed, failed.successes) == ("failures", 2, 0)

@@ -1,0 +1,368 @@
+"""Object sets: known masses, hollow things that are hollow, clear errors, and repeatability."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pybullet_data
+import pytest
+import trimesh
+
+from envs.objects import (
+    BROKEN_RANDOM_URDFS,
+    HAND_OPENING,
+    ObjectError,
+    load_object,
+    load_object_set,
+    prepare,
+    spawn,
+)
+from envs.primitives import FAMILIES, make_primitive
+
+DATA = Path(pybullet_data.getDataPath())
+IDENTITY = (0, 0, 0, 1)
+
+
+@pytest.fixture
+def client():
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+    plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    pybullet.createMultiBody(0, plane, physicsClientId=client)
+    yield client
+    pybullet.disconnect(client)
+
+
+def primitive(family: str, cache_dir: Path):
+    return load_object_set("primitives", split="train", cache_dir=cache_dir)[FAMILIES.index(family)]
+
+
+def step(client: int, count: int) -> None:
+    for _ in range(count):
+        pybullet.stepSimulation(physicsClientId=client)
+
+
+def ball(client: int, radius: float, position) -> int:
+    shape = pybullet.createCollisionShape(
+        pybullet.GEOM_SPHERE, radius=radius, physicsClientId=client
+    )
+    return pybullet.createMultiBody(0.01, shape, basePosition=position, physicsClientId=client)
+
+
+def height(client: int, body: int) -> float:
+    return pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0][2]
+
+
+# --- masses ---------------------------------------------------------------------------------
+
+
+def test_the_box_is_the_tutorials(tmp_path):
+    objects = load_object_set("box", cache_dir=tmp_path)
+    assert len(objects) == 1
+    assert objects[0].mass == pytest.approx(0.1)
+    assert objects[0].extents == pytest.approx([0.06] * 3)
+    assert objects[0].inertia == pytest.approx([0.1 * 0.06**2 / 6] * 3)
+    assert objects[0].color == (1.0, 0.2, 0.2, 1.0)
+
+
+def test_mass_and_inertia_of_a_mesh_box_are_the_closed_form(tmp_path):
+    box = trimesh.creation.box((0.04, 0.05, 0.06))
+    box.apply_translation((1, 2, 3))
+    box.export(tmp_path / "box.stl")
+    model = load_object(tmp_path / "box.stl", density=500, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(500 * 0.04 * 0.05 * 0.06, rel=1e-4)
+    a, b, c = 0.04**2, 0.05**2, 0.06**2
+    closed_form = model.mass / 12 * np.array([b + c, a + c, a + b])
+    assert model.inertia == pytest.approx(closed_form, rel=1e-4)  # STL has single precision
+    assert np.concatenate(model.parts).mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert model.extents == pytest.approx([0.04, 0.05, 0.06], abs=1e-6)
+
+
+def test_a_light_object_is_given_the_least_mass_and_the_inertia_that_goes_with_it(tmp_path):
+    trimesh.creation.box((0.01, 0.01, 0.01)).export(tmp_path / "dice.stl")
+    model = load_object(tmp_path / "dice.stl", cache_dir=tmp_path)
+    assert model.mass == pytest.approx(0.02)
+    assert model.inertia == pytest.approx([0.02 * 0.01**2 / 6] * 3, rel=1e-4)
+
+
+@pytest.mark.parametrize("family", ["sphere", "cylinder", "capsule"])
+def test_round_natives_have_the_closed_form_volume(tmp_path, family):
+    shape = make_primitive(FAMILIES.index(family))
+    radius, length = (*shape.native.size, 0.0)[:2]
+    closed_form = {
+        "sphere": 4 / 3 * np.pi * radius**3,
+        "cylinder": np.pi * radius**2 * length,
+        "capsule": np.pi * radius**2 * length + 4 / 3 * np.pi * radius**3,
+    }
+    model = primitive(family, tmp_path)
+    assert model.mass / shape.density == pytest.approx(closed_form[family], rel=2e-3)
+
+
+def test_pybullet_gets_what_the_model_says(tmp_path, client):
+    for model in (primitive("mug", tmp_path), primitive("sphere", tmp_path)):
+        body = spawn(client, model, (0.1, 0.2, 0.3), IDENTITY)
+        info = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
+        assert info[0] == pytest.approx(model.mass)
+        assert info[1] == pytest.approx(model.friction)
+        assert info[2] == pytest.approx(model.inertia)
+        position, _ = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        assert position == pytest.approx((0.1, 0.2, 0.3))
+
+
+# --- shapes ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", ["mug", "bowl"])
+def test_hollow_things_hold_a_ball(tmp_path, client, family):
+    model = primitive(family, tmp_path)
+    low, high = (f(np.concatenate(model.parts)[:, 2]) for f in (np.min, np.max))
+    axis = -np.array([part.mean(axis=0) for part in model.parts[:17]]).mean(axis=0)
+    body = spawn(client, model, (0, 0, -low), IDENTITY)
+    marble = ball(client, 0.01, (-axis[0], -axis[1], high - low + 0.02))
+    step(client, 480)
+    assert height(client, marble) < height(client, body) + high - 0.02
+
+
+def test_a_rod_passes_through_the_ring_and_a_ray_does(tmp_path, client):
+    ring = primitive("ring", tmp_path)
+    top = ring.extents[2] / 2
+    body = spawn(client, ring, (0, 0, top), IDENTITY)
+    rod_shape = pybullet.createCollisionShape(
+        pybullet.GEOM_CYLINDER, radius=0.01, height=0.2, physicsClientId=client
+    )
+    rod = pybullet.createMultiBody(0, rod_shape, basePosition=(0, 0, 0.11), physicsClientId=client)
+    pybullet.performCollisionDetection(physicsClientId=client)
+    assert not pybullet.getContactPoints(body, rod, physicsClientId=client)
+    wall = np.concatenate(ring.parts)[:, 0].max() - 0.004
+    ends = [(0.0, 0.0), (wall, 0.0)]
+    assert [_line_meets(ring, x, y) for x, y in ends] == [False, True]
+
+
+def _line_meets(model, x: float, y: float) -> bool:
+    """Whether the vertical line through (x, y) meets the model's geometry."""
+    for solid in model.geometry():
+        slope = solid.normals[:, 2]
+        gap = solid.offsets - solid.normals[:, :2] @ (x, y)
+        upper = (gap[slope > 1e-9] / slope[slope > 1e-9]).min()
+        lower = (gap[slope < -1e-9] / slope[slope < -1e-9]).max()
+        if (gap[abs(slope) <= 1e-9] >= 0).all() and lower < upper:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("index", range(len(FAMILIES)))
+def test_an_object_rests_on_the_plane_where_its_geometry_ends(tmp_path, client, index):
+    """So that the camera, the labels and the physics agree about the surface."""
+    model = load_object_set("primitives", split="train", cache_dir=tmp_path)[index]
+    low = np.concatenate(model.parts)[:, 2].min()
+    body = spawn(client, model, (0, 0, 0.0005 - low), IDENTITY)
+    step(client, 120)
+    assert height(client, body) == pytest.approx(-low, abs=3e-4)
+
+
+def test_every_family_has_a_side_that_the_hand_can_span():
+    for index in range(900, 1000):
+        shape = make_primitive(index)
+        if len(shape.parts) == 1:
+            sides = np.sort(np.ptp(shape.parts[0], axis=0))
+            assert sides[1] <= 0.065
+        else:  # a bar or a wall: a part whose thinner side fits
+            assert min(np.ptp(part, axis=0).min() for part in shape.parts) <= 0.065
+
+
+def test_parts_of_primitives_touch_but_do_not_overlap():
+    for family in ("L", "T", "U", "cross", "ring", "bowl", "mug"):
+        parts = make_primitive(FAMILIES.index(family)).parts
+        hulls = [trimesh.convex.convex_hull(part) for part in parts]
+        union = trimesh.boolean.union(hulls, engine="manifold")
+        assert union.volume == pytest.approx(sum(hull.volume for hull in hulls), rel=1e-3)
+        # one body, but for slivers of rounding where two surfaces touch
+        assert max(piece.volume for piece in union.split()) > 0.999 * union.volume
+
+
+# --- sets -----------------------------------------------------------------------------------
+
+
+def test_sizes_and_disjoint_splits(tmp_path):
+    for name, train_size in (("primitives", 900), ("random_urdfs", 899)):
+        train = load_object_set(name, split="train", cache_dir=tmp_path)
+        test = load_object_set(name, split="test", cache_dir=tmp_path)
+        assert (len(train), len(test)) == (train_size, 100)
+        key = "indices" if name == "primitives" else "files"
+        assert not set(getattr(train, key)) & set(getattr(test, key))
+
+
+def test_families_are_equally_frequent(tmp_path):
+    indices = load_object_set("primitives", split="train", cache_dir=tmp_path).indices
+    counts = np.bincount([index % len(FAMILIES) for index in indices])
+    assert counts.max() - counts.min() <= 1
+
+
+def test_a_primitive_depends_on_its_index_alone():
+    for index in (0, 10, 905):
+        first, second = make_primitive(index), make_primitive(index)
+        assert first.color == second.color and first.density == second.density
+        for a, b in zip(first.parts, second.parts, strict=True):
+            assert np.array_equal(a, b)
+    assert make_primitive(0).color != make_primitive(11).color
+
+
+def test_primitives_weigh_and_slide_as_promised(tmp_path):
+    objects = load_object_set("primitives", cache_dir=tmp_path)
+    for model in (objects[index] for index in range(len(FAMILIES))):
+        assert 0.4 <= model.friction <= 1.0
+        assert 0.03 - 1e-6 <= model.mass <= 0.3 + 1e-6
+
+
+def test_a_set_is_a_sequence_that_makes_each_object_once(tmp_path):
+    objects = load_object_set("primitives", cache_dir=tmp_path)
+    assert objects[0] is objects[0]
+    assert objects[-1] is objects[99]
+    with pytest.raises(IndexError):
+        objects[100]
+
+
+def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
+    _write_folder(tmp_path / "things")
+    serial = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "a")
+    parallel = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "b")
+    prepare(serial, workers=1)
+    prepare(parallel, workers=2)
+    for a, b in zip(serial, parallel, strict=True):
+        assert a.name == b.name and a.mass == b.mass
+        assert Path(b.collision).parent == tmp_path / "b" and b.collision.exists()
+
+
+# --- random_urdfs ---------------------------------------------------------------------------
+
+
+def test_random_urdfs_are_concave_and_named(tmp_path):
+    model = load_object_set("random_urdfs", cache_dir=tmp_path)[0]
+    assert model.name == "000" and model.friction == 1.0
+    assert len(model.parts) > 1
+    mesh = trimesh.load_scene(model.fine_visual.path).to_mesh()
+    # 0.015 is the URDF's own scale, 0.65 the set's
+    assert model.fine_visual.scale == pytest.approx((0.015 * 0.65,) * 3)
+    shown = mesh.vertices * model.fine_visual.scale + model.fine_visual.position
+    assert np.concatenate(model.parts).min(axis=0) == pytest.approx(shown.min(axis=0), abs=5e-4)
+    assert np.concatenate(model.parts).max(axis=0) == pytest.approx(shown.max(axis=0), abs=5e-4)
+
+
+@pytest.mark.parametrize("number", BROKEN_RANDOM_URDFS)
+def test_the_broken_random_urdf_is_broken_and_says_so(tmp_path, number):
+    path = DATA / "random_urdfs" / f"{number}" / f"{number}.urdf"
+    with pytest.raises(ObjectError, match=f"{number}.obj has .* not finite"):
+        load_object(path, cache_dir=tmp_path)
+    files = load_object_set("random_urdfs", split="train", cache_dir=tmp_path).files
+    assert path not in files
+
+
+# --- folders --------------------------------------------------------------------------------
+
+URDF = """<robot name="t"><link name="a">
+  <contact><lateral_friction value="0.3"/></contact>
+  <visual><geometry><mesh filename="mesh/box.obj" scale="0.5 0.5 0.5"/></geometry>
+    <material name="m"><color rgba="0 1 0 1"/></material></visual>
+  <collision><geometry><mesh filename="mesh/box.obj" scale="0.5 0.5 0.5"/></geometry></collision>
+</link>
+<link name="b"><collision><geometry><box size="0.02 0.02 0.02"/></geometry></collision></link>
+<joint name="j" type="fixed"><parent link="a"/><child link="b"/><origin xyz="0 0 0.03"/></joint>
+</robot>"""
+
+
+def _write_folder(folder: Path) -> None:
+    (folder / "sub" / "mesh").mkdir(parents=True)
+    for suffix in ("obj", "stl", "ply", "glb"):
+        trimesh.creation.box((0.03, 0.04, 0.08)).export(folder / f"one.{suffix}")
+    trimesh.creation.box((0.08, 0.08, 0.08)).export(folder / "sub" / "mesh" / "box.obj")
+    (folder / "sub" / "two.urdf").write_text(URDF)
+
+
+def test_a_folder_holds_its_urdfs_and_the_meshes_that_none_of_them_uses(tmp_path):
+    _write_folder(tmp_path / "things")
+    objects = load_object_set(str(tmp_path / "things"), density=800, cache_dir=tmp_path / "cache")
+    assert objects.name == "things"
+    assert [path.name for path in objects.files] == [
+        "one.glb", "one.obj", "one.ply", "one.stl", "two.urdf",
+    ]  # fmt: skip
+    for index in range(4):
+        assert np.sort(objects[index].extents) == pytest.approx([0.03, 0.04, 0.08], abs=1e-6)
+        assert objects[index].mass == pytest.approx(800 * 0.03 * 0.04 * 0.08)
+    # a 2 cm cube stands on a 4 cm cube
+    urdf = objects[4]
+    assert urdf.mass == pytest.approx(800 * (0.04**3 + 0.02**3))
+    assert urdf.extents == pytest.approx([0.04, 0.04, 0.06], abs=1e-6)
+    assert urdf.friction == 0.3 and urdf.color == (0, 1, 0, 1)
+
+
+def test_fine_visuals_of_every_format_can_be_spawned(tmp_path, client):
+    _write_folder(tmp_path / "things")
+    for model in load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "cache"):
+        body = spawn(client, model, (0, 0, 1), IDENTITY, fine=True)
+        (shape,) = pybullet.getVisualShapeData(body, physicsClientId=client)
+        assert Path(shape[4].decode()) == model.fine_visual.path
+        assert shape[7] == pytest.approx(model.color)
+
+
+def test_fit_makes_the_middle_side_what_it_says(tmp_path):
+    _write_folder(tmp_path / "things")
+    folder = str(tmp_path / "things")
+    model = load_object_set(folder, fit=0.06, cache_dir=tmp_path / "cache")[1]
+    assert np.sort(model.extents) == pytest.approx([0.045, 0.06, 0.12], abs=1e-6)
+    model = load_object_set(folder, fit=0.06, scale=0.5, cache_dir=tmp_path / "cache")[1]
+    assert np.sort(model.extents) == pytest.approx([0.0225, 0.03, 0.06], abs=1e-6)
+
+
+def test_objects_in_wrong_units_warn_once(tmp_path):
+    (tmp_path / "big").mkdir()
+    for name in ("a", "b"):
+        trimesh.creation.box((3, 4, 8)).export(tmp_path / "big" / f"{name}.stl")
+    objects = load_object_set(str(tmp_path / "big"), cache_dir=tmp_path / "cache")
+    with pytest.warns(UserWarning, match=f"a.stl .* opens {HAND_OPENING} m .*objects.fit"):
+        objects[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        objects[1]
+
+
+# --- errors ---------------------------------------------------------------------------------
+
+
+def test_an_unknown_set_names_what_is_allowed(tmp_path):
+    with pytest.raises(ObjectError, match="'boxes' .* box, primitives, random_urdfs .* folder"):
+        load_object_set("boxes", cache_dir=tmp_path)
+
+
+def test_an_empty_folder_names_the_suffixes(tmp_path):
+    with pytest.raises(ObjectError, match=r"holds no object.*\.urdf, \.obj, \.stl, \.ply, \.glb"):
+        load_object_set(str(tmp_path), cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"split": "val"}, "objects.split is 'val'; allowed are 'train' and 'test'"),
+        ({"scale": -1.0}, "objects.scale is -1.0"),
+        ({"density": float("nan")}, "objects.density is nan"),
+        ({"fit": 0.06}, "objects.fit does not apply"),
+    ],
+)
+def test_arguments_out_of_range_are_named(tmp_path, arguments, message):
+    with pytest.raises(ObjectError, match=message):
+        load_object_set("primitives", cache_dir=tmp_path, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<robot", "bad.urdf cannot be read"),
+        ('<robot name="r"><link name="l"/></robot>', "bad.urdf has neither"),
+        (URDF, "box.obj does not exist"),
+    ],
+)
+def test_a_bad_urdf_is_named(tmp_path, content, message):
+    path = tmp_path / "bad.urdf"
+    path.write_text(content)
+    with pytest.raises(ObjectError, match=message):
+        load_object(path, cache_dir=tmp_path)

@@ -1,0 +1,130 @@
+"""Frames and grasps: closed forms and round trips."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from utils.transforms import (
+    Grasp,
+    ImageGrasp,
+    RGBDFrame,
+    angle_difference,
+    deproject,
+    grasp_to_image,
+    image_to_grasp,
+    inverse_pose,
+    look_at,
+    pose_matrix,
+    position_quaternion,
+    project,
+    top_down_pose,
+    wrap_to_pi_range,
+)
+
+K = np.array([[400.0, 0.0, 111.5], [0.0, 400.0, 111.5], [0.0, 0.0, 1.0]])
+angles = st.floats(-20, 20)
+small = st.floats(-0.15, 0.15)
+
+
+def test_top_down_pose_by_hand():
+    # Closing along +x: y_E = x_W, z_E = -z_W, hence x_E = y_E x z_E = x_W x (-z_W) = y_W.
+    T = top_down_pose([0.4, 0.1, 0.2], 0.0)
+    np.testing.assert_allclose(T[:3, :3], [[0, 1, 0], [1, 0, 0], [0, 0, -1]], atol=1e-15)
+    np.testing.assert_allclose(T[:3, 3], [0.4, 0.1, 0.2])
+
+
+@given(angles)
+def test_top_down_pose_is_a_rotation_that_closes_along_the_angle(angle):
+    R = top_down_pose(np.zeros(3), angle)[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    np.testing.assert_allclose(R[:, 1], [np.cos(angle), np.sin(angle), 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("angle", "wrapped"), [(0, 0), (np.pi, 0), (-0.1, np.pi - 0.1), (7, 7 - 2 * np.pi)]
+)
+def test_wrap_by_hand(angle, wrapped):
+    assert wrap_to_pi_range(angle) == pytest.approx(wrapped)
+
+
+@given(angles)
+def test_wrap_stays_in_range(angle):
+    assert 0 <= wrap_to_pi_range(angle) < np.pi
+
+
+def test_angle_difference_across_the_seam():
+    degrees = np.degrees(angle_difference(np.radians([179, 1, 45]), np.radians([1, 179, 135])))
+    np.testing.assert_allclose(degrees, [2, 2, 90])
+
+
+def test_pose_round_trip_and_inverse():
+    quaternion = Rotation.random(rng=np.random.default_rng(0)).as_quat(canonical=True)
+    T = pose_matrix([1.0, 2.0, 3.0], quaternion)
+    position, again = position_quaternion(T)
+    np.testing.assert_allclose(position, [1, 2, 3])
+    assert abs(again @ quaternion) == pytest.approx(1)
+    np.testing.assert_allclose(T @ inverse_pose(T), np.eye(4), atol=1e-12)
+
+
+def test_camera_above_the_table_by_hand():
+    # 0.8 m above (0.5, 0), image up = +x: a point 0.1 m to the robot's left (+y) and on the table
+    # appears 400 * 0.1 / 0.8 = 50 px left of the centre.
+    T = look_at([0.5, 0, 0.8], [0.5, 0, 0], up=(1, 0, 0))
+    pixel, depth = project(np.array([0.5, 0.1, 0.0]), K, T)
+    np.testing.assert_allclose(pixel, [111.5 - 50, 111.5], atol=1e-9)
+    assert depth == pytest.approx(0.8)
+    np.testing.assert_allclose(deproject(pixel, depth, K, T), [0.5, 0.1, 0.0], atol=1e-12)
+
+
+def test_points_behind_the_camera_have_no_pixel():
+    T = look_at([0, 0, 1], [0, 0, 0], up=(1, 0, 0))
+    assert np.isnan(project(np.array([0.0, 0.0, 2.0]), K, T)[0]).all()
+
+
+@pytest.mark.parametrize("eye", [(0, 0, 1), (0, 0, 0)])
+def test_look_at_refuses_undefined_views(eye):
+    with pytest.raises(ValueError, match="look_at"):
+        look_at(eye, (0, 0, 0), up=(0, 0, 1))
+
+
+@given(small, small, st.floats(0, 0.15), angles, st.floats(0, 0.08), small, small)
+def test_grasp_image_round_trip(x, y, z, angle, width, tilt_x, tilt_y):
+    T_WC = look_at([0.5 + tilt_x, tilt_y, 0.8], [0.5, 0.0, 0.0], up=(1, 0.1, 0))
+    grasp = Grasp(np.array([0.5 + x, y, z]), angle, width, 0.7)
+    again = image_to_grasp(grasp_to_image(grasp, K, T_WC), K, T_WC)
+    np.testing.assert_allclose(again.position, grasp.position, atol=1e-9)
+    assert angle_difference(again.angle, grasp.angle) < 1e-9
+    assert (again.width, again.quality) == (grasp.width, grasp.quality)
+
+
+def test_image_angle_by_hand():
+    # Seen from above with image up = +x, image right = -y: closing along +x is vertical.
+    T = look_at([0.5, 0, 0.8], [0.5, 0, 0], up=(1, 0, 0))
+    on_image = grasp_to_image(Grasp(np.array([0.5, 0, 0]), 0.0, 0.05, 1.0), K, T)
+    assert isinstance(on_image, ImageGrasp)
+    assert on_image.angle == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [((0, 0), 0, 0.05, 1), ((0, 0, np.nan), 0, 0.05, 1), ((0, 0, 0), np.inf, 0.05, 1),
+     ((0, 0, 0), 0, -0.01, 1)],
+)  # fmt: skip
+def test_grasp_refuses_nonsense(arguments):
+    position, *rest = arguments
+    with pytest.raises(ValueError, match="Grasp"):
+        Grasp(np.array(position, dtype=float), *rest)
+
+
+def test_frame_points_and_blinding():
+    depth = np.array([[0.8, 0.0]], dtype=np.float32)
+    T = look_at([0.5, 0, 0.8], [0.5, 0, 0], up=(1, 0, 0))
+    flat = np.array([[100.0, 0, 0], [0, 100.0, 0], [0, 0, 1]])
+    frame = RGBDFrame(np.zeros((1, 2, 3), np.uint8), depth, flat, T, np.zeros((1, 2)), "secret")
+    np.testing.assert_allclose(frame.points()[0, 0], [0.5, 0, 0], atol=1e-7)
+    assert np.isnan(frame.points()[0, 1]).all()
+    blind = frame.without_truth()
+    assert blind.truth is None and blind.segmentation is None
