@@ -18,23 +18,23 @@ import argparse
 import multiprocessing
 import platform
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
 from envs.cell import Cell
 from envs.execution import GraspOutcome
-from envs.objects import ObjectSet, load_object_set
+from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
 from models.planners import PLANNERS, make_planner
-from utils.config import Config, parse_args, run_script
+from utils.config import OBJECT_SETS, Config, parse_args, run_script
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import draw_grasp
@@ -57,8 +57,7 @@ from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_policies(config)
-    for name in config.evaluate.object_sets:
-        load_objects(name, config)  # an unusable folder is reported before any work is done
+    check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     device = f"{platform.machine()} CPU, {worker_count(config)} workers"
     announce(config, run, device)
@@ -89,6 +88,15 @@ def check_policies(config: Config) -> None:
     for name in config.evaluate.policies:
         if name not in PLANNERS:
             raise unknown_choice("evaluate.policies", name, PLANNERS)
+
+
+def check_objects(config: Config) -> None:
+    """Raise UserError for an unusable object set. Someone's own meshes are read and cut into
+    convex parts here, so that a broken one is named before any work is done."""
+    for name in config.evaluate.object_sets:
+        objects = load_objects(name, config)
+        if name not in OBJECT_SETS:
+            prepare(objects, min(worker_count(config), len(objects)))
 
 
 def load_objects(name: str, config: Config) -> ObjectSet:
@@ -154,7 +162,8 @@ def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Ta
                     p for p in plan.policies if (p, scenario, objects, seed) not in known
                 )
                 if policies:
-                    film = run / "films" if number < plan.videos else None
+                    filmed = number < plan.videos and scenario == plan.scenarios[-1]
+                    film = run / "films" if filmed else None
                     yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
 
 
@@ -169,21 +178,28 @@ def evaluate(config: Config, run: Path) -> Outcome:
         initargs=(config,),
     )
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
+    todo, pending = tasks(config, outcome.rounds, run), set()
     try:
-        pending = {pool.submit(work, task) for task in tasks(config, outcome.rounds, run)}
-        while pending:
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in finished:
-                _collect(future, outcome, journal, progress)
-    except KeyboardInterrupt:
-        outcome.interrupted = True
+        with pool:
+            try:
+                while True:
+                    # No more than one scene a worker is under way, so that an end is soon an end.
+                    more = islice(todo, worker_count(config) - len(pending))
+                    pending |= {pool.submit(work, task) for task in more}
+                    if not pending:
+                        break
+                    finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                    _collect(finished, outcome, journal, progress)
+            except KeyboardInterrupt:
+                outcome.interrupted = True
+                progress.write("interrupted: finishing the scenes under way")
+                _collect(wait(pending).done, outcome, journal, progress)
     except BrokenProcessPool as error:
         raise UserError(
             f"a worker process died (out of memory?); {len(outcome.rounds)} rounds are safe in "
             f"{journal}: go on with --resume {run}, perhaps with evaluate.workers=1"
         ) from error
     finally:
-        pool.shutdown(wait=not outcome.interrupted, cancel_futures=True)
         progress.close()
     outcome.rounds.sort(key=lambda r: _rank(r, config))
     outcome.gallery = _balanced(outcome.gallery, config.evaluate.gallery)
@@ -191,14 +207,17 @@ def evaluate(config: Config, run: Path) -> Outcome:
     return outcome
 
 
-def _collect(future: Future, outcome: Outcome, journal: Path, progress: tqdm) -> None:
-    rounds, pictures, films = future.result()
-    for record in rounds:
-        append_round(journal, record)
-    outcome.rounds += rounds
-    outcome.gallery += pictures
-    outcome.films += films
-    progress.update(len(rounds))
+def _collect(
+    finished: Iterable[Future], outcome: Outcome, journal: Path, progress: tqdm
+) -> None:
+    for future in finished:
+        rounds, pictures, films = future.result()
+        for record in rounds:
+            append_round(journal, record)
+        outcome.rounds += rounds
+        outcome.gallery += pictures
+        outcome.films += films
+        progress.update(len(rounds))
 
 
 def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
@@ -262,7 +281,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
 def picture(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, caption: str) -> GalleryItem:
     """The frame with the grasp drawn in, and how it went."""
     on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
-    image = draw_grasp(np.asarray(frame.rgb), on_image, frame.K, success=outcome.success)
+    image = draw_grasp(frame.rgb, on_image, frame.K, success=outcome.success)
     return GalleryItem(image, f"{caption}: {outcome.reason}", outcome.success)
 
 

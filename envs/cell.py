@@ -21,6 +21,8 @@ from utils.geometry import SceneGeometry, SolidObject
 from utils.transforms import RGBDFrame, look_at, pose_matrix
 
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
+# An object farther than this share of the workspace's side from its centre is out of the game.
+_REACH = 0.63
 
 
 class PhysicsError(RuntimeError):
@@ -123,7 +125,7 @@ class Cell:
         # is still in the game; one behind the robot or off the table is not.
         position = self.object_position(index)
         margin = abs(position[:2] - self.config.workspace.center).max()
-        return on_table(position) and margin <= 0.7 * self.config.workspace.size
+        return on_table(position) and margin <= _REACH * self.config.workspace.size
 
     def camera_pose(self, mount: str | None = None) -> np.ndarray:
         """(4, 4) T_WC of the overhead or the wrist camera."""

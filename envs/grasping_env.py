@@ -28,7 +28,8 @@ from envs.panda import (
     MAX_OPENING,
     TIP,
     ServoStep,
-    forward_kinematics,
+    moved,
+    pose_error,
 )
 from envs.scenes import make_scene
 from envs.studio import Studio
@@ -39,7 +40,10 @@ from utils.errors import UserError
 _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
-_FOLLOW_TOLERANCE = 0.005  # m between the commanded and the reachable E before it is reported
+# How far the arm's answer to a command may lie from it before the command is refused.
+_FOLLOW_POSITION, _FOLLOW_ROTATION = 0.005, 0.03  # m, rad
+_LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
+_FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
 
 class RobotGraspingEnv(gymnasium.Env):
@@ -54,7 +58,8 @@ class RobotGraspingEnv(gymnasium.Env):
     `rotation_step` radians, both in W. `ee_planar`: dx, dy, dz, dyaw. `joint`: seven changes in
     units of `joint_step` radians. Changes add up on the *commanded* pose, are held within the
     workspace and the joint limits, and are scaled down as a whole where a joint would have to
-    exceed its velocity limit.
+    exceed its velocity limit. The command stays where it is when the arm cannot reach the new
+    one, or is held up by something on its way.
 
     Reward (`dense`): 1 at success, plus the change of a potential, so that it cannot alter which
     policy is best (Ng, Harada and Russell, "Policy invariance under reward transformations",
@@ -71,8 +76,8 @@ class RobotGraspingEnv(gymnasium.Env):
     (`off_table`) or the physics has blown up (`physics`). Truncation: `max_steps` actions.
 
     info: `is_success`, `reason` (why the episode ended, or None), `object_position` (3,),
-    `end_effector_position` (3,), `grasped`, `reachable` (False where the command could not be
-    followed), `scene_seed`.
+    `end_effector_position` (3,), `grasped`, `reachable` (False where the action was
+    refused), `scene_seed`.
 
     Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
     file, or None for the defaults. Any key of the config's `env` section can be given by name:
@@ -162,8 +167,8 @@ class RobotGraspingEnv(gymnasium.Env):
             self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
         )
         self.cell.load(scene)
-        self._q_command = self.cell.home.copy()
-        self._T_command = forward_kinematics(self._q_command)
+        self._servo = ServoStep(self.cell.home.copy())  # at the commanded joint positions
+        self._T_command = self._servo.reached
         self._reachable = True
         self._steps = 0
         self._held_steps = 0
@@ -251,33 +256,59 @@ class RobotGraspingEnv(gymnasium.Env):
 
     def _command(self, action: np.ndarray) -> None:
         """Move the commanded pose by an action and send the motors there."""
-        settings, q = self.settings, self._q_command
-        if settings.control == "joint":
-            goal = q + settings.joint_step * action[:7]
+        if self.settings.control == "joint":
+            goal = self._servo.q + self.settings.joint_step * action[:7]
             goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
+            goal, _ = self._within_speed(goal)
+            self._reachable = not self._blocked(goal)
+            if self._reachable:
+                self._servo = ServoStep(goal)
         else:
-            servo = ServoStep(q)
-            self._move_command_pose(action, servo.reached)
-            goal = servo.towards(self._T_command)
-        change = goal - q
-        excess = float((abs(change) / self._max_joint_change).max())
-        self._q_command = q + change / max(excess, 1.0)
-        self.cell.robot.drive_arm_to(self._q_command, self.config.robot.velocity_scale)
+            self._follow(self._moved_pose(action))
+        self.cell.robot.drive_arm_to(self._servo.q, self.config.robot.velocity_scale)
         self.cell.robot.command_gripper(MAX_OPENING * (action[-1] + 1) / 2)
 
-    def _move_command_pose(self, action: np.ndarray, reached: np.ndarray) -> None:
-        settings, T = self.settings, self._T_command
-        # A command that the arm could not follow is taken back to where the arm got, so that it
-        # does not wind up.
-        self._reachable = abs(reached[:3, 3] - T[:3, 3]).max() < _FOLLOW_TOLERANCE
-        if not self._reachable:
-            T[:] = reached
+    def _moved_pose(self, action: np.ndarray) -> np.ndarray:
+        """(4, 4) the commanded pose of E moved by an action, within the workspace."""
+        settings, T = self.settings, self._T_command.copy()
         position = T[:3, 3] + settings.position_step * action[:3]
         T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if turn.any():
             R = Rotation.from_rotvec(settings.rotation_step * turn).as_matrix()
             T[:3, :3] = R @ T[:3, :3]
+        return T
+
+    def _follow(self, target: np.ndarray) -> None:
+        """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
+        where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
+        start = self._servo
+        motion = pose_error(self._T_command, target)
+        goal, share = self._within_speed(start.towards(target))
+        for _ in range(_FOLLOW_TRIES):
+            wanted = target if share == 1.0 else moved(self._T_command, share * motion)
+            servo = ServoStep(goal)
+            error = abs(pose_error(servo.reached, wanted))
+            if error[:3].max() < _FOLLOW_POSITION and error[3:].max() < _FOLLOW_ROTATION:
+                self._reachable = not self._blocked(goal)
+                if self._reachable:
+                    self._servo, self._T_command = servo, wanted
+                return
+            goal, slower = self._within_speed(servo.towards(wanted))
+            share *= slower
+        self._reachable = False
+
+    def _blocked(self, goal: np.ndarray) -> bool:
+        """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""
+        now = self._state[:7]
+        lead = abs(goal - now).max()
+        return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
+
+    def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
+        """Joint positions (7,) towards `goal` within this action's time, and the share of the way."""
+        change = goal - self._servo.q
+        share = 1.0 / max(float((abs(change) / self._max_joint_change).max()), 1.0)
+        return self._servo.q + share * change, share
 
     # --- What happened ----------------------------------------------------------------------
 
@@ -286,10 +317,10 @@ class RobotGraspingEnv(gymnasium.Env):
         cell = self.cell
         q, velocity, opening = cell.robot.joint_state()
         self._state = np.array([*q, *velocity, opening], dtype=np.float32)
-        tip = pybullet.getLinkState(cell.robot.body, TIP, physicsClientId=cell.client)[0]
-        self._tip = np.array(tip)
         if not np.isfinite(self._state).all():
             raise PhysicsError("the robot's state is not finite")
+        tip = pybullet.getLinkState(cell.robot.body, TIP, physicsClientId=cell.client)[0]
+        self._tip = np.array(tip)
         positions = [cell.object_position(i) for i in range(len(cell.bodies))]
         distances = [float(np.linalg.norm(p - self._tip)) for p in positions]
         nearest = min(range(len(positions)), key=distances.__getitem__)
@@ -344,23 +375,29 @@ def _camera_of_env(config: Config) -> Config:
     )
 
 
+def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:
+    """(5,) `ee_planar` action of a simple pick of the nearest object: above it, down, close, up."""
+    offset = info["object_position"] - info["end_effector_position"]
+    over_it = bool(np.linalg.norm(offset[:2]) < 0.01)
+    if not over_it:
+        offset[2] += 0.12
+    opening = env.get_gripper_width()
+    closing = info["grasped"] or opening < 0.07 or (over_it and abs(offset[2]) < 0.01)
+    if closing:
+        offset[:] = 0.0, 0.0, 0.05 if info["grasped"] else 0.0
+    move = np.clip(offset / env.settings.position_step, -1, 1)
+    return np.array([*move, 0.0, -1.0 if closing else 1.0], dtype=np.float32)
+
+
 def main() -> None:
-    """A scripted pick: above the object, down, close, up."""
+    """The scripted pick on the default scene."""
     env = RobotGraspingEnv(render_mode="rgb_array", control="ee_planar")
     observation, info = env.reset(seed=0)
     print("observation:", {name: value.shape for name, value in observation.items()})
     print("action:", env.action_space)
     done, step, total = False, 0, 0.0
     while not done:
-        offset = info["object_position"] - info["end_effector_position"]
-        over_it = np.linalg.norm(offset[:2]) < 0.01
-        down = offset[2] if over_it else offset[2] + 0.12
-        closing = over_it and abs(offset[2]) < 0.01 or info["grasped"] or env.get_gripper_width() < 0.07
-        if closing:
-            offset[:2], down = 0.0, 0.05 if info["grasped"] else 0.0
-        move = np.clip(np.array([*offset[:2], down]) / env.settings.position_step, -1, 1)
-        action = np.array([*move, 0.0, -1.0 if closing else 1.0], dtype=np.float32)
-        observation, reward, terminated, truncated, info = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(scripted_action(env, info))
         total, step, done = total + reward, step + 1, terminated or truncated
         if step % 5 == 0 or done:
             print(

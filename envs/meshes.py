@@ -31,17 +31,18 @@ VERTEX_TOLERANCE = 0.004  # a hull may cut its own corners by this much: 0.3 mm 
 MERGE_TOLERANCE = 0.03  # two parts become one if that adds less than this part of the volume
 CONVEX_RATIO = 0.95  # volume / hull volume from which a mesh counts as convex
 MAX_PAIRWISE = 24  # above this many pieces only the smallest looks for a partner: n instead of n^2
-# Chosen for time: 1 to 3 s for a scanned object. Without its remeshing ("off", and "auto" when the
-# mesh is clean) CoACD takes up to minutes; its own decimation shrinks hulls by up to a sixth.
+# Chosen for time: 4 to 10 s for a scanned object on one core. Without its remeshing ("off", and
+# "auto" when the mesh is clean) or with a shallower search, whose many cuts have to be merged again
+# (50 s for a ring), CoACD takes up to minutes; its own decimation shrinks hulls by up to a sixth.
 COACD_SETTINGS = {
     "threshold": 0.08,
     "max_convex_hull": MAX_PARTS,
     "preprocess_mode": "on",
     "preprocess_resolution": 30,
     "resolution": 300,
-    "mcts_iterations": 30,
-    "mcts_nodes": 6,
-    "mcts_max_depth": 1,
+    "mcts_iterations": 60,
+    "mcts_nodes": 10,
+    "mcts_max_depth": 2,
     "decimate": False,
 }
 _CACHE_VERSION = 1

@@ -37,13 +37,26 @@ FINGERS = [LEFT_FINGER, RIGHT_FINGER]
 _A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
 _ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2)
 _D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
-_TWISTS = [Rotation.from_euler("x", alpha).as_matrix() for alpha in _ALPHA]
-_OFFSETS = [
-    np.array([a, -np.sin(alpha) * d, np.cos(alpha) * d]) for a, alpha, d in zip(_A, _ALPHA, _D)
-]
+
+
+def _link_terms() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(7, 4, 4) each: link i's transform is constant + cosine * cos(q_i) + sine * sin(q_i)."""
+    constant, cosine, sine = np.zeros((3, 7, 4, 4))
+    for i, (a, alpha, d) in enumerate(zip(_A, _ALPHA, _D)):
+        twist = np.eye(4)
+        twist[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
+        twist[:3, 3] = a, -np.sin(alpha) * d, np.cos(alpha) * d
+        constant[i] = twist @ np.diag([0.0, 0.0, 1.0, 1.0])
+        cosine[i] = twist @ np.diag([1.0, 1.0, 0.0, 0.0])
+        sine[i, :, 0], sine[i, :, 1] = twist[:, 1], -twist[:, 0]
+    return constant, cosine, sine
+
+
+_LINK_CONSTANT, _LINK_COSINE, _LINK_SINE = _link_terms()
 # Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
-_TOOL_ROTATION = Rotation.from_euler("z", -np.pi / 4).as_matrix()
-_TOOL_OFFSET = np.array([0.0, 0.0, 0.107 + 0.105])
+_TOOL = np.eye(4)
+_TOOL[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
+_TOOL[:3, 3] = 0.0, 0.0, 0.107 + 0.105
 
 
 class UnreachableError(UserError):
@@ -57,24 +70,17 @@ def forward_kinematics(q: np.ndarray) -> np.ndarray:
 
 def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
-    axes = np.empty((7, 3))
-    origins = np.empty((7, 3))
-    rotation, position = np.eye(3), np.zeros(3)
-    cosines, sines = np.cos(q), np.sin(q)
-    for i in range(7):
-        position = position + rotation @ _OFFSETS[i]
-        rotation = rotation @ _TWISTS[i]
-        origins[i], axes[i] = position, rotation[:, 2]
-        c, s = cosines[i], sines[i]
-        turned = np.empty((3, 3))
-        turned[:, 0] = rotation[:, 0] * c + rotation[:, 1] * s
-        turned[:, 1] = rotation[:, 1] * c - rotation[:, 0] * s
-        turned[:, 2] = rotation[:, 2]
-        rotation = turned
-    T = np.eye(4)
-    T[:3, :3] = rotation @ _TOOL_ROTATION
-    T[:3, 3] = position + rotation @ _TOOL_OFFSET
-    arm = T[:3, 3] - origins
+    cosines, sines = np.cos(q)[:, None, None], np.sin(q)[:, None, None]
+    links = _LINK_CONSTANT + cosines * _LINK_COSINE + sines * _LINK_SINE
+    T = links[0]
+    poses = [T]
+    for link in links[1:]:
+        T = T @ link
+        poses.append(T)
+    T = T @ _TOOL
+    frames = np.array(poses)
+    axes = frames[:, :3, 2]
+    arm = T[:3, 3] - frames[:, :3, 3]
     jacobian = np.empty((6, 7))
     jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
     jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
@@ -104,6 +110,14 @@ def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
     error[:3] = target[:3, 3] - T[:3, 3]
     error[3:] = rotation_vector(target[:3, :3] @ T[:3, :3].T)
     return error
+
+
+def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix() @ T[:3, :3]
+    result[:3, 3] = T[:3, 3] + motion[:3]
+    return result
 
 
 def inverse_kinematics(
@@ -235,6 +249,11 @@ class Panda:
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
             )
+        # The motors' own limit holds back the motors only: a quick shoulder throws the light wrist.
+        # Bullet has one such limit for all joints of a body.
+        pybullet.changeDynamics(
+            self.body, -1, maxJointVelocity=JOINT_VELOCITY.max(), physicsClientId=client
+        )
 
     def place(self, q: np.ndarray, opening: float = MAX_OPENING) -> None:
         """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""

@@ -16,7 +16,7 @@ from envs.cell import Cell
 from envs.panda import ARM, FINGERS
 from utils.transforms import look_at
 
-SCENIC_EYE, SCENIC_TARGET = (1.35, -0.55, 0.75), (0.36, -0.10, 0.24)  # m in W
+SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
 
 
@@ -58,7 +58,7 @@ class Studio:
 class Film:
     """Films a cell from now on, at `rate` pictures a second of simulated time, until written."""
 
-    def __init__(self, cell: Cell, rate: int = 10, width: int = 480, height: int = 368):
+    def __init__(self, cell: Cell, rate: int = 6, width: int = 480, height: int = 368):
         self._cell, self._rate = cell, rate
         self._studio = Studio(cell, width, height)
         self._pictures: list[np.ndarray] = []

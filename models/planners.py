@@ -311,9 +311,10 @@ def measure(
     centre = heights.centres[label]
     arm_across = np.abs(((centre[:, :2] - xy) * across).sum(axis=1))
     arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
+    arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
 
     score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
-    score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2)
+    score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
     score *= 0.4 + 0.6 * np.minimum(cover_left, cover_right)
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp(room, (0.003, 0.008), (0.4, 1.0))
@@ -352,8 +353,9 @@ def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.
 
 def _palm_gap(xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006) -> np.ndarray:
     """(N,) smallest height of the palm's underside, fingertips at 0, over the scene in W."""
-    # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2).
-    radius = int(np.ceil(step / np.sqrt(2) / heights.cell))
+    # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
+    # more cell for rounding to the grid.
+    radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     scene = cv2.dilate(heights.height, disc)
     ends = gripper.palm_half_length, gripper.palm_outline[-1][0]

@@ -67,8 +67,9 @@ def height_map_from_frame(
     hidden = ~np.isfinite(seen)
     table = workspace.table_height
     # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
+    # OpenCV pads with the largest double, which a cell far outside the view would inherit.
     lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
-    height = np.maximum(np.where(hidden, np.where(np.isfinite(lowest), lowest, table), seen), table)
+    height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, table), seen), table)
     # The rays that graze an edge bound what may stand in its shadow.
     ceiling = _splat(_grazing_points(frame, cell), grid.shape[:2], origin, cell)
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)

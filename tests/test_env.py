@@ -1,0 +1,486 @@
+"""`RobotGrasping-v0`: Gymnasium's contract, physics limits, reward, success and its endings."""
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import psutil
+import pybullet
+import pytest
+from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+from envs.cell import PhysicsError
+from envs.grasping_env import RobotGraspingEnv, scripted_action
+from envs.panda import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
+from utils.config import ConfigError
+from utils.errors import UserError
+
+SIDE = 32  # pixels
+CONTROLS = {"ee": 7, "ee_planar": 5, "joint": 8}  # and the sizes of their actions
+OBSERVATIONS = [["rgb"], ["depth"], ["state"], ["rgb", "depth", "state"]]
+
+
+@pytest.fixture
+def make(config):
+    """Makes environments, state-only unless told otherwise, and closes them after the test."""
+    made = []
+
+    def make_env(render_mode=None, **settings) -> RobotGraspingEnv:
+        settings = {"observations": ["state"], "resolution": SIDE} | settings
+        made.append(RobotGraspingEnv(render_mode, config, **settings))
+        return made[-1]
+
+    yield make_env
+    for env in made:
+        env.close()
+
+
+@pytest.fixture
+def picked(make):
+    """An env whose object is in the hand, one step before success, and the last info."""
+    env = make(control="ee_planar", hold_seconds=10.0)
+    _, info = env.reset(seed=0)
+    while not (info["grasped"] and info["object_position"][2] > env.settings.lift_height):
+        *_, info = env.step(scripted_action(env, info))
+    return env, info
+
+
+def run(env, seed: int, steps: int) -> Iterator[tuple]:
+    """What a reset and then `steps` random actions give back, one by one."""
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    yield observation, info
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        yield env.step(action)
+
+
+def assert_identical(a, b) -> None:
+    """Bit-identical nested tuples, dicts, arrays and scalars."""
+    assert type(a) is type(b)
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_identical(a[key], b[key])
+    elif isinstance(a, (tuple, list)):
+        assert len(a) == len(b)
+        for x, y in zip(a, b):
+            assert_identical(x, y)
+    else:
+        np.testing.assert_array_equal(a, b)
+
+
+# --- Gymnasium's contract ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", ["overhead", "wrist"])
+@pytest.mark.parametrize("observations", OBSERVATIONS, ids="+".join)
+@pytest.mark.parametrize("control", CONTROLS)
+def test_gymnasiums_checker_finds_nothing(make, control, observations, camera):
+    env = make(control=control, observations=observations, camera=camera)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env, skip_render_check=True)  # it would open a window
+    assert env.action_space.shape == (CONTROLS[control],)
+    assert list(env.observation_space) == sorted(observations)
+
+
+def test_observations_carry_the_documented_units(make):
+    env = make(observations=["rgb", "depth", "state"])
+    observation, info = env.reset(seed=1)
+    rgb, depth, state = (observation[name] for name in ("rgb", "depth", "state"))
+    assert (rgb.shape, rgb.dtype) == ((SIDE, SIDE, 3), np.uint8)
+    assert (depth.shape, depth.dtype) == ((SIDE, SIDE, 1), np.float32)
+    assert (state.shape, state.dtype) == ((15,), np.float32)
+    # The camera is 0.8 m above the table and looks straight down; the cube is 6 cm high.
+    assert np.median(depth) == pytest.approx(0.8, abs=1e-3)
+    # Dropped with a random rotation, it settles on a face.
+    assert depth.min() == pytest.approx(0.8 - 0.06, abs=3e-3)
+    np.testing.assert_allclose(state[:7], env.config.robot.home, atol=0.01)
+    np.testing.assert_allclose(state[7:14], 0.0, atol=0.01)
+    assert state[14] == pytest.approx(0.08, abs=1e-3) == env.get_gripper_width()
+    assert info["object_position"][2] == pytest.approx(0.03, abs=1e-3)
+    assert (rgb[..., 0].astype(int) - rgb[..., 1]).max() > 100, "the cube is red"
+
+
+def test_settings_by_name_through_gymnasium_make():
+    env = gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")
+    assert env.action_space.shape == (5,) and env.unwrapped.settings.control == "ee_planar"
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vector_environments(mode):
+    envs = gymnasium.make_vec(
+        "RobotGrasping-v0", num_envs=2, vectorization_mode=mode, observations=["state"]
+    )
+    observations, _ = envs.reset(seed=0)
+    assert observations["state"].shape == (2, 15)
+    observations, rewards, *_, infos = envs.step(np.zeros((2, 7), np.float32))
+    assert rewards.shape == (2,)
+    objects = infos["object_position"]
+    assert (objects[0] != objects[1]).any(), "seeds 0 and 1 are two scenes"
+    envs.close()
+
+
+def test_public_methods_of_the_tutorial_exist():
+    for name in ("reset", "step", "render", "close", "get_gripper_width"):
+        assert callable(getattr(RobotGraspingEnv, name)), name
+
+
+def test_demonstration_runs_without_a_display():
+    environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
+    result = subprocess.run(
+        [sys.executable, "-m", "envs.grasping_env"],
+        cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True, timeout=100,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "ended by success" in result.stdout
+
+
+# --- Rendering --------------------------------------------------------------------------------
+
+
+def test_render_mode_none_gives_none(make):
+    env = make()
+    env.reset(seed=0)
+    assert env.render() is None
+
+
+def test_rgb_array_shows_the_robot(make):
+    env = make("rgb_array", control="joint")
+    with pytest.raises(ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    before = env.render()
+    assert (before.shape, before.dtype) == ((480, 640, 3), np.uint8)
+    swing = np.zeros(8, np.float32)
+    swing[0] = 1.0
+    for _ in range(5):
+        env.step(swing)
+    # Camera, table and cube stay where they are: only the robot can change the picture.
+    changed = (abs(env.render().astype(int) - before) > 30).any(axis=-1)
+    assert changed.mean() > 0.02
+
+
+def test_render_modes_that_cannot_be_are_refused(make, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(UserError, match="rgb_array"):
+        make("human")
+    with pytest.raises(UserError, match="'movie'.*human.*rgb_array"):
+        make("movie")
+
+
+# --- Determinism ------------------------------------------------------------------------------
+
+
+def test_same_seed_same_episode(make):
+    settings = {"observations": ["rgb", "depth", "state"]}
+    env, other = make(**settings), make(**settings)
+    first = list(run(env, 5, 15))
+    list(run(env, 6, 7))  # other work in between
+    assert_identical(first, list(run(env, 5, 15)))
+    assert_identical(first, list(run(other, 5, 15)))
+
+
+def test_interleaved_environments_do_not_touch_each_other(make):
+    settings = [{"control": "ee"}, {"control": "joint", "observations": ["rgb", "depth"]}]
+    alone = [list(run(make(**s), seed, 15)) for seed, s in enumerate(settings)]
+    a, b = (run(make(**s), seed, 15) for seed, s in enumerate(settings))
+    together = list(zip(a, b, strict=True))
+    assert_identical(alone[0], [pair[0] for pair in together])
+    assert_identical(alone[1], [pair[1] for pair in together])
+
+
+def test_scene_seed_asks_for_one_scene(make):
+    env = make()
+    _, info = env.reset(seed=0)
+    _, again = env.reset(seed=1, options={"scene_seed": info["scene_seed"]})
+    assert again["scene_seed"] == info["scene_seed"]
+    np.testing.assert_array_equal(again["object_position"], info["object_position"])
+    _, other = env.reset()
+    assert other["scene_seed"] != info["scene_seed"]
+
+
+# --- How episodes end -------------------------------------------------------------------------
+
+
+def test_truncation_comes_exactly_at_max_steps(make):
+    env = make(max_steps=4)
+    env.reset(seed=0)
+    steps = [env.step(np.zeros(7)) for _ in range(4)]
+    assert [truncated for *_, truncated, _ in steps] == [False, False, False, True]
+    assert not any(terminated for _, _, terminated, _, _ in steps)
+    assert steps[-1][-1]["reason"] == "max_steps"
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(7))
+
+
+@pytest.mark.parametrize("reward", ["dense", "sparse"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scripted_pick_succeeds(make, seed, reward):
+    env = make(control="ee_planar", reward=reward)
+    _, info = env.reset(seed=seed)
+    start, rewards, terminated, truncated = potential(info), [], False, False
+    while not (terminated or truncated):
+        _, r, terminated, truncated, info = env.step(scripted_action(env, info))
+        rewards.append(r)
+    assert terminated and not truncated and info["is_success"] and info["reason"] == "success"
+    assert info["grasped"] and info["object_position"][2] > env.settings.lift_height
+    if reward == "sparse":
+        assert rewards[-1] == 1.0 and not any(rewards[:-1])
+    else:
+        assert sum(rewards) == pytest.approx(1.0 + potential(info) - start, abs=1e-9)
+
+
+def potential(info, lift_height: float = 0.15) -> float:
+    """Phi as the class documents it."""
+    d = np.linalg.norm(info["object_position"] - info["end_effector_position"])
+    g = float(info["grasped"])
+    h = min(max(info["object_position"][2] / lift_height, 0.0), 1.0)
+    return float(((1 - np.tanh(5 * d)) + g + 2 * g * h) / 4)
+
+
+def test_dense_rewards_telescope_over_random_actions(make):
+    env = make()
+    (_, start), *steps = run(env, 3, 40)
+    total = sum(reward for _, reward, *_ in steps)
+    assert total == pytest.approx(potential(steps[-1][-1]) - potential(start), abs=1e-9)
+
+
+def test_success_needs_the_object_held_up_for_a_while(picked):
+    env, info = picked  # must stay up for 10 s = 120 actions, more than an episode has
+    for _ in range(20):
+        _, _, terminated, _, info = env.step(np.array([0, 0, 0, 0, -1.0]))
+        assert not terminated and info["grasped"]
+
+
+def test_a_flung_object_is_no_success(make):
+    env = make(hold_seconds=0.0)
+    env.reset(seed=0)
+    cube = env.cell.bodies[0]
+    pybullet.resetBaseVelocity(cube, [0, 0, 2.5], [0, 0, 0], physicsClientId=env.cell.client)
+    highest, succeeded = 0.0, False
+    for _ in range(8):
+        _, _, terminated, _, info = env.step(np.zeros(7))
+        highest, succeeded = max(highest, info["object_position"][2]), succeeded or terminated
+    assert highest > env.settings.lift_height and not succeeded
+
+
+def test_an_object_off_the_table_ends_the_episode(make):
+    env = make()
+    env.reset(seed=0)
+    pybullet.resetBasePositionAndOrientation(
+        env.cell.bodies[0], [0.5, 2.0, 0.1], [0, 0, 0, 1], physicsClientId=env.cell.client
+    )
+    _, reward, terminated, truncated, info = env.step(np.zeros(7))
+    assert terminated and not truncated and info["reason"] == "off_table"
+    assert not info["is_success"] and reward < 0
+
+
+def blow_up_the_object(env, monkeypatch):
+    nowhere = [float("nan")] * 3
+    pybullet.resetBasePositionAndOrientation(
+        env.cell.bodies[0], nowhere, [0, 0, 0, 1], physicsClientId=env.cell.client
+    )
+
+
+def blow_up_the_robot(env, monkeypatch):
+    nowhere = np.full(7, np.nan)
+    monkeypatch.setattr(env.cell.robot, "joint_state", lambda: (nowhere, nowhere, 0.0))
+
+
+def blow_up_the_judge(env, monkeypatch):
+    def fail(index):
+        raise PhysicsError("as if")
+
+    monkeypatch.setattr(env.cell, "object_position", fail)
+
+
+@pytest.mark.parametrize("blow_up", [blow_up_the_object, blow_up_the_robot, blow_up_the_judge])
+def test_a_physics_blow_up_ends_the_episode(make, blow_up, monkeypatch):
+    env = make(observations=["rgb", "depth", "state"])
+    env.reset(seed=0)
+    blow_up(env, monkeypatch)
+    observation, reward, terminated, _, info = env.step(np.zeros(7))
+    assert terminated and info["reason"] == "physics" and reward == 0.0
+    assert env.observation_space.contains(observation)
+    assert np.isfinite([*info["object_position"], *info["end_effector_position"]]).all()
+    monkeypatch.undo()
+    env.reset(seed=0)  # and the next episode is sound again
+    assert env.step(np.zeros(7))[-1]["reason"] is None
+
+
+# --- Wrong use --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_bad_actions_are_refused(make, control):
+    env, size = make(control=control), CONTROLS[control]
+    env.reset(seed=0)
+    for shape in [(size + 1,), (1, size), ()]:
+        with pytest.raises(InvalidAction, match=rf"{control}.*\({size},\)"):
+            env.step(np.zeros(shape))
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(InvalidAction, match="non-finite"):
+            env.step(np.full(size, bad))
+    env.step(np.zeros(size))  # none of them has done harm
+
+
+def test_life_cycle_errors(make):
+    env = make("rgb_array")
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(7))
+    with pytest.raises(ResetNeeded):
+        env.get_gripper_width()
+    env.close()
+    env.close()
+    for call in (env.reset, env.render, env.get_gripper_width, lambda: env.step(np.zeros(7))):
+        with pytest.raises(ClosedEnvironmentError):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"contrl": "ee"}, r"env\.contrl.*control"),
+        ({"control": "cartesian"}, r"env\.control.*cartesian"),
+        ({"observations": []}, r"env\.observations"),
+        ({"observations": ["state", "state"]}, r"env\.observations.*repeated"),
+        ({"resolution": 8}, r"env\.resolution.*16"),
+        ({"max_steps": 0}, r"env\.max_steps"),
+        ({"objects": "no_such_set"}, r"env\.objects.*random_urdfs"),
+        ({"position_step": float("nan")}, r"env\.position_step"),
+        ({"lift_height": "high"}, r"env\.lift_height"),
+    ],
+)
+def test_wrong_settings_name_their_key(make, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**settings)
+
+
+# --- Limits -----------------------------------------------------------------------------------
+
+
+def extreme_actions(size: int) -> list[np.ndarray]:
+    """Each direction at full throttle, both ways, then everything at once."""
+    corners = [sign * np.eye(size)[i] for i in range(size - 1) for sign in (1, -1)]
+    return [*corners, np.ones(size), -np.ones(size)]
+
+
+@pytest.mark.parametrize("manner", ["random", "extreme"])
+@pytest.mark.parametrize("control", CONTROLS)
+def test_joint_and_velocity_limits_hold_at_every_physics_step(make, control, manner):
+    env, size = make(control=control, max_steps=10**6), CONTROLS[control]
+    env.reset(seed=0)
+    positions, velocities = [], []
+
+    def watch(cell):
+        q, velocity, _ = cell.robot.joint_state()
+        positions.append(q)
+        velocities.append(velocity)
+
+    env.cell.on_step = watch
+    if manner == "random":
+        actions = np.random.default_rng(0).uniform(-1, 1, (200, size))
+    else:
+        actions = np.repeat(extreme_actions(size), 200 // len(extreme_actions(size)), axis=0)
+    for action in actions:
+        _, _, terminated, _, _ = env.step(action)
+        if terminated:
+            env.reset(seed=0)
+    # The motors are constraints that the solver meets to within its residual.
+    assert (np.min(positions, axis=0) >= JOINT_LOWER - 1e-3).all()
+    assert (np.max(positions, axis=0) <= JOINT_UPPER + 1e-3).all()
+    assert (np.max(np.abs(velocities), axis=0) <= JOINT_VELOCITY * 1.03).all()
+
+
+def test_the_command_does_not_wind_up_at_the_workspace_wall(make):
+    env = make()
+    env.reset(seed=0)
+    away = np.eye(7)[1]
+    for _ in range(25):
+        *_, info = env.step(away)
+    wall = env.config.workspace.center[1] + env.config.workspace.size / 2 + 0.08
+    assert info["reachable"]
+    assert info["end_effector_position"][1] == pytest.approx(wall, abs=0.01)
+    for _ in range(4):
+        *_, back = env.step(-away)
+    # Four times 5 cm, less what the arm lags behind. Wound up by 1 m, it would not have moved.
+    assert back["end_effector_position"][1] < wall - 0.15
+
+
+@pytest.mark.parametrize("control", ["ee", "ee_planar"])
+def test_what_the_arm_cannot_reach_is_refused_and_reported(make, control):
+    """An upright hand at the far upper wall is beyond the Panda's reach: 0.79 m from its shoulder."""
+    env, size = make(control=control), CONTROLS[control]
+    _, info = env.reset(seed=0)
+    assert info["reachable"]
+    far = np.eye(size)[0]
+    for action in [far] * 25 + [-far] * 10:
+        observation, *_, info = env.step(action)
+        R = forward_kinematics(observation["state"][:7])[:3, :3]
+        tilt = np.degrees(np.arccos(min(-R[2, 2], 1.0)))
+        assert tilt < 10, "the hand tilts, which nobody asked for"
+        if action is far:
+            farthest = info
+    assert not farthest["reachable"] and farthest["end_effector_position"][0] < 0.73
+    assert info["reachable"]
+    gone_back = farthest["end_effector_position"][0] - info["end_effector_position"][0]
+    assert gone_back > 0.2
+
+
+def test_an_arm_held_up_by_the_table_does_not_wind_up(make):
+    env = make(control="joint")
+    env.reset(seed=0)
+    down = np.eye(8)[1]  # the shoulder leans forward
+    for _ in range(30):
+        observation, *_, info = env.step(down)
+    stuck = observation["state"][1]
+    assert not info["reachable"] and stuck < JOINT_UPPER[1] - 0.3
+    for _ in range(10):
+        observation, *_, info = env.step(-down)
+    assert info["reachable"] and observation["state"][1] < stuck - 0.4
+
+
+# --- The long run -----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_resets_leak_no_memory(make):
+    env, process = make(), psutil.Process()
+    for seed in range(50):  # caches and allocator pools fill up
+        env.reset(seed=seed)
+    before = process.memory_info().rss
+    for seed in range(1000):
+        env.reset(seed=seed)
+    assert process.memory_info().rss - before < 10e6
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")  # SB3 remarks on the platform
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+def test_stable_baselines3_trains_on_it_unmodified(config, algorithm):
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    env = gymnasium.make("RobotGrasping-v0", config=config, resolution=64)
+    if algorithm == "PPO":
+        settings = {"n_steps": 250, "batch_size": 125, "n_epochs": 1}
+    else:
+        settings = {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32, "train_freq": 50,
+                    "gradient_steps": 5}  # fmt: skip
+    learner = getattr(stable_baselines3, algorithm)("MultiInputPolicy", env, seed=0, **settings)
+    learner.learn(2000)
+    assert learner.num_timesteps >= 2000
+    observation, _ = env.reset(seed=0)
+    action, _ = learner.predict(observation, deterministic=True)
+    assert env.action_space.contains(action)
+    env.close()

@@ -1,0 +1,136 @@
+"""Convex solids, gripper outline and height maps against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from utils.geometry import (
+    ConvexSolid,
+    GripperGeometry,
+    SceneGeometry,
+    SolidObject,
+    Workspace,
+    intersect_lines,
+)
+from utils.height_map import height_map_from_frame, height_map_from_scene
+from utils.transforms import RGBDFrame, look_at, pose_matrix
+
+CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+K = np.array([[390.6, 0, 111.5], [0, 390.6, 111.5], [0, 0, 1.0]])  # 224 px, 32 degrees
+T_WC = look_at((0.5, 0, 0.8), (0.5, 0, 0), up=(1, 0, 0))
+
+
+def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
+    return pose_matrix((x, y, z), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)))
+
+
+def boxes_frame(boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]]) -> RGBDFrame:
+    """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula."""
+    v, u = np.mgrid[0:224, 0:224]
+    rays = np.stack([(u - 111.5) / 390.6, (v - 111.5) / 390.6, np.ones_like(u)], axis=-1) @ T_WC[:3, :3].T
+    eye = T_WC[:3, 3]
+    depth = -eye[2] / rays[..., 2]
+    things = []
+    for size, yaw, (x, y) in boxes:
+        half = np.array(size) / 2
+        T = yaw_pose(x, y, half[2], yaw)
+        local_eye, local_rays = (eye - T[:3, 3]) @ T[:3, :3], rays @ T[:3, :3]
+        with np.errstate(divide="ignore"):
+            slabs = np.sort([(s * half - local_eye) / local_rays for s in (-1, 1)], axis=0)
+        near, far = slabs[0].max(axis=-1), slabs[1].min(axis=-1)
+        depth = np.where((near < far) & (near < depth), near, depth)
+        solid = ConvexSolid.from_vertices(CORNERS * half).transformed(T)
+        things.append(SolidObject((solid,), T[:3, 3], 0.7))
+    rgb = np.zeros((224, 224, 3), np.uint8)
+    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=SceneGeometry(tuple(things)))
+
+
+def test_line_through_a_box_by_hand() -> None:
+    box = ConvexSolid.from_vertices(CORNERS * (0.5, 1.0, 2.0))
+    hits = intersect_lines(box, [(-3, 0, 0), (0, 0, 9), (-3, 1.5, 0), (-1, 0, 0)], [(2, 0, 0), (0, 0, -1), (1, 0, 0), (1, 1, 0)])  # fmt: skip
+    assert hits.enter == pytest.approx([1.25, 7, np.inf, 0.5])
+    assert hits.leave == pytest.approx([1.75, 11, -np.inf, 1.0])
+    assert hits.hit.tolist() == [True, True, False, True]
+    np.testing.assert_allclose(hits.enter_normal[[0, 1, 3]], [(-1, 0, 0), (0, 0, 1), (-1, 0, 0)], atol=1e-9)
+    np.testing.assert_allclose(hits.leave_normal[[0, 1, 3]], [(1, 0, 0), (0, 0, -1), (0, 1, 0)], atol=1e-9)
+    assert np.isnan(hits.enter_normal[2]).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000))
+def test_random_lines_against_points_along_them(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    solid = ConvexSolid.from_vertices(random.normal(size=(12, 3)))
+    origins, directions = random.normal(size=(2, 20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    hits = intersect_lines(solid, origins, directions)
+    t = np.linspace(-8, 8, 4001)
+    points = origins[:, None] + t[:, None] * directions[:, None]
+    inside = (points @ solid.normals.T <= solid.offsets).all(axis=-1)
+    for line in range(20):
+        if inside[line].any():
+            lo, hi = t[inside[line]][[0, -1]]
+            assert hits.enter[line] == pytest.approx(lo, abs=0.0041)
+            assert hits.leave[line] == pytest.approx(hi, abs=0.0041)
+        else:
+            assert not hits.hit[line] or hits.leave[line] - hits.enter[line] < 0.0041
+
+
+def test_a_moved_solid_is_hit_where_the_moved_line_was() -> None:
+    T = yaw_pose(0.3, -0.2, 0.1, 0.7)
+    solid = ConvexSolid.from_vertices(CORNERS)
+    origin, direction = np.array([[-4, 0.2, 0.1]]), np.array([1.0, 0.1, 0.05])
+    still = intersect_lines(solid, origin, direction)
+    moved = intersect_lines(solid.transformed(T), origin @ T[:3, :3].T + T[:3, 3], T[:3, :3] @ direction)
+    assert moved.enter == pytest.approx(still.enter) and moved.leave == pytest.approx(still.leave)
+    np.testing.assert_allclose(moved.enter_normal, still.enter_normal @ T[:3, :3].T, atol=1e-9)
+
+
+def test_gripper_outline_bounds_pybullets_meshes() -> None:
+    folder = pytest.importorskip("pybullet_data").getDataPath() + "/franka_panda/meshes/collision/"
+
+    def mesh(name: str) -> ConvexSolid:
+        with open(folder + name) as lines:
+            return ConvexSolid.from_vertices([line.split()[1:4] for line in lines if line.startswith("v ")])
+
+    gripper, finger, hand = GripperGeometry(), mesh("finger.obj"), mesh("hand.obj")
+    # panda.urdf: finger joints 0.0584, grasp target 0.105 below the hand frame.
+    tip = 0.0584 + finger.vertices[:, 2].max()
+    assert gripper.tip_below_centre == pytest.approx(tip - 0.105, abs=1e-4)
+    assert gripper.finger_half_width == pytest.approx(finger.vertices[:, 0].max(), abs=1e-4)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.0316, 0.0316, 41), np.linspace(-0.1, 0.1, 201)))
+    columns = np.column_stack([x, y, 0 * x])
+    for solid, base, claimed in (
+        (finger, 0.0584, gripper.finger_underside(np.maximum(y, 0))),
+        (hand, 0.0, gripper.palm_underside(x)),
+    ):
+        hits = intersect_lines(solid, columns, (0.0, 0.0, 1.0))
+        true = tip - base - hits.leave
+        assert (claimed[hits.hit] - true[hits.hit]).max() < 0.0004  # the claimed outline is nowhere above the mesh
+
+
+def test_height_maps_of_a_known_box() -> None:
+    frame = boxes_frame([((0.06, 0.08, 0.05), 0.4, (0.47, 0.03))])
+    for heights in (height_map_from_frame(frame, Workspace()), height_map_from_scene(frame.truth, Workspace())):
+        box = frame.truth.objects[0].centre_of_mass[:2]
+        c, s = np.cos(0.4), np.sin(0.4)
+        rows, cols = np.mgrid[0 : heights.height.shape[0], 0 : heights.height.shape[1]]
+        xy = heights.origin + heights.cell * np.stack([cols, rows], axis=-1) - box
+        excess = np.abs(xy @ np.array([[c, -s], [s, c]])) - (0.03, 0.04)
+        inside, outside = (excess < -0.002).all(axis=-1), (excess > 0.003).any(axis=-1)
+        np.testing.assert_allclose(heights.height[inside], 0.05, atol=1e-4)
+        np.testing.assert_allclose(heights.height[outside], 0.0, atol=1e-4)
+        assert set(heights.label[inside]) == {0} and set(heights.label[outside]) == {-1}
+        np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None:
+    # Outer face at x = 0.62, 0.05 high: the camera over x = 0.5 hides 0.12 * 0.05 / 0.75 = 8 mm behind it.
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.0, (0.60, 0.0))])
+    heights = height_map_from_frame(frame, Workspace())
+    rows, cols = np.nonzero(heights.ceiling > heights.height + 0.003)
+    x = heights.origin[0] + heights.cell * cols
+    assert len(x) and x.min() > 0.579 and x.max() < 0.631
+    centre_row = heights.index(np.array([0.6, 0.0]))[0]
+    assert 0.618 < x[rows == centre_row].min() and x[rows == centre_row].max() > 0.624

@@ -1,0 +1,93 @@
+"""Planners on scenes whose best grasp is known by construction."""
+
+import numpy as np
+import pytest
+
+from models.planners import PLANNERS, make_planner
+from tests.test_geometry import boxes_frame
+from utils.geometry import GripperGeometry, Workspace
+from utils.transforms import angle_difference
+
+DELIBERATE = ("heuristic", "oracle")
+
+
+def planner(name: str, seed: int = 0):
+    return make_planner(name, GripperGeometry(), Workspace(), seed)
+
+
+def test_unknown_planner_is_refused_with_the_allowed_names() -> None:
+    with pytest.raises(ValueError, match="'grasp'.*random, heuristic, oracle"):
+        planner("grasp")
+
+
+def test_oracle_without_truth_says_what_is_missing() -> None:
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.0, (0.5, 0.0))])
+    with pytest.raises(ValueError, match="frame.truth"):
+        planner("oracle")(frame.without_truth())
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+@pytest.mark.parametrize("degrees", [*range(0, 180, 15), 5, 85, 95, 175, 178, 182, 270, 355])
+def test_a_box_is_closed_on_across_its_short_side(name: str, degrees: int) -> None:
+    yaw = np.deg2rad(degrees)
+    frame = boxes_frame([((0.04, 0.10, 0.05), yaw, (0.52, -0.04))])
+    best = planner(name)(frame)[0]
+    assert np.rad2deg(angle_difference(best.angle, yaw)) < 5
+    assert np.linalg.norm(best.position[:2] - (0.52, -0.04)) < 0.003
+    # 5 cm high: the tips, 7.2 mm below the position, stay off the table and reach under the middle.
+    assert 0.003 < best.position[2] - 0.0072 < 0.025
+    assert 0.04 < best.width <= 0.08
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+def test_no_finger_goes_into_a_one_centimetre_gap(name: str) -> None:
+    frame = boxes_frame([((0.04, 0.06, 0.05), 0.0, (0.475, 0.0)), ((0.04, 0.06, 0.05), 0.0, (0.525, 0.0))])
+    grasps = planner(name)(frame)
+    assert grasps
+    for grasp in grasps:
+        for side in (-1, 1):
+            finger = grasp.position + side * (grasp.width / 2 + 0.007) * grasp.closing_direction
+            in_gap = abs(finger[0] - 0.5) < 0.012 and abs(finger[1]) < 0.03
+            assert not in_gap or grasp.position[2] - 0.0072 > 0.05
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_an_empty_table_has_nothing_to_grasp(name: str) -> None:
+    assert planner(name)(boxes_frame([])) == []
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+@pytest.mark.parametrize("degrees", [0, 20, 45])
+def test_a_box_wider_than_the_gripper_is_left_alone(name: str, degrees: int) -> None:
+    frame = boxes_frame([((0.09, 0.10, 0.05), np.deg2rad(degrees), (0.5, 0.0))])
+    assert planner(name)(frame) == []
+
+
+@pytest.mark.parametrize("name", ("random", "heuristic"))
+def test_unprivileged_planners_do_not_look_at_the_truth(name: str) -> None:
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))])
+    described = [repr(planner(name)(seen)) for seen in (frame, frame.without_truth())]
+    assert not PLANNERS[name].needs_truth and described[0] == described[1]
+
+
+def test_random_follows_its_own_seed() -> None:
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.45, 0.0))])
+    plan = planner("random", 3)
+    first, second = repr(plan(frame)), repr(plan(frame))
+    plan.reset(3)
+    assert first == repr(plan(frame)) and first != second
+    for grasp in plan(frame):
+        assert grasp.position[2] >= 0.004 + 0.0072 - 1e-9
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+def test_ranking_is_sorted_and_distinct(name: str) -> None:
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))])
+    grasps = planner(name)(frame)
+    assert 2 <= len(grasps) <= 20
+    qualities = [grasp.quality for grasp in grasps]
+    assert qualities == sorted(qualities, reverse=True)
+    for i, a in enumerate(grasps):
+        for b in grasps[:i]:
+            apart = np.linalg.norm(a.position[:2] - b.position[:2])
+            assert apart >= 0.01 or angle_difference(a.angle, b.angle) >= np.deg2rad(20) - 1e-9
