@@ -100,15 +100,7 @@ def check_objects(config: Config) -> None:
 
 
 def load_objects(name: str, config: Config) -> ObjectSet:
-    settings = config.objects
-    return load_object_set(
-        name,
-        split=settings.split,
-        scale=settings.scale,
-        fit=settings.fit,
-        density=settings.density,
-        cache_dir=config.cache_folder,
-    )
+    return load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
 
 
 def worker_count(config: Config) -> int:
@@ -272,7 +264,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
             )
         )  # fmt: skip
         if film is not None:
-            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}.mp4"
+            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}.{config.evaluate.film_format}"
             film.write(task.film_folder / name)
             films.append((task.film_folder / name, f"{policy} on {task.scenario}"))
     return rounds, pictures, films

@@ -16,7 +16,6 @@ import numpy as np
 import pybullet
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
-from scipy.spatial.transform import Rotation
 
 from envs.camera import render
 from envs.cell import Cell, PhysicsError, camera_intrinsics
@@ -30,6 +29,7 @@ from envs.panda import (
     ServoStep,
     moved,
     pose_error,
+    rotation_matrix,
 )
 from envs.scenes import make_scene
 from envs.studio import Studio
@@ -41,7 +41,10 @@ _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
 # How far the arm's answer to a command may lie from it before the command is refused.
-_FOLLOW_POSITION, _FOLLOW_ROTATION = 0.005, 0.03  # m, rad
+_FOLLOW_POSITION, _FOLLOW_ROTATION = 0.01, 0.06  # m, rad
+# Share of the joint speeds that is commanded: inertia and contacts throw a joint a little over what
+# its motor asks for (3 % in free motion).
+_SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
@@ -107,11 +110,8 @@ class RobotGraspingEnv(gymnasium.Env):
         }
         self.objects = load_object_set(
             self.settings.objects,
-            split=self.config.objects.split,
-            scale=self.config.objects.scale,
-            fit=self.config.objects.fit,
-            density=self.config.objects.density,
             cache_dir=self.config.cache_folder,
+            **self.config.objects.model_dump(),
         )
         if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             raise UserError(
@@ -134,12 +134,9 @@ class RobotGraspingEnv(gymnasium.Env):
         x, y = self.config.workspace.center
         self._lowest = np.array([x - reach, y - reach, _LOWEST_TIP])
         self._highest = np.array([x + reach, y + reach, _HIGHEST_TIP])
-        self._max_joint_change = (
-            JOINT_VELOCITY
-            * self.config.robot.velocity_scale
-            * self.settings.substeps
-            / self.config.sim.frequency
-        )
+        self._speed = _SPEED_HEADROOM * self.config.robot.velocity_scale
+        seconds = self.settings.substeps / self.config.sim.frequency
+        self._max_joint_change = JOINT_VELOCITY * self._speed * seconds
 
     def _observation_spaces(self) -> dict[str, spaces.Space]:
         side = self.settings.resolution
@@ -265,7 +262,7 @@ class RobotGraspingEnv(gymnasium.Env):
                 self._servo = ServoStep(goal)
         else:
             self._follow(self._moved_pose(action))
-        self.cell.robot.drive_arm_to(self._servo.q, self.config.robot.velocity_scale)
+        self.cell.robot.drive_arm_to(self._servo.q, self._speed)
         self.cell.robot.command_gripper(MAX_OPENING * (action[-1] + 1) / 2)
 
     def _moved_pose(self, action: np.ndarray) -> np.ndarray:
@@ -275,18 +272,17 @@ class RobotGraspingEnv(gymnasium.Env):
         T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if turn.any():
-            R = Rotation.from_rotvec(settings.rotation_step * turn).as_matrix()
-            T[:3, :3] = R @ T[:3, :3]
+            T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
         return T
 
     def _follow(self, target: np.ndarray) -> None:
         """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
         where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
-        start = self._servo
-        motion = pose_error(self._T_command, target)
-        goal, share = self._within_speed(start.towards(target))
+        goal, share = self._within_speed(self._servo.towards(target))
         for _ in range(_FOLLOW_TRIES):
-            wanted = target if share == 1.0 else moved(self._T_command, share * motion)
+            wanted = target
+            if share < 1.0:
+                wanted = moved(self._T_command, share * pose_error(self._T_command, target))
             servo = ServoStep(goal)
             error = abs(pose_error(servo.reached, wanted))
             if error[:3].max() < _FOLLOW_POSITION and error[3:].max() < _FOLLOW_ROTATION:
@@ -305,7 +301,7 @@ class RobotGraspingEnv(gymnasium.Env):
         return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
 
     def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joint positions (7,) towards `goal` within this action's time, and the share of the way."""
+        """Joint positions (7,) as far towards a goal as one action gets, and the share of the way."""
         change = goal - self._servo.q
         share = 1.0 / max(float((abs(change) / self._max_joint_change).max()), 1.0)
         return self._servo.q + share * change, share

@@ -6,6 +6,7 @@ PyBullet's. Knows nothing of objects, cameras or grasps.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,12 +97,32 @@ def geometric_jacobian(q: np.ndarray) -> np.ndarray:
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """(3,) axis-angle logarithm of a (3, 3) rotation, fast where the angle is not near pi."""
-    sine_axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    cosine = 0.5 * (a + e + i - 1.0)
     if cosine < -0.99:
         return Rotation.from_matrix(R).as_rotvec()
-    sine = float(np.sqrt(sine_axis @ sine_axis))
-    return sine_axis * (np.arctan2(sine, cosine) / sine) if sine > 1e-9 else sine_axis
+    x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
+    return np.array([scale * x, scale * y, scale * z])
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of an axis-angle vector (3,), by Rodrigues' formula."""
+    x, y, z = vector.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-9:
+        return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])
+    x, y, z = x / angle, y / angle, z / angle
+    s, c = math.sin(angle), math.cos(angle)
+    t = 1.0 - c
+    return np.array(
+        [
+            [c + t * x * x, t * x * y - s * z, t * x * z + s * y],
+            [t * x * y + s * z, c + t * y * y, t * y * z - s * x],
+            [t * x * z - s * y, t * y * z + s * x, c + t * z * z],
+        ]
+    )
 
 
 def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -115,7 +136,7 @@ def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
 def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
     result = np.eye(4)
-    result[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix() @ T[:3, :3]
+    result[:3, :3] = rotation_matrix(motion[3:]) @ T[:3, :3]
     result[:3, 3] = T[:3, 3] + motion[:3]
     return result
 
@@ -249,6 +270,11 @@ class Panda:
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
             )
+        for joint, lower, upper in zip(ARM, JOINT_LOWER, JOINT_UPPER):  # the URDF's are wider
+            pybullet.changeDynamics(
+                self.body, joint, jointLowerLimit=lower, jointUpperLimit=upper,
+                physicsClientId=client,
+            )  # fmt: skip
         # The motors' own limit holds back the motors only: a quick shoulder throws the light wrist.
         # Bullet has one such limit for all joints of a body.
         pybullet.changeDynamics(

@@ -1,10 +1,14 @@
 """Pictures for people: a twin of a cell with detailed meshes, shadows and a scenic camera.
 
-The twin has no physics of its own; it copies the poses of the cell that it shows.
+The twin has no physics of its own; it copies the poses of the cell that it shows. To see a scene:
+
+    python -m envs.studio --objects primitives --layout pile --output scene.png seed=3
 """
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -13,7 +17,10 @@ import pybullet
 
 from envs.camera import Intrinsics, render
 from envs.cell import Cell
+from envs.objects import load_object_set
 from envs.panda import ARM, FINGERS
+from envs.scenes import LAYOUTS, make_scene
+from utils.config import parse_args, run_script
 from utils.transforms import look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
@@ -78,3 +85,26 @@ class Film:
             imageio.mimwrite(path, self._pictures, duration=1000 / (speed * self._rate), loop=0)
         else:
             imageio.mimwrite(path, self._pictures, fps=speed * self._rate, quality=6)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write a picture of one scene."""
+
+    def options(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--output", type=Path, default="scene.png", help="PNG or JPEG file")
+        parser.add_argument("--objects", default="primitives", help="a named set or a folder")
+        parser.add_argument("--layout", default="pile", choices=LAYOUTS)
+
+    config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
+    objects = load_object_set(
+        chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
+    )
+    with Cell(config) as cell:
+        cell.load(make_scene(chosen.layout, objects, config.seed, config))
+        with Studio(cell) as studio:
+            imageio.imwrite(chosen.output, studio.picture())
+    print(f"wrote {chosen.output}")
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -4,16 +4,17 @@ A planner is a callable `plan(frame) -> list[Grasp]`, best first; an empty list 
 nothing to grasp. `random` and `heuristic` see only the depth image, `oracle` the true geometry.
 This module knows no simulator.
 
-Heuristic and oracle share one search over a height map: runs of matter along the closing line that
-fit between the fingers (dense, every angle and height); each survivor is then posed on the map, its
-contacts, clearances and lever arms measured, and it is centred and turned onto the faces it touches.
+Heuristic and oracle share one search over a height map: runs of matter along the closing line
+that fit between the fingers (dense, every angle and height); each survivor is then posed on the
+map, its contacts, clearances and lever arms measured, and it is centred and turned onto the faces.
 The oracle judges the best ones by exact line-solid intersections, also with the pose perturbed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Callable, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -73,33 +74,37 @@ class Candidates:
     score: np.ndarray
 
     @staticmethod
-    def rough(xy, angle, tip, width, score) -> "Candidates":
+    def rough(xy, angle, tip, width, score) -> Candidates:
         """Candidates of the dense stage, not measured yet."""
-        return Candidates(xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score)
+        return Candidates(
+            xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
+        )
 
     def __len__(self) -> int:
         return len(self.angle)
 
-    def take(self, index) -> "Candidates":
+    def take(self, index) -> Candidates:
         return Candidates(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def best(self, count: int) -> "Candidates":
+    def best(self, count: int) -> Candidates:
         """The `count` best feasible ones, best first."""
         order = np.argsort(-self.score, kind="stable")[:count]
         return self.take(order[self.score[order] > 0])
 
-    def better(self, other: "Candidates") -> "Candidates":
+    def better(self, other: Candidates) -> Candidates:
         """Of each pair of candidates the one with the higher score."""
         wins = other.score > self.score
         pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return Candidates(*(np.where(wins[:, None] if a.ndim == 2 else wins, b, a) for a, b in pairs))
+        return Candidates(
+            *(np.where(wins[:, None] if a.ndim == 2 else wins, b, a) for a, b in pairs)
+        )
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) unit vectors along the closing line and across it."""
         along = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
         return along, np.stack([-along[:, 1], along[:, 0]], axis=-1)
 
-    def distinct(self, count: int, distance: float, angle: float) -> "Candidates":
+    def distinct(self, count: int, distance: float, angle: float) -> Candidates:
         """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
         kept: list[int] = []
         for i in range(len(self)):
@@ -166,10 +171,14 @@ def dense_candidates(
     lowest = heights.table_height + settings.table_clearance
     levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
     # Gradients of the blurred map point across an edge whatever its height.
-    slope = np.stack(np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1)
+    slope = np.stack(
+        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1
+    )
     slope /= np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9
     thickness = gripper.finger_outline[1][0]
-    finger = np.ones((2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8)
+    finger = np.ones(
+        (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
+    )
     palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
     parts = [Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))]
@@ -182,40 +191,54 @@ def dense_candidates(
             heights.height, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
             borderValue=heights.table_height,
         )  # fmt: skip
-        level, row, first, last = _runs(turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell)
+        level, row, first, last = _runs(
+            turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell
+        )
         tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
         limit = tip - settings.clearance
         free = np.zeros(len(tip), bool)
         for room in settings.rooms:  # a sloping flank asks for more of it
             offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
-            left, right = (np.clip(np.rint(at).astype(int), 0, size - 1) for at in (first - offset, last + offset))
+            left, right = (
+                np.clip(np.rint(at).astype(int), 0, size - 1)
+                for at in (first - offset, last + offset)
+            )
             fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
             free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
         free &= under_palm[row, centre] < limit + gripper.palm_height
         row, first, last, tip = row[free], first[free], last[free], tip[free]
 
-        def place(column: np.ndarray) -> np.ndarray:
-            return middle + cell * ((column - half)[:, None] * along + (row - half)[:, None] * across)
-
-        xy = place((first + last) / 2)
+        base = middle + cell * (row - half)[:, None] * across
+        at_first, at_inside, xy, at_last = (
+            base + cell * (column - half)[:, None] * along
+            for column in (first, first + 1.5, (first + last) / 2, last)
+        )
         reach = np.abs(xy - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
         # Outward normals are minus the gradient: cosines against the closing line on both sides.
         facing = np.minimum(
-            slope[heights.index(place(first))] @ along, -slope[heights.index(place(last))] @ along
+            slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
         )
-        inside = heights.label[heights.index(place(first + 1.5))]
+        inside = heights.label[heights.index(at_inside)]
         arm = np.abs((heights.centres[inside, :2] - xy) @ across) if len(heights.centres) else 0.0
         rise = turned[row, first] - tip
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
-        score *= reach * (facing > settings.min_facing) * np.clip(rise / settings.good_engagement, 0.2, 1)
+        score *= (
+            reach
+            * (facing > settings.min_facing)
+            * np.clip(rise / settings.good_engagement, 0.2, 1)
+        )
         parts.append(
             Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
         )
-    return Candidates(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates)))
+    return Candidates(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates))
+    )
 
 
-def _runs(turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float) -> tuple[np.ndarray, ...]:
+def _runs(
+    turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float
+) -> tuple[np.ndarray, ...]:
     """Runs of cells over a level along the rows: level, row, first and last column, each (M,).
 
     A run may bridge a gap to the next one or two of its row (a ring, a mug). Every second row is
@@ -288,7 +311,9 @@ def measure(
         half = np.minimum(width / 2 + candidate_room, gripper.max_opening / 2)
         outward = near - half[:, None]
         # Between contact and finger only the closing pads pass, over anything below the tips.
-        sill = np.where(near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf)
+        sill = np.where(
+            near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
+        )
         below_finger = gripper.finger_underside(np.maximum(outward, 0))
         under = np.where(outward < -settings.inner_margin, sill, below_finger)
         fits = (obstacles - under).max(axis=1) <= tip - settings.clearance
@@ -296,7 +321,9 @@ def measure(
         free |= fits
         opening, room = np.where(fits, 2 * half, opening), np.where(fits, half - width / 2, room)
     under = gripper.finger_underside(near - opening[:, None] / 2)[..., None]
-    blind = ((heights.ceiling[where] - under > tip[:, None, None]) & (under < np.inf)).mean(axis=(1, 2))
+    blind = ((heights.ceiling[where] - under > tip[:, None, None]) & (under < np.inf)).mean(
+        axis=(1, 2)
+    )
     left_over = np.nonzero(free & touched)[0]
     gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
     free[left_over] = gap >= settings.clearance - tip[left_over]
@@ -321,7 +348,9 @@ def measure(
     score *= np.exp(-4 * blind)
     score *= np.where(ends[0] == ends[1], 1.0, 0.5)
     score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
-    feasible = touched & free & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    feasible = (
+        touched & free & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    )
     feasible &= (label >= 0) & (width > 0)
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
     return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
@@ -332,7 +361,7 @@ def _first_contacts(H, window, level, u, cell) -> tuple[np.ndarray, np.ndarray]:
 
     Lines that meet nothing hold +inf (left) and -inf (right).
     """
-    matter = (H > level[:, None, None]) & window[..., None]
+    matter = (level[:, None, None] < H) & window[..., None]
     hit = matter.any(axis=1)
     left = u[matter.argmax(axis=1)] - cell / 2
     right = u[len(u) - 1 - matter[:, ::-1].argmax(axis=1)] + cell / 2
@@ -351,7 +380,9 @@ def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.
     return slope, (weight * (gap < touch)).mean(axis=1)
 
 
-def _palm_gap(xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006) -> np.ndarray:
+def _palm_gap(
+    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
+) -> np.ndarray:
     """(N,) smallest height of the palm's underside, fingertips at 0, over the scene in W."""
     # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
     # more cell for rounding to the grid.
@@ -360,7 +391,11 @@ def _palm_gap(xy, along, across, heights: HeightMap, gripper: GripperGeometry, s
     scene = cv2.dilate(heights.height, disc)
     ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
     u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
-    grid = xy[:, None, None] + u[:, None, None] * along[:, None, None] + v[:, None] * across[:, None, None]
+    grid = (
+        xy[:, None, None]
+        + u[:, None, None] * along[:, None, None]
+        + v[:, None] * across[:, None, None]
+    )
     return (gripper.palm_underside(v) - scene[heights.index(grid)]).min(axis=(1, 2))
 
 
@@ -432,7 +467,12 @@ class OraclePlanner:
         settings: SearchSettings = SearchSettings(shortlist=1500, finalists=500),
         judged: int = 120,
     ):
-        self.gripper, self.workspace, self.settings, self.judged = gripper, workspace, settings, judged
+        self.gripper, self.workspace, self.settings, self.judged = (
+            gripper,
+            workspace,
+            settings,
+            judged,
+        )
 
     def reset(self, seed: int) -> None:
         """Nothing to do: the planner is deterministic."""
@@ -460,7 +500,9 @@ def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
     workspace, margin = _square_of(heights)
     for number, thing in enumerate(scene.objects):
         alone = SceneGeometry((thing,), scene.table_height)
-        whole[number] = (height_map_from_scene(alone, workspace, 2 * heights.cell, margin).label >= 0).sum()
+        whole[number] = (
+            height_map_from_scene(alone, workspace, 2 * heights.cell, margin).label >= 0
+        ).sum()
     return np.clip(1 - seen / np.maximum(4 * whole, 1), 0, 1)
 
 
@@ -479,7 +521,9 @@ PERTURBATIONS = np.array(
 )
 
 
-def exact_quality(candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry) -> np.ndarray:
+def exact_quality(
+    candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
+) -> np.ndarray:
     """(N,) in [0, 1]: contacts of the flat pads with the true solids, nominal and perturbed.
 
     A pose counts 0 unless both pads first meet the same object with normals inside the friction
@@ -488,7 +532,8 @@ def exact_quality(candidates: Candidates, scene: SceneGeometry, gripper: Gripper
     N, P = len(candidates), len(PERTURBATIONS)
     along, across = candidates.axes()
     along, across = (
-        np.broadcast_to(np.pad(axis, ((0, 0), (0, 1)))[:, None], (N, P, 3)) for axis in (along, across)
+        np.broadcast_to(np.pad(axis, ((0, 0), (0, 1)))[:, None], (N, P, 3))
+        for axis in (along, across)
     )
     cos, sin = np.cos(PERTURBATIONS[:, 2, None]), np.sin(PERTURBATIONS[:, 2, None])
     centre = np.column_stack([candidates.xy, candidates.tip])[:, None]
@@ -501,7 +546,9 @@ def exact_quality(candidates: Candidates, scene: SceneGeometry, gripper: Gripper
     return 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
 
 
-def _pad_contacts(centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry) -> np.ndarray:
+def _pad_contacts(
+    centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
+) -> np.ndarray:
     """(N,) quality in [0, 1] of pads that close along lines over their faces.
 
     centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
@@ -514,7 +561,11 @@ def _pad_contacts(centre, along, across, half, scene: SceneGeometry, gripper: Gr
         )
     )
     N, L = len(centre), len(offset)
-    origins = centre[:, None] + offset[:, None] * across[:, None] + height[:, None] * np.array((0, 0, 1.0))
+    origins = (
+        centre[:, None]
+        + offset[:, None] * across[:, None]
+        + height[:, None] * np.array((0, 0, 1.0))
+    )
     flat, directions = origins.reshape(-1, 3), np.repeat(along, L, axis=0)
     limit = np.repeat(half, L)
     # Travel of each pad from its open position to the first matter on each line, left then right.
@@ -552,7 +603,10 @@ def _pad_contacts(centre, along, across, half, scene: SceneGeometry, gripper: Gr
     angle = np.arccos(np.clip((facing * touch).sum(axis=2) / count, -1, 1))
     held = np.take_along_axis(owner, travel.argmin(axis=2)[..., None], axis=2)
     alone = np.where(touch, owner == held, True).all(axis=2)
-    point = np.stack([(touch * offset).sum(axis=2), (touch * height).sum(axis=2)], axis=-1) / count[..., None]
+    point = (
+        np.stack([(touch * offset).sum(axis=2), (touch * height).sum(axis=2)], axis=-1)
+        / count[..., None]
+    )
     good = (held[0] == held[1])[:, 0] & (held[0, :, 0] >= 0) & alone.all(axis=0)
     good &= (first[..., 0] > 0.0005).all(axis=0)  # a pad that starts inside matter has hit it
     held = held[0, :, 0]
@@ -562,7 +616,9 @@ def _pad_contacts(centre, along, across, half, scene: SceneGeometry, gripper: Gr
     to_mass = np.array([thing.centre_of_mass for thing in scene.objects])[held] - centre
     arm = np.abs((to_mass * across).sum(axis=1) - point[..., 0].mean(axis=0))
     above = np.abs(to_mass[:, 2] - point[..., 1].mean(axis=0))
-    value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(-((arm / 0.02) ** 2) - (above / 0.06) ** 2)
+    value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(
+        -((arm / 0.02) ** 2) - (above / 0.06) ** 2
+    )
     return value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
 
 

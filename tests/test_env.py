@@ -12,6 +12,7 @@ import numpy as np
 import psutil
 import pybullet
 import pytest
+import torch
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
@@ -377,7 +378,7 @@ def extreme_actions(size: int) -> list[np.ndarray]:
     return [*corners, np.ones(size), -np.ones(size)]
 
 
-@pytest.mark.parametrize("manner", ["random", "extreme"])
+@pytest.mark.parametrize("manner", ["random", "random again", "extreme"])
 @pytest.mark.parametrize("control", CONTROLS)
 def test_joint_and_velocity_limits_hold_at_every_physics_step(make, control, manner):
     env, size = make(control=control, max_steps=10**6), CONTROLS[control]
@@ -390,18 +391,18 @@ def test_joint_and_velocity_limits_hold_at_every_physics_step(make, control, man
         velocities.append(velocity)
 
     env.cell.on_step = watch
-    if manner == "random":
-        actions = np.random.default_rng(0).uniform(-1, 1, (200, size))
+    if manner != "extreme":
+        actions = np.random.default_rng(len(manner)).uniform(-1, 1, (200, size))
     else:
         actions = np.repeat(extreme_actions(size), 200 // len(extreme_actions(size)), axis=0)
     for action in actions:
         _, _, terminated, _, _ = env.step(action)
         if terminated:
             env.reset(seed=0)
-    # The motors are constraints that the solver meets to within its residual.
-    assert (np.min(positions, axis=0) >= JOINT_LOWER - 1e-3).all()
-    assert (np.max(positions, axis=0) <= JOINT_UPPER + 1e-3).all()
-    assert (np.max(np.abs(velocities), axis=0) <= JOINT_VELOCITY * 1.03).all()
+    # A joint is stopped in the physics step after the one that took it over its limit.
+    assert (np.min(positions, axis=0) >= JOINT_LOWER - 5e-3).all()
+    assert (np.max(positions, axis=0) <= JOINT_UPPER + 5e-3).all()
+    assert (np.max(np.abs(velocities), axis=0) <= JOINT_VELOCITY + 1e-6).all()
 
 
 def test_the_command_does_not_wind_up_at_the_workspace_wall(make):
@@ -421,7 +422,7 @@ def test_the_command_does_not_wind_up_at_the_workspace_wall(make):
 
 @pytest.mark.parametrize("control", ["ee", "ee_planar"])
 def test_what_the_arm_cannot_reach_is_refused_and_reported(make, control):
-    """An upright hand at the far upper wall is beyond the Panda's reach: 0.79 m from its shoulder."""
+    """An upright hand at the far upper wall is beyond the Panda's reach."""
     env, size = make(control=control), CONTROLS[control]
     _, info = env.reset(seed=0)
     assert info["reachable"]
@@ -471,6 +472,7 @@ def test_resets_leak_no_memory(make):
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_stable_baselines3_trains_on_it_unmodified(config, algorithm):
     stable_baselines3 = pytest.importorskip("stable_baselines3")
+    torch.set_num_threads(1)  # on a busy machine more threads than free cores wait for each other
     env = gymnasium.make("RobotGrasping-v0", config=config, resolution=64)
     if algorithm == "PPO":
         settings = {"n_steps": 250, "batch_size": 125, "n_epochs": 1}

@@ -41,7 +41,9 @@ def test_a_box_is_closed_on_across_its_short_side(name: str, degrees: int) -> No
 
 @pytest.mark.parametrize("name", DELIBERATE)
 def test_no_finger_goes_into_a_one_centimetre_gap(name: str) -> None:
-    frame = boxes_frame([((0.04, 0.06, 0.05), 0.0, (0.475, 0.0)), ((0.04, 0.06, 0.05), 0.0, (0.525, 0.0))])
+    frame = boxes_frame(
+        [((0.04, 0.06, 0.05), 0.0, (0.475, 0.0)), ((0.04, 0.06, 0.05), 0.0, (0.525, 0.0))]
+    )
     grasps = planner(name)(frame)
     assert grasps
     for grasp in grasps:
@@ -65,7 +67,9 @@ def test_a_box_wider_than_the_gripper_is_left_alone(name: str, degrees: int) -> 
 
 @pytest.mark.parametrize("name", ("random", "heuristic"))
 def test_unprivileged_planners_do_not_look_at_the_truth(name: str) -> None:
-    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))])
+    frame = boxes_frame(
+        [((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))]
+    )
     described = [repr(planner(name)(seen)) for seen in (frame, frame.without_truth())]
     assert not PLANNERS[name].needs_truth and described[0] == described[1]
 
@@ -82,7 +86,9 @@ def test_random_follows_its_own_seed() -> None:
 
 @pytest.mark.parametrize("name", DELIBERATE)
 def test_ranking_is_sorted_and_distinct(name: str) -> None:
-    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))])
+    frame = boxes_frame(
+        [((0.04, 0.10, 0.05), 0.3, (0.45, 0.0)), ((0.03, 0.03, 0.08), 1.0, (0.55, 0.05))]
+    )
     grasps = planner(name)(frame)
     assert 2 <= len(grasps) <= 20
     qualities = [grasp.quality for grasp in grasps]

@@ -138,6 +138,7 @@ class EvaluateConfig(Section):
     workers: Count | None
     max_failures: Count
     videos: Annotated[int, Field(ge=0)]
+    film_format: Literal["mp4", "gif"]
     gallery: Annotated[int, Field(ge=0)]
     name: Name | None
 

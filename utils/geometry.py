@@ -23,12 +23,12 @@ class ConvexSolid:
     offsets: np.ndarray
 
     @staticmethod
-    def from_vertices(vertices: np.ndarray) -> "ConvexSolid":
+    def from_vertices(vertices: np.ndarray) -> ConvexSolid:
         hull = ConvexHull(np.asarray(vertices, dtype=float))
         planes = np.unique(hull.equations.round(9), axis=0)
         return ConvexSolid(hull.points[hull.vertices], planes[:, :3], -planes[:, 3])
 
-    def transformed(self, T: np.ndarray) -> "ConvexSolid":
+    def transformed(self, T: np.ndarray) -> ConvexSolid:
         normals = self.normals @ T[:3, :3].T
         return ConvexSolid(
             transform_points(T, self.vertices), normals, self.offsets + normals @ T[:3, 3]
@@ -111,10 +111,11 @@ class Workspace:
 class GripperGeometry:
     """Outer shape of the Franka hand, metres, measured from the fingertips' lowest point up.
 
-    Read off the collision meshes `finger.obj` and `hand.obj` of pybullet_data/franka_panda (PyBullet
-    uses their convex hulls) with the joint origins of `panda.urdf`: fingers start 0.0584 below the
-    hand frame and are 0.0538 long, so the tips lie 0.1122 below it; E (`panda_grasptarget`) is at
-    0.105. "Along" is the closing line, "across" is horizontal and at right angles to it.
+    Read off the collision meshes `finger.obj` and `hand.obj` of pybullet_data/franka_panda
+    (PyBullet uses their convex hulls) with the joint origins of `panda.urdf`: fingers start 0.0584
+    below the hand frame and are 0.0538 long, so the tips lie 0.1122 below it; E
+    (`panda_grasptarget`) is at 0.105. "Along" is the closing line, "across" is horizontal
+    and at right angles to it.
     """
 
     max_opening: float = 0.08  # two finger joints of 0.04 each
@@ -147,6 +148,6 @@ class GripperGeometry:
         return np.interp(outward, distance, height, left=np.inf, right=np.inf)
 
     def palm_underside(self, across) -> np.ndarray:
-        """Height of the hand's underside above the fingertips at distances across the closing line."""
+        """Height of the hand's underside above the tips at distances across the closing line."""
         distance, height = np.array(self.palm_outline).T
         return np.interp(np.abs(across), distance, height, right=np.inf)

@@ -38,7 +38,7 @@ class HeightMap:
     table_height: float
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column (...) of the cells that hold points (..., 2); outside, the nearest cell."""
+        """Row and column (...) of the cells of points (..., 2); the nearest cell if outside."""
         col, row = np.moveaxis(np.rint((xy - self.origin) / self.cell).astype(np.intp), -1, 0)
         rows, cols = self.height.shape
         return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
@@ -95,7 +95,9 @@ def height_map_from_scene(
             base = grid[window]
             if base.size == 0:
                 continue
-            origins = np.concatenate([base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1)
+            origins = np.concatenate(
+                [base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1
+            )
             top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
             label[window] = np.where(top > height[window], number, label[window])
             height[window] = np.maximum(top, height[window])
@@ -134,7 +136,9 @@ def label_pieces(
     return np.where(above, owner[nearest], -1)
 
 
-def _column_centroids(rise: np.ndarray, label: np.ndarray, grid: np.ndarray, table: float) -> np.ndarray:
+def _column_centroids(
+    rise: np.ndarray, label: np.ndarray, grid: np.ndarray, table: float
+) -> np.ndarray:
     """(M, 3) centroids of the columns under each labelled piece."""
     count = label.max() + 1
     on = label >= 0
@@ -144,7 +148,9 @@ def _column_centroids(rise: np.ndarray, label: np.ndarray, grid: np.ndarray, tab
     return np.column_stack([x, y, table + z])
 
 
-def _splat(points: np.ndarray, shape: tuple[int, int], origin: np.ndarray, cell: float) -> np.ndarray:
+def _splat(
+    points: np.ndarray, shape: tuple[int, int], origin: np.ndarray, cell: float
+) -> np.ndarray:
     """(R, C) highest z of the points (N, 3) in each cell; -inf where there is none."""
     col, row = np.rint((points[:, :2] - origin) / cell).astype(int).T
     inside = (row >= 0) & (row < shape[0]) & (col >= 0) & (col < shape[1])
@@ -167,7 +173,9 @@ def _surface_points(frame: RGBDFrame, split: int = 2) -> np.ndarray:
     """
     depth = frame.depth.astype(float)
     sub = (np.arange(split) + 0.5) / split - 0.5
-    v, u, dv, du = np.meshgrid(np.arange(depth.shape[0]), np.arange(depth.shape[1]), sub, sub, indexing="ij")
+    v, u, dv, du = np.meshgrid(
+        np.arange(depth.shape[0]), np.arange(depth.shape[1]), sub, sub, indexing="ij"
+    )
     points = _rays(frame, u + du, v + dv) * depth[:, :, None, None, None] + frame.T_WC[:3, 3]
     return points[depth > 0].reshape(-1, 3)
 

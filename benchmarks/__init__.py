@@ -1,0 +1,1 @@
+"""Measurements against peers: `python -m benchmarks.bench_env` and its neighbours."""
