@@ -199,9 +199,7 @@ def evaluate(config: Config, run: Path) -> Outcome:
     return outcome
 
 
-def _collect(
-    finished: Iterable[Future], outcome: Outcome, journal: Path, progress: tqdm
-) -> None:
+def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progress: tqdm) -> None:
     for future in finished:
         rounds, pictures, films = future.result()
         for record in rounds:

@@ -12,8 +12,9 @@ import numpy as np
 import pybullet
 
 from envs.camera import Image, Intrinsics, load_renderer, render
+from envs.kinematics import forward_kinematics
 from envs.objects import spawn
-from envs.panda import Panda, forward_kinematics, panda_urdf
+from envs.panda import Panda, panda_urdf
 from envs.scenes import Scene, settle
 from envs.world import add_bin, add_table, on_table, set_up_physics
 from utils.config import CameraConfig, Config
@@ -88,9 +89,7 @@ class Cell:
     def object_pose(self, index: int) -> np.ndarray:
         """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""
         return pose_matrix(
-            *pybullet.getBasePositionAndOrientation(
-                self.bodies[index], physicsClientId=self.client
-            )
+            *pybullet.getBasePositionAndOrientation(self.bodies[index], physicsClientId=self.client)
         )
 
     def object_position(self, index: int) -> np.ndarray:
@@ -110,6 +109,8 @@ class Cell:
         """Take an object out of the game: it stays visible where it is but collides no more."""
         body = self.bodies[index]
         self.remaining.discard(index)
+        # A body without mass keeps its velocity and would drift away.
+        pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=self.client)
         pybullet.changeDynamics(body, -1, mass=0, physicsClientId=self.client)
         pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self.client)
 

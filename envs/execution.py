@@ -6,18 +6,19 @@ successful grasp is. Knows nothing of how grasps are found.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from envs.cell import Cell
-from envs.panda import (
-    MAX_OPENING,
+from envs.kinematics import (
     Trajectory,
     UnreachableError,
     forward_kinematics,
     inverse_kinematics,
 )
+from envs.panda import MAX_OPENING
 from envs.world import BIN_CENTRE, BIN_HEIGHT
 from utils.transforms import Grasp, top_down_pose
 
@@ -135,10 +136,9 @@ def _go_home(cell: Cell) -> None:
     if T[2, 3] < 0.2:
         up = T.copy()
         up[2, 3] = 0.2
-        try:
+        # Where the line cannot be had, the joint motion below goes up as well, only less straight.
+        with contextlib.suppress(UnreachableError):
             _follow(cell, _line(cell, robot.q, up))
-        except UnreachableError:
-            pass  # the joint motion below goes up as well, only less straight
     _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
 
 

@@ -13,24 +13,23 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import pybullet
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
 from envs.camera import render
 from envs.cell import Cell, PhysicsError, camera_intrinsics
-from envs.objects import load_object_set
-from envs.panda import (
+from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     JOINT_VELOCITY,
-    MAX_OPENING,
-    TIP,
     ServoStep,
+    forward_kinematics,
     moved,
     pose_error,
     rotation_matrix,
 )
+from envs.objects import load_object_set
+from envs.panda import MAX_OPENING
 from envs.scenes import make_scene
 from envs.studio import Studio
 from envs.world import on_table
@@ -301,7 +300,7 @@ class RobotGraspingEnv(gymnasium.Env):
         return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
 
     def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joint positions (7,) as far towards a goal as one action gets, and the share of the way."""
+        """Joint positions (7,) towards a goal, and the share of the way that an action gets."""
         change = goal - self._servo.q
         share = 1.0 / max(float((abs(change) / self._max_joint_change).max()), 1.0)
         return self._servo.q + share * change, share
@@ -315,8 +314,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._state = np.array([*q, *velocity, opening], dtype=np.float32)
         if not np.isfinite(self._state).all():
             raise PhysicsError("the robot's state is not finite")
-        tip = pybullet.getLinkState(cell.robot.body, TIP, physicsClientId=cell.client)[0]
-        self._tip = np.array(tip)
+        self._tip = cell.robot.tip_position()
         positions = [cell.object_position(i) for i in range(len(cell.bodies))]
         distances = [float(np.linalg.norm(p - self._tip)) for p in positions]
         nearest = min(range(len(positions)), key=distances.__getitem__)
@@ -382,7 +380,18 @@ def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:
     if closing:
         offset[:] = 0.0, 0.0, 0.05 if info["grasped"] else 0.0
     move = np.clip(offset / env.settings.position_step, -1, 1)
-    return np.array([*move, 0.0, -1.0 if closing else 1.0], dtype=np.float32)
+    turn = 0.0 if closing else np.clip(_turn_to_sides(env) / env.settings.rotation_step, -1, 1)
+    return np.array([*move, turn, -1.0 if closing else 1.0], dtype=np.float32)
+
+
+def _turn_to_sides(env: RobotGraspingEnv) -> float:
+    """Yaw in radians that brings the closing line square to the sides of the first object: a cube's
+    diagonal is wider than the hand."""
+    sides = env.cell.object_pose(0)[:3, :3]
+    level = sides[:, np.argmin(abs(sides[2]))]
+    closing_line = forward_kinematics(env.cell.robot.q)[:3, 1]
+    angle = np.arctan2(level[1], level[0]) - np.arctan2(closing_line[1], closing_line[0])
+    return float((angle + np.pi / 4) % (np.pi / 2) - np.pi / 4)
 
 
 def main() -> None:

@@ -1,14 +1,11 @@
-"""The Franka Panda: kinematics, limits, motors and gripper.
+"""The Franka Panda's body in PyBullet: model, motors, gripper and contacts.
 
-The kinematics are closed-form numpy (no simulator state is touched to plan), the motors are
-PyBullet's. Knows nothing of objects, cameras or grasps.
+Knows nothing of objects, cameras or grasps; where to move is worked out in `envs.kinematics`.
 """
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,240 +13,28 @@ import pybullet
 import pybullet_data
 from scipy.spatial.transform import Rotation
 
-from utils.errors import UserError
+from envs.kinematics import (
+    CARTESIAN_ACCELERATION,
+    JOINT_LOWER,
+    JOINT_TORQUE,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    TOOL_LENGTH,
+    Trajectory,
+    UnreachableError,
+    forward_kinematics,
+    inverse_kinematics,
+    rotation_vector,
+    time_path,
+)
 from utils.files import write_atomic
 
-# Limits of the arm, from Franka Emika's interface specification (Panda).
-JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # rad
-JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # rad
-JOINT_VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # rad/s
-JOINT_ACCELERATION = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])  # rad/s^2
-JOINT_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # N m
-CARTESIAN_ACCELERATION = 6.5  # m/s^2, half of the specified 13, which leaves room for tracking
 MAX_OPENING = 0.08  # m between the fingertips
 FINGER_SPEED = 0.05  # m/s a finger, from the Franka Hand's product manual
 
-# Link numbers in pybullet_data's franka_panda/panda.urdf.
+# Link numbers in the model that `panda_urdf` writes; the hand is part of the last arm link.
 ARM = list(range(7))
-HAND, LEFT_FINGER, RIGHT_FINGER, TIP = 8, 9, 10, 11
-FINGERS = [LEFT_FINGER, RIGHT_FINGER]
-
-# Modified (Craig) Denavit-Hartenberg parameters, same specification: a_{i-1}, alpha_{i-1}, d_i.
-_A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
-_ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2)
-_D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
-
-
-def _link_terms() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(7, 4, 4) each: link i's transform is constant + cosine * cos(q_i) + sine * sin(q_i)."""
-    constant, cosine, sine = np.zeros((3, 7, 4, 4))
-    for i, (a, alpha, d) in enumerate(zip(_A, _ALPHA, _D)):
-        twist = np.eye(4)
-        twist[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
-        twist[:3, 3] = a, -np.sin(alpha) * d, np.cos(alpha) * d
-        constant[i] = twist @ np.diag([0.0, 0.0, 1.0, 1.0])
-        cosine[i] = twist @ np.diag([1.0, 1.0, 0.0, 0.0])
-        sine[i, :, 0], sine[i, :, 1] = twist[:, 1], -twist[:, 0]
-    return constant, cosine, sine
-
-
-_LINK_CONSTANT, _LINK_COSINE, _LINK_SINE = _link_terms()
-# Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
-_TOOL = np.eye(4)
-_TOOL[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
-_TOOL[:3, 3] = 0.0, 0.0, 0.107 + 0.105
-
-
-class UnreachableError(UserError):
-    """The arm cannot reach a pose within its joint limits."""
-
-
-def forward_kinematics(q: np.ndarray) -> np.ndarray:
-    """(4, 4) T_WE for joint positions q (7,), the robot's base being the world frame."""
-    return _chain(q)[0]
-
-
-def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
-    cosines, sines = np.cos(q)[:, None, None], np.sin(q)[:, None, None]
-    links = _LINK_CONSTANT + cosines * _LINK_COSINE + sines * _LINK_SINE
-    T = links[0]
-    poses = [T]
-    for link in links[1:]:
-        T = T @ link
-        poses.append(T)
-    T = T @ _TOOL
-    frames = np.array(poses)
-    axes = frames[:, :3, 2]
-    arm = T[:3, 3] - frames[:, :3, 3]
-    jacobian = np.empty((6, 7))
-    jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
-    jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
-    jacobian[2] = axes[:, 0] * arm[:, 1] - axes[:, 1] * arm[:, 0]
-    jacobian[3:] = axes.T
-    return T, jacobian
-
-
-def geometric_jacobian(q: np.ndarray) -> np.ndarray:
-    """(6, 7) Jacobian of E in W: rows v then omega, for joint positions q (7,)."""
-    return _chain(q)[1]
-
-
-def rotation_vector(R: np.ndarray) -> np.ndarray:
-    """(3,) axis-angle logarithm of a (3, 3) rotation, fast where the angle is not near pi."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    cosine = 0.5 * (a + e + i - 1.0)
-    if cosine < -0.99:
-        return Rotation.from_matrix(R).as_rotvec()
-    x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
-    sine = math.sqrt(x * x + y * y + z * z)
-    scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
-    return np.array([scale * x, scale * y, scale * z])
-
-
-def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of an axis-angle vector (3,), by Rodrigues' formula."""
-    x, y, z = vector.tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle < 1e-9:
-        return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])
-    x, y, z = x / angle, y / angle, z / angle
-    s, c = math.sin(angle), math.cos(angle)
-    t = 1.0 - c
-    return np.array(
-        [
-            [c + t * x * x, t * x * y - s * z, t * x * z + s * y],
-            [t * x * y + s * z, c + t * y * y, t * y * z - s * x],
-            [t * x * z - s * y, t * y * z + s * x, c + t * z * z],
-        ]
-    )
-
-
-def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(6,) small motion in W that takes pose T to the target: metres, then radians."""
-    error = np.empty(6)
-    error[:3] = target[:3, 3] - T[:3, 3]
-    error[3:] = rotation_vector(target[:3, :3] @ T[:3, :3].T)
-    return error
-
-
-def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
-    result = np.eye(4)
-    result[:3, :3] = rotation_matrix(motion[3:]) @ T[:3, :3]
-    result[:3, 3] = T[:3, 3] + motion[:3]
-    return result
-
-
-def inverse_kinematics(
-    target: np.ndarray,
-    seed: np.ndarray,
-    rest: np.ndarray | None = None,
-    *,
-    position_tolerance: float = 1e-4,
-    rotation_tolerance: float = 1e-3,
-    max_iterations: int = 100,
-) -> np.ndarray:
-    """Joint positions (7,) that bring E to the target pose (4, 4) in W.
-
-    Damped least squares within the joint limits (Buss, "Introduction to inverse kinematics",
-    2004), started at `seed`; the redundant joint is drawn towards `rest`. The result has been
-    checked by forward kinematics: within `position_tolerance` metres and `rotation_tolerance`
-    radians, otherwise UnreachableError.
-    """
-    q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
-    for _ in range(max_iterations):
-        T, jacobian = _chain(q)
-        error = pose_error(T, target)
-        if abs(error[:3]).max() < position_tolerance and abs(error[3:]).max() < rotation_tolerance:
-            return q
-        q = q + _damped_step(jacobian, error, q, rest)
-        q = np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
-    position = np.round(target[:3, 3], 3).tolist()
-    raise UnreachableError(
-        f"the arm cannot reach the pose at {position} m within its joint limits: inverse kinematics "
-        f"stopped {1000 * np.linalg.norm(error[:3]):.1f} mm and "
-        f"{np.degrees(np.linalg.norm(error[3:])):.1f} degrees away; choose a pose within 0.85 m of "
-        "the base"
-    )
-
-
-def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: float = 0.3):
-    """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
-    square = jacobian @ jacobian.T
-    square.flat[::7] += damping**2
-    if rest is None:
-        step = jacobian.T @ np.linalg.solve(square, error)
-    else:
-        # The pull fades near the goal, where the damping would let it leak into the task.
-        pull = 0.1 * min(1.0, abs(error).max() / 0.05) * (rest - q)
-        step = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
-    largest = abs(step).max()
-    return step * (max_step / largest) if largest > max_step else step
-
-
-class ServoStep:
-    """One cheap step of inverse kinematics for every control period of a streamed pose command.
-
-    The kinematic chain is walked once: `reached` is (4, 4) T_WE at `q` (7,), and `towards` gives
-    the joint positions (7,) one damped step nearer to a target pose, within the joint limits.
-    """
-
-    def __init__(self, q: np.ndarray):
-        self.q = q
-        self.reached, self._jacobian = _chain(q)
-
-    def towards(self, target: np.ndarray) -> np.ndarray:
-        step = _damped_step(self._jacobian, pose_error(self.reached, target), self.q, None)
-        return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Joint references at the control rate: positions (N, 7) rad and velocities (N, 7) rad/s."""
-
-    positions: np.ndarray
-    velocities: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-
-def time_path(
-    waypoints: np.ndarray,
-    lengths: np.ndarray,
-    *,
-    dt: float,
-    max_speed: float,
-    max_acceleration: float,
-    velocity_scale: float = 1.0,
-    acceleration_scale: float = 1.0,
-) -> Trajectory:
-    """Run along joint waypoints (M, 7) with a smooth profile that respects every joint's limits.
-
-    lengths (M,) is the path coordinate of each waypoint (metres or any unit); max_speed and
-    max_acceleration bound its first two derivatives. The profile is the quintic
-    s(u) = 10u^3 - 15u^4 + 6u^5, whose peaks are 1.875 L/T and 5.7735 L/T^2.
-    """
-    total = lengths[-1] - lengths[0]
-    if total < 1e-9:
-        return Trajectory(waypoints[-1:].copy(), np.zeros((1, 7)))
-    share = (lengths - lengths[0]) / total
-    slope = abs(np.diff(waypoints, axis=0)) / np.maximum(np.diff(share), 1e-9)[:, None]
-    steepest = slope.max(axis=0)
-    duration = max(
-        1.875 * total / max_speed,
-        np.sqrt(5.7735 * total / max_acceleration),
-        float(np.max(1.875 * steepest / (JOINT_VELOCITY * velocity_scale))),
-        float(np.sqrt(np.max(5.7735 * steepest / (JOINT_ACCELERATION * acceleration_scale)))),
-        dt,
-    )
-    steps = int(np.ceil(duration / dt))
-    u = np.arange(1, steps + 1) / steps
-    s = u**3 * (10 - 15 * u + 6 * u**2)
-    positions = np.column_stack([np.interp(s, share, waypoints[:, j]) for j in range(7)])
-    velocities = np.diff(np.vstack([waypoints[:1], positions]), axis=0) / dt
-    return Trajectory(positions, velocities)
+LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
 
 class Panda:
@@ -260,13 +45,17 @@ class Panda:
         self.body = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
         )
-        # Without this gear the fingers drift off the hand's centre (bullet3 #2101).
+        # One motor drives both fingers, as in the real hand: the left finger's, and a gear takes it
+        # to the right one. Without the gear the fingers drift off centre (bullet3 #2101).
+        pybullet.setJointMotorControl2(
+            self.body, RIGHT_FINGER, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client
+        )
         gear = pybullet.createConstraint(
             self.body, LEFT_FINGER, self.body, RIGHT_FINGER, pybullet.JOINT_GEAR,
             [1, 0, 0], [0, 0, 0], [0, 0, 0], physicsClientId=client,
         )  # fmt: skip
         pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=client)
-        for link in [*ARM, HAND, *FINGERS]:
+        for link in [*ARM, *FINGERS]:
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
             )
@@ -311,13 +100,12 @@ class Panda:
     def command_gripper(self, opening: float, force: float | None = None) -> None:
         """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
         opening = min(max(float(opening), 0.0), MAX_OPENING)
-        for finger in FINGERS:
-            pybullet.setJointMotorControl2(
-                self.body, finger, pybullet.POSITION_CONTROL,
-                targetPosition=opening / 2, force=self.grip_force if force is None else force,
-                positionGain=0.2, velocityGain=1.0, maxVelocity=FINGER_SPEED,
-                physicsClientId=self.client,
-            )  # fmt: skip
+        pybullet.setJointMotorControl2(
+            self.body, LEFT_FINGER, pybullet.POSITION_CONTROL,
+            targetPosition=opening / 2, force=2 * (self.grip_force if force is None else force),
+            positionGain=0.2, velocityGain=1.0, maxVelocity=FINGER_SPEED,
+            physicsClientId=self.client,
+        )  # fmt: skip
 
     def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
@@ -325,6 +113,13 @@ class Panda:
         q = np.array([state[0] for state in states[:7]])
         velocity = np.array([state[1] for state in states[:7]])
         return q, velocity, states[7][0] + states[8][0]
+
+    def tip_position(self) -> np.ndarray:
+        """(3,) origin of E in W, read from the physics."""
+        state = pybullet.getLinkState(self.body, ARM[-1], physicsClientId=self.client)
+        x, y, z, w = state[5]
+        approach = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+        return np.array(state[4]) + TOOL_LENGTH * approach
 
     @property
     def q(self) -> np.ndarray:
@@ -405,20 +200,79 @@ _MAX_JUMP = 0.3  # rad between neighbouring waypoints
 
 
 def panda_urdf(cache_dir: Path, fine: bool) -> Path:
-    """The URDF to load: pybullet_data's own for pictures, or one with low-polygon visuals.
+    """Write the robot's model made from pybullet_data's `franka_panda/panda.urdf`; its path.
 
-    The stock visual meshes have about 102,000 triangles, which the software renderer transforms
-    at every frame; the collision meshes that replace them have 3,400.
+    Links behind fixed joints (flange, hand, grasp target) are welded to their parents: the same
+    body, but each link costs the articulated-body solver time at every step. Unless `fine`, the
+    visual meshes (about 102,000 triangles, which the software renderer transforms at every frame)
+    are replaced by the collision meshes (3,400).
     """
     stock = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
-    if fine:
-        return stock
-    tree = ElementTree.parse(stock)
-    for mesh in tree.iter("mesh"):
-        name = mesh.attrib["filename"].replace("package://", "").replace("/visual/", "/collision/")
+    robot = ElementTree.parse(stock).getroot()
+    for mesh in robot.iter("mesh"):
+        name = mesh.attrib["filename"].replace("package://", "")
+        name = name if fine else name.replace("/visual/", "/collision/")
         mesh.set("filename", str(stock.parent / name))
-    path = cache_dir / "panda_low_polygon.urdf"
-    text = ElementTree.tostring(tree.getroot(), encoding="unicode")
+    _weld_fixed_joints(robot)
+    path = cache_dir / f"panda_{'fine' if fine else 'low_polygon'}.urdf"
+    text = ElementTree.tostring(robot, encoding="unicode")
     if not path.exists() or path.read_text() != text:
         write_atomic(path, text)
     return path
+
+
+def _weld_fixed_joints(robot: ElementTree.Element) -> None:
+    """Give the shapes and mass of each link behind a fixed joint to the link before it."""
+    links = {link.attrib["name"]: link for link in robot.iter("link")}
+    for joint in robot.findall("joint[@type='fixed']"):
+        T = _origin(joint)
+        parent, child = (joint.find(end).attrib["link"] for end in ("parent", "child"))
+        for shape in [*links[child].findall("visual"), *links[child].findall("collision")]:
+            _set_origin(shape, T @ _origin(shape))
+            links[parent].append(shape)
+        _add_mass(links[parent], links[child], T)
+        for other in robot.findall("joint"):
+            if other is not joint and other.find("parent").attrib["link"] == child:
+                other.find("parent").set("link", parent)
+                _set_origin(other, T @ _origin(other))
+        robot.remove(links[child])
+        robot.remove(joint)
+
+
+def _add_mass(parent: ElementTree.Element, child: ElementTree.Element, T: np.ndarray) -> None:
+    """Add a welded link's mass at its place. PyBullet works out the inertia from the shapes."""
+    added = child.find("inertial")
+    if added is None:
+        return
+    own = parent.find("inertial")
+    if own is None:
+        _set_origin(added, T @ _origin(added))
+        parent.append(added)
+        return
+    masses = [float(inertial.find("mass").attrib["value"]) for inertial in (own, added)]
+    if sum(masses) > 0:
+        centre = np.eye(4)
+        centre[:3, 3] = np.average(
+            [_origin(own)[:3, 3], (T @ _origin(added))[:3, 3]], axis=0, weights=masses
+        )
+        _set_origin(own, centre)
+    own.find("mass").set("value", repr(sum(masses)))
+
+
+def _origin(element: ElementTree.Element) -> np.ndarray:
+    """(4, 4) transform of a URDF element's origin."""
+    T, origin = np.eye(4), element.find("origin")
+    if origin is not None:
+        xyz, rpy = ([float(x) for x in origin.get(k, "0 0 0").split()] for k in ("xyz", "rpy"))
+        T[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+        T[:3, 3] = xyz
+    return T
+
+
+def _set_origin(element: ElementTree.Element, T: np.ndarray) -> None:
+    origin = element.find("origin")
+    if origin is None:
+        origin = ElementTree.SubElement(element, "origin")
+    origin.set("xyz", " ".join(repr(float(x)) for x in T[:3, 3]))
+    rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+    origin.set("rpy", " ".join(repr(float(x)) for x in rpy))

@@ -44,9 +44,7 @@ class Studio:
         joints = [*ARM, *FINGERS]
         states = pybullet.getJointStates(cell.robot.body, joints, physicsClientId=cell.client)
         for joint, state in zip(joints, states):
-            pybullet.resetJointState(
-                twin.robot.body, joint, state[0], physicsClientId=twin.client
-            )
+            pybullet.resetJointState(twin.robot.body, joint, state[0], physicsClientId=twin.client)
         for body, copy in zip(cell.bodies, twin.bodies):
             pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
             pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=twin.client)

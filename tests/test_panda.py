@@ -1,33 +1,31 @@
 """The arm: kinematics against PyBullet's, limits, straight lines, coupled fingers."""
 
+from pathlib import Path
+
 import numpy as np
 import pybullet
+import pybullet_data
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from envs.panda import (
-    ARM,
-    FINGERS,
+from envs.kinematics import (
     JOINT_ACCELERATION,
     JOINT_LOWER,
     JOINT_TORQUE,
     JOINT_UPPER,
     JOINT_VELOCITY,
-    MAX_OPENING,
-    TIP,
-    Panda,
     ServoStep,
     UnreachableError,
     forward_kinematics,
     geometric_jacobian,
     inverse_kinematics,
-    panda_urdf,
     pose_error,
     rotation_vector,
     time_path,
 )
+from envs.panda import ARM, FINGERS, MAX_OPENING, Panda, panda_urdf
 from envs.world import set_up_physics
 from utils.transforms import top_down_pose
 
@@ -50,25 +48,75 @@ def test_forward_kinematics_known_pose():
     np.testing.assert_allclose(forward_kinematics(HOME)[:3, 3], [0.306891, 0, 0.485282], atol=1e-5)
 
 
-def test_kinematics_equal_pybullets(robot):
+@pytest.fixture(scope="module")
+def stock():
+    """A client and PyBullet's own Panda in it, with its link `panda_grasptarget` (11) at E."""
+    client = pybullet.connect(pybullet.DIRECT)
+    path = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+    yield client, pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
+    pybullet.disconnect(physicsClientId=client)
+
+
+def test_kinematics_equal_pybullets(stock):
+    client, body = stock
     rng = np.random.default_rng(0)
     for _ in range(50):
         q = rng.uniform(JOINT_LOWER, JOINT_UPPER)
-        robot.place(q)
+        for joint, value in zip(ARM, q):
+            pybullet.resetJointState(body, joint, value, physicsClientId=client)
         state = pybullet.getLinkState(
-            robot.body, TIP, computeForwardKinematics=True, physicsClientId=robot.client
+            body, 11, computeForwardKinematics=True, physicsClientId=client
         )
         T = forward_kinematics(q)
         np.testing.assert_allclose(T[:3, 3], state[4], atol=1e-6)
-        np.testing.assert_allclose(
-            T[:3, :3], Rotation.from_quat(state[5]).as_matrix(), atol=1e-6
-        )
+        np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(state[5]).as_matrix(), atol=1e-6)
         linear, angular = pybullet.calculateJacobian(
-            robot.body, TIP, [0, 0, 0], [*q, 0, 0], [0] * 9, [0] * 9,
-            physicsClientId=robot.client,
-        )  # fmt: skip
+            body, 11, [0, 0, 0], [*q, 0, 0], [0] * 9, [0] * 9, physicsClientId=client
+        )
         theirs = np.vstack([linear, angular])[:, :7]
         np.testing.assert_allclose(geometric_jacobian(q), theirs, atol=1e-9)
+
+
+def _distance(client: int, body: int, point) -> float:
+    """From a body's collision shapes to a 1 mm ball, metres."""
+    shape = pybullet.createCollisionShape(
+        pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=client
+    )
+    ball = pybullet.createMultiBody(0, shape, -1, list(point), physicsClientId=client)
+    found = pybullet.getClosestPoints(body, ball, 1.0, physicsClientId=client)
+    pybullet.removeBody(ball, physicsClientId=client)
+    return min(point[8] for point in found)
+
+
+def test_welded_model_is_the_stock_robot(stock, robot):
+    client, body = stock
+    rng = np.random.default_rng(3)
+    mass = {
+        c: sum(
+            pybullet.getDynamicsInfo(b, link, physicsClientId=c)[0]
+            for link in range(-1, pybullet.getNumJoints(b, physicsClientId=c))
+        )
+        for c, b in (stock, (robot.client, robot.body))
+    }
+    assert mass[client] == pytest.approx(mass[robot.client])
+    for _ in range(10):
+        q, opening = rng.uniform(JOINT_LOWER, JOINT_UPPER), rng.uniform(0, 0.08)
+        robot.place(q, opening)
+        for joint, value in zip([*ARM, 9, 10], [*q, opening / 2, opening / 2]):
+            pybullet.resetJointState(body, joint, value, physicsClientId=client)
+        for ours, theirs in zip([*ARM, *FINGERS], [*ARM, 9, 10]):
+            a, b = (
+                pybullet.getLinkState(i, link, computeForwardKinematics=True, physicsClientId=c)
+                for i, link, c in ((robot.body, ours, robot.client), (body, theirs, client))
+            )
+            np.testing.assert_allclose(a[4], b[4], atol=1e-6)  # the links' frames
+            assert abs(np.dot(a[5], b[5])) == pytest.approx(1, abs=1e-6)
+        # Shapes are where they were: equal distances to a small ball near the hand.
+        near = forward_kinematics(q)[:3, 3] + rng.uniform(-0.15, 0.15, 3)
+        np.testing.assert_allclose(
+            _distance(robot.client, robot.body, near), _distance(client, body, near), atol=1e-5
+        )
+        np.testing.assert_allclose(robot.tip_position(), forward_kinematics(q)[:3, 3], atol=1e-6)
 
 
 @given(joint_positions)
@@ -121,7 +169,9 @@ def test_time_path_respects_every_limit():
     dt = 1 / 1000
     for _ in range(20):
         ends = rng.uniform(JOINT_LOWER, JOINT_UPPER, (2, 7))
-        path = time_path(ends, np.array([0.0, 1.0]), dt=dt, max_speed=np.inf, max_acceleration=np.inf)
+        path = time_path(
+            ends, np.array([0.0, 1.0]), dt=dt, max_speed=np.inf, max_acceleration=np.inf
+        )
         acceleration = np.diff(path.velocities, axis=0) / dt
         assert (abs(path.velocities) <= JOINT_VELOCITY * 1.001).all()
         assert (abs(acceleration) <= JOINT_ACCELERATION * 1.01).all()
@@ -160,9 +210,7 @@ def test_motion_in_physics_is_legal_and_accurate(robot):
     states = _run(robot, robot.joint_move(HOME, goal))
     fastest = max((abs(velocity) / JOINT_VELOCITY).max() for _, velocity in states)
     assert fastest < 1.01
-    torque = [
-        s[3] for s in pybullet.getJointStates(robot.body, ARM, physicsClientId=robot.client)
-    ]
+    torque = [s[3] for s in pybullet.getJointStates(robot.body, ARM, physicsClientId=robot.client)]
     assert (abs(np.array(torque)) <= JOINT_TORQUE).all()
     np.testing.assert_allclose(robot.q, goal, atol=2e-3)
 

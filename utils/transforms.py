@@ -90,7 +90,7 @@ class RGBDFrame:
     K: np.ndarray
     T_WC: np.ndarray
     segmentation: np.ndarray | None = None
-    truth: "SceneGeometry | None" = None  # noqa: F821  (utils.geometry, not needed at run time)
+    truth: SceneGeometry | None = None  # noqa: F821  (utils.geometry, not needed at run time)
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
@@ -99,7 +99,7 @@ class RGBDFrame:
         depth = np.where(self.depth > 0, self.depth, np.nan).astype(float)
         return deproject(np.stack([u, v], axis=-1), depth, self.K, self.T_WC)
 
-    def without_truth(self) -> "RGBDFrame":
+    def without_truth(self) -> RGBDFrame:
         """The same frame as an unprivileged planner may see it."""
         return replace(self, segmentation=None, truth=None)
 

@@ -1,0 +1,240 @@
+"""Kinematics of the Franka Panda in closed form, its limits, and motions that respect them.
+
+Pure numpy: planning touches no simulator state. Knows nothing of PyBullet, objects or grasps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from utils.errors import UserError
+
+# Limits of the arm, from Franka Emika's interface specification (Panda).
+JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # rad
+JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # rad
+JOINT_VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # rad/s
+JOINT_ACCELERATION = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])  # rad/s^2
+JOINT_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # N m
+CARTESIAN_ACCELERATION = 6.5  # m/s^2, half of the specified 13, which leaves room for tracking
+
+# Modified (Craig) Denavit-Hartenberg parameters, same specification: a_{i-1}, alpha_{i-1}, d_i.
+_A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
+_ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2)
+_D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
+
+
+def _link_terms() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(7, 4, 4) each: link i's transform is constant + cosine * cos(q_i) + sine * sin(q_i)."""
+    constant, cosine, sine = np.zeros((3, 7, 4, 4))
+    for i, (a, alpha, d) in enumerate(zip(_A, _ALPHA, _D)):
+        twist = np.eye(4)
+        twist[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
+        twist[:3, 3] = a, -np.sin(alpha) * d, np.cos(alpha) * d
+        constant[i] = twist @ np.diag([0.0, 0.0, 1.0, 1.0])
+        cosine[i] = twist @ np.diag([1.0, 1.0, 0.0, 0.0])
+        sine[i, :, 0], sine[i, :, 1] = twist[:, 1], -twist[:, 0]
+    return constant, cosine, sine
+
+
+_LINK_CONSTANT, _LINK_COSINE, _LINK_SINE = _link_terms()
+TOOL_LENGTH = 0.107 + 0.105  # m from joint 7's frame to E
+# Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
+_TOOL = np.eye(4)
+_TOOL[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
+_TOOL[:3, 3] = 0.0, 0.0, TOOL_LENGTH
+
+
+class UnreachableError(UserError):
+    """The arm cannot reach a pose within its joint limits."""
+
+
+def forward_kinematics(q: np.ndarray) -> np.ndarray:
+    """(4, 4) T_WE for joint positions q (7,), the robot's base being the world frame."""
+    return _chain(q)[0]
+
+
+def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
+    cosines, sines = np.cos(q)[:, None, None], np.sin(q)[:, None, None]
+    links = _LINK_CONSTANT + cosines * _LINK_COSINE + sines * _LINK_SINE
+    T = links[0]
+    poses = [T]
+    for link in links[1:]:
+        T = T @ link
+        poses.append(T)
+    T = T @ _TOOL
+    frames = np.array(poses)
+    axes = frames[:, :3, 2]
+    arm = T[:3, 3] - frames[:, :3, 3]
+    jacobian = np.empty((6, 7))
+    jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
+    jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
+    jacobian[2] = axes[:, 0] * arm[:, 1] - axes[:, 1] * arm[:, 0]
+    jacobian[3:] = axes.T
+    return T, jacobian
+
+
+def geometric_jacobian(q: np.ndarray) -> np.ndarray:
+    """(6, 7) Jacobian of E in W: rows v then omega, for joint positions q (7,)."""
+    return _chain(q)[1]
+
+
+def rotation_vector(R: np.ndarray) -> np.ndarray:
+    """(3,) axis-angle logarithm of a (3, 3) rotation, fast where the angle is not near pi."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    cosine = 0.5 * (a + e + i - 1.0)
+    if cosine < -0.99:
+        return Rotation.from_matrix(R).as_rotvec()
+    x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
+    return np.array([scale * x, scale * y, scale * z])
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of an axis-angle vector (3,), by Rodrigues' formula."""
+    x, y, z = vector.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-9:
+        return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])
+    x, y, z = x / angle, y / angle, z / angle
+    s, c = math.sin(angle), math.cos(angle)
+    t = 1.0 - c
+    return np.array(
+        [
+            [c + t * x * x, t * x * y - s * z, t * x * z + s * y],
+            [t * x * y + s * z, c + t * y * y, t * y * z - s * x],
+            [t * x * z - s * y, t * y * z + s * x, c + t * z * z],
+        ]
+    )
+
+
+def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(6,) small motion in W that takes pose T to the target: metres, then radians."""
+    error = np.empty(6)
+    error[:3] = target[:3, 3] - T[:3, 3]
+    error[3:] = rotation_vector(target[:3, :3] @ T[:3, :3].T)
+    return error
+
+
+def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
+    result = np.eye(4)
+    result[:3, :3] = rotation_matrix(motion[3:]) @ T[:3, :3]
+    result[:3, 3] = T[:3, 3] + motion[:3]
+    return result
+
+
+def inverse_kinematics(
+    target: np.ndarray,
+    seed: np.ndarray,
+    rest: np.ndarray | None = None,
+    *,
+    position_tolerance: float = 1e-4,
+    rotation_tolerance: float = 1e-3,
+    max_iterations: int = 100,
+) -> np.ndarray:
+    """Joint positions (7,) that bring E to the target pose (4, 4) in W.
+
+    Damped least squares within the joint limits (Buss, "Introduction to inverse kinematics",
+    2004), started at `seed`; the redundant joint is drawn towards `rest`. The result has been
+    checked by forward kinematics: within `position_tolerance` metres and `rotation_tolerance`
+    radians, otherwise UnreachableError.
+    """
+    q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
+    for _ in range(max_iterations):
+        T, jacobian = _chain(q)
+        error = pose_error(T, target)
+        if abs(error[:3]).max() < position_tolerance and abs(error[3:]).max() < rotation_tolerance:
+            return q
+        q = q + _damped_step(jacobian, error, q, rest)
+        q = np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
+    position = np.round(target[:3, 3], 3).tolist()
+    raise UnreachableError(
+        f"the arm cannot reach the pose at {position} m within its joint limits: inverse "
+        f"kinematics stopped {1000 * np.linalg.norm(error[:3]):.1f} mm and "
+        f"{np.degrees(np.linalg.norm(error[3:])):.1f} degrees away; choose a pose within 0.85 m of "
+        "the base"
+    )
+
+
+def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: float = 0.3):
+    """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
+    square = jacobian @ jacobian.T
+    square.flat[::7] += damping**2
+    if rest is None:
+        step = jacobian.T @ np.linalg.solve(square, error)
+    else:
+        # The pull fades near the goal, where the damping would let it leak into the task.
+        pull = 0.1 * min(1.0, abs(error).max() / 0.05) * (rest - q)
+        step = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
+    largest = abs(step).max()
+    return step * (max_step / largest) if largest > max_step else step
+
+
+class ServoStep:
+    """One cheap step of inverse kinematics for every control period of a streamed pose command.
+
+    The kinematic chain is walked once: `reached` is (4, 4) T_WE at `q` (7,), and `towards` gives
+    the joint positions (7,) one damped step nearer to a target pose, within the joint limits.
+    """
+
+    def __init__(self, q: np.ndarray):
+        self.q = q
+        self.reached, self._jacobian = _chain(q)
+
+    def towards(self, target: np.ndarray) -> np.ndarray:
+        step = _damped_step(self._jacobian, pose_error(self.reached, target), self.q, None)
+        return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Joint references at the control rate: positions (N, 7) rad and velocities (N, 7) rad/s."""
+
+    positions: np.ndarray
+    velocities: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def time_path(
+    waypoints: np.ndarray,
+    lengths: np.ndarray,
+    *,
+    dt: float,
+    max_speed: float,
+    max_acceleration: float,
+    velocity_scale: float = 1.0,
+    acceleration_scale: float = 1.0,
+) -> Trajectory:
+    """Run along joint waypoints (M, 7) with a smooth profile that respects every joint's limits.
+
+    lengths (M,) is the path coordinate of each waypoint (metres or any unit); max_speed and
+    max_acceleration bound its first two derivatives. The profile is the quintic
+    s(u) = 10u^3 - 15u^4 + 6u^5, whose peaks are 1.875 L/T and 5.7735 L/T^2.
+    """
+    total = lengths[-1] - lengths[0]
+    if total < 1e-9:
+        return Trajectory(waypoints[-1:].copy(), np.zeros((1, 7)))
+    share = (lengths - lengths[0]) / total
+    slope = abs(np.diff(waypoints, axis=0)) / np.maximum(np.diff(share), 1e-9)[:, None]
+    steepest = slope.max(axis=0)
+    duration = max(
+        1.875 * total / max_speed,
+        np.sqrt(5.7735 * total / max_acceleration),
+        float(np.max(1.875 * steepest / (JOINT_VELOCITY * velocity_scale))),
+        float(np.sqrt(np.max(5.7735 * steepest / (JOINT_ACCELERATION * acceleration_scale)))),
+        dt,
+    )
+    steps = int(np.ceil(duration / dt))
+    u = np.arange(1, steps + 1) / steps
+    s = u**3 * (10 - 15 * u + 6 * u**2)
+    positions = np.column_stack([np.interp(s, share, waypoints[:, j]) for j in range(7)])
+    velocities = np.diff(np.vstack([waypoints[:1], positions]), axis=0) / dt
+    return Trajectory(positions, velocities)
