@@ -2,7 +2,7 @@
 
 A set is named (`box`, `primitives`, `random_urdfs`) or is any folder of URDF and mesh files. Every
 object is one rigid body whose frame has its origin at the centre of mass and the axes of its
-source. This module knows neither robot nor scene.
+source. This module knows neither robot nor scene, and not what URDF and mesh files look like.
 """
 
 from __future__ import annotations
@@ -16,30 +16,20 @@ from functools import cached_property
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 
 import numpy as np
 import pybullet
 import pybullet_data
 import trimesh
-import yourdfpy
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from envs.meshes import (
-    ObjectError,
-    checked_mesh,
-    decompose,
-    load_mesh,
-    mass_properties,
-    write_mesh_obj,
-    write_parts_obj,
-)
+from envs.bullet_shapes import collision_shape, visual_shape
+from envs.meshes import ObjectError, decompose, mass_properties, write_parts_obj
+from envs.object_files import FineVisual, fine_visual, object_files, read_object
 from envs.primitives import NativeShape, make_primitive, random_color
 from utils.geometry import ConvexSolid
 
 NAMED_SETS = ("box", "primitives", "random_urdfs")
-SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
@@ -48,23 +38,11 @@ RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda han
 DEFAULT_DENSITY = 1000.0
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
-DEFAULT_FRICTION = 0.7  # of a file that states none
 HAND_OPENING = 0.08
 LARGEST_EXTENT = 0.5
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
 ROLLING_FRICTION = 0.0005
-
-
-@dataclass(frozen=True)
-class FineVisual:
-    """The original mesh: a vertex v of the file is at rotation(quaternion) @ (scale * v) + position
-    in the body frame (metres; quaternion x, y, z, w)."""
-
-    path: Path
-    scale: tuple[float, float, float]
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +89,10 @@ def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = Fa
     # The shapes live until `resetSimulation`, even if the body is removed (bullet3 #2086).
     body = pybullet.createMultiBody(
         baseMass=model.mass,
-        baseCollisionShapeIndex=_collision_shape(client, model),
-        baseVisualShapeIndex=_visual_shape(client, model, fine),
+        baseCollisionShapeIndex=collision_shape(client, model.collision),
+        baseVisualShapeIndex=visual_shape(
+            client, model.collision, model.color, model.fine_visual if fine else None
+        ),
         basePosition=np.asarray(position, dtype=float).tolist(),
         baseOrientation=np.asarray(quaternion, dtype=float).tolist(),
         physicsClientId=client,
@@ -198,7 +178,12 @@ def load_object_set(
             "random_urdfs", _random_urdf_files(split), scale or default, fit, density, cache_dir
         )
     folder = Path(name_or_path).expanduser()
-    files = _object_files(folder)
+    if not folder.is_dir():
+        raise ObjectError(
+            f"objects: {str(folder)!r} is neither one of the sets {', '.join(NAMED_SETS)} nor an "
+            "existing folder"
+        )
+    files = object_files(folder)
     return FileSet(folder.resolve().name, files, scale or 1.0, fit, density, cache_dir)
 
 
@@ -308,6 +293,13 @@ class FileSet(ObjectSet):
         return model
 
 
+def _random_urdf_files(split: str) -> list[Path]:
+    """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
+    folder = Path(pybullet_data.getDataPath()) / "random_urdfs"
+    numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
+    return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
+
+
 def load_object(
     path: str | Path,
     *,
@@ -321,7 +313,7 @@ def load_object(
     scale, fit, density: as in `load_object_set`. Raises ObjectError naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
-    source = _read_urdf(path) if path.suffix.lower() == ".urdf" else _Source(load_mesh(path))
+    source = read_object(path)
     parts = decompose(source.mesh, cache_dir, str(path))
     solid = mass_properties(source.mesh, parts)
     if fit is not None:
@@ -337,7 +329,7 @@ def load_object(
         friction=source.friction,
         color=source.color or random_color(np.random.default_rng(list(path.stem.encode()))),
         collision=write_parts_obj(parts, cache_dir),
-        fine_visual=_fine_visual(path, source, scale, solid.centre_of_mass, cache_dir),
+        fine_visual=fine_visual(path, source, scale, solid.centre_of_mass, cache_dir),
         extents=np.ptp(np.concatenate(parts), axis=0),
     )
 
@@ -357,188 +349,3 @@ def _native_model(name, shape: NativeShape, density, friction, color) -> ObjectM
         extents=np.asarray(solid.extents),
         rolling_friction=0.0 if shape.kind == "box" else ROLLING_FRICTION,
     )
-
-
-# --- files ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Source:
-    """What a file says. visual: (mesh file, scale (3,), T (4, 4)) if there is just one, as read by
-    PyBullet; otherwise the mesh itself is what there is to see."""
-
-    mesh: trimesh.Trimesh
-    friction: float = DEFAULT_FRICTION
-    color: tuple[float, float, float, float] | None = None
-    visual: tuple[Path, np.ndarray, np.ndarray] | None = None
-    visual_mesh: trimesh.Trimesh | None = None
-
-
-def _random_urdf_files(split: str) -> list[Path]:
-    """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
-    folder = Path(pybullet_data.getDataPath()) / "random_urdfs"
-    numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
-    return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
-
-
-def _object_files(folder: Path) -> list[Path]:
-    """Sorted URDF and mesh files below a folder, without the meshes that its URDFs refer to."""
-    if not folder.is_dir():
-        raise ObjectError(
-            f"objects: {str(folder)!r} is neither one of the sets {', '.join(NAMED_SETS)} nor an "
-            "existing folder"
-        )
-    files = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
-    )
-    referred: set[Path] = set()
-    for path in files:
-        if path.suffix.lower() == ".urdf":
-            for mesh in _parse_xml(path).iter("mesh"):
-                referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
-    files = [path for path in files if path.resolve() not in referred]
-    if not files:
-        raise ObjectError(
-            f"objects: folder {folder} holds no object; "
-            f"put in files ending in {', '.join(SUFFIXES)}"
-        )
-    return files
-
-
-def _parse_xml(path: Path) -> ElementTree.Element:
-    try:
-        return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
-
-
-def _resolve_mesh(filename: str, urdf: Path) -> str:
-    """The file that a URDF's mesh element means: relative to it, or in a package around it."""
-    if filename.startswith("package://"):
-        inside = Path(filename.removeprefix("package://"))
-        for base in urdf.resolve().parents:
-            for candidate in (base / inside, base / Path(*inside.parts[1:])):
-                if candidate.is_file():
-                    return str(candidate)
-    return str(urdf.parent / filename.removeprefix("file://"))
-
-
-def _read_urdf(path: Path) -> _Source:
-    xml = _parse_xml(path)
-    for element in xml.iter("mesh"):
-        # Checked first: its message names the mesh, which yourdfpy's may not.
-        load_mesh(_resolve_mesh(element.get("filename", ""), path))
-    try:
-        robot = yourdfpy.URDF.load(
-            str(path),
-            build_collision_scene_graph=True,
-            load_collision_meshes=True,
-            filename_handler=lambda fname: _resolve_mesh(fname, path),
-        )
-        # A link is solid where it collides; without any collision geometry, where it shows.
-        scene = robot.collision_scene if robot.collision_scene.geometry else robot.scene
-        mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
-        friction = xml.find(".//contact/lateral_friction")  # yourdfpy leaves <contact> out
-        friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
-    except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
-        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
-    if len(mesh.faces) == 0:
-        raise ObjectError(f"URDF {path} has neither collision nor visual geometry; add some")
-    shown = [(link, item) for link in robot.robot.links for item in link.visuals]
-    return _Source(
-        mesh=checked_mesh(mesh, str(path)),
-        friction=friction,
-        color=_urdf_color(shown, robot),
-        visual=_single_visual(shown, robot, path),
-        visual_mesh=visual if len(visual.faces) else None,
-    )
-
-
-def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:
-    named = {material.name: material for material in robot.robot.materials}
-    for _, item in shown:
-        material = item.material and named.get(item.material.name, item.material)
-        color = (item.material and item.material.color) or (material and material.color)
-        if color is not None:
-            return tuple(float(c) for c in color.rgba)
-    return None
-
-
-def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
-    if len(shown) != 1 or shown[0][1].geometry.mesh is None:
-        return None
-    link, item = shown[0]
-    file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
-    scale = item.geometry.mesh.scale
-    scale = np.broadcast_to(1.0 if scale is None else scale, 3)
-    origin = np.eye(4) if item.origin is None else item.origin
-    return file, scale, robot.get_transform(link.name) @ origin
-
-
-def _fine_visual(path: Path, source: _Source, scale: float, centre, cache_dir: Path) -> FineVisual:
-    if source.visual is not None:
-        file, file_scale, T = source.visual
-    elif source.visual_mesh is not None:
-        file, file_scale, T = write_mesh_obj(source.visual_mesh, cache_dir), np.ones(3), np.eye(4)
-    else:
-        file, file_scale, T = path, np.ones(3), np.eye(4)
-    if file.suffix.lower() != ".obj":  # what PyBullet makes of the others differs from trimesh
-        file = write_mesh_obj(load_mesh(file), cache_dir)
-    return FineVisual(
-        path=file,
-        scale=tuple((scale * file_scale).tolist()),
-        position=tuple((scale * (T[:3, 3] - centre)).tolist()),
-        quaternion=tuple(Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
-    )
-
-
-# --- PyBullet shapes ------------------------------------------------------------------------
-
-
-def _collision_shape(client: int, model: ObjectModel) -> int:
-    shape = model.collision
-    if isinstance(shape, NativeShape):
-        kind, size = _native_arguments(shape, "height")
-        return pybullet.createCollisionShape(kind, physicsClientId=client, **size)
-    return pybullet.createCollisionShape(
-        pybullet.GEOM_MESH, fileName=str(shape), physicsClientId=client
-    )
-
-
-def _visual_shape(client: int, model: ObjectModel, fine: bool) -> int:
-    shape = model.collision
-    if isinstance(shape, NativeShape):
-        kind, size = _native_arguments(shape, "length")
-        return pybullet.createVisualShape(
-            kind, rgbaColor=model.color, physicsClientId=client, **size
-        )
-    visual = model.fine_visual
-    if not fine or visual is None:
-        return pybullet.createVisualShape(
-            pybullet.GEOM_MESH, fileName=str(shape), rgbaColor=model.color, physicsClientId=client
-        )
-    return pybullet.createVisualShape(
-        pybullet.GEOM_MESH,
-        fileName=str(visual.path),
-        meshScale=visual.scale,
-        visualFramePosition=visual.position,
-        visualFrameOrientation=visual.quaternion,
-        # The colour multiplies a texture: white leaves it as it is.
-        rgbaColor=(1, 1, 1, 1) if _has_texture(visual.path) else model.color,
-        physicsClientId=client,
-    )
-
-
-def _native_arguments(shape: NativeShape, length_name: str) -> tuple[int, dict]:
-    """PyBullet calls a cylinder's length "height" when it collides and "length" when it shows."""
-    if shape.kind == "box":
-        return pybullet.GEOM_BOX, {"halfExtents": [side / 2 for side in shape.size]}
-    if shape.kind == "sphere":
-        return pybullet.GEOM_SPHERE, {"radius": shape.size[0]}
-    kinds = {"cylinder": pybullet.GEOM_CYLINDER, "capsule": pybullet.GEOM_CAPSULE}
-    return kinds[shape.kind], {"radius": shape.size[0], length_name: shape.size[1]}
-
-
-def _has_texture(path: Path) -> bool:
-    material = path.with_suffix(".mtl")
-    return material.is_file() and "map_Kd" in material.read_text(errors="replace")

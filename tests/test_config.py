@@ -10,14 +10,14 @@ from pydantic import ValidationError
 from utils.config import (
     DEFAULTS,
     ConfigError,
-    _known_keys,
-    _schema_at,
     changed_keys,
     dump_config,
     load_config,
     parse_args,
     run_script,
+    with_settings,
 )
+from utils.config_errors import known_keys, schema_at
 from utils.errors import UserError, unknown_choice
 
 
@@ -57,7 +57,7 @@ def test_defaults_and_schema_have_the_same_keys():
             if isinstance(value, dict):
                 yield from keys(value, f"{prefix}{key}.")
 
-    assert set(keys(yaml.safe_load(DEFAULTS.read_text(encoding="utf-8")))) == set(_known_keys())
+    assert set(keys(yaml.safe_load(DEFAULTS.read_text(encoding="utf-8")))) == set(known_keys())
 
 
 def test_frozen():
@@ -187,8 +187,8 @@ def test_unreadable_files(tmp_path):
 
 
 def test_every_leaf_explains_a_wrong_type():
-    for key in _known_keys():
-        if "properties" not in _schema_at(key):
+    for key in known_keys():
+        if "properties" not in schema_at(key):
             text = message(f"{key}={{a: 1}}")
             assert text.startswith(key) and "expected" in text
 
@@ -205,6 +205,21 @@ def test_changed_keys_repeat_a_run():
     assert len(changes) == 5 and "scene.count=2" in changes
     assert load_config(None, changes) == config
     assert changed_keys(load_config()) == []
+
+
+def test_with_settings_changes_one_section():
+    config = load_config()
+    changed = with_settings(config, "env", {"max_steps": 7})
+    assert changed.env.max_steps == 7 and config.env.max_steps != 7
+    assert changed_keys(changed) == ["env.max_steps=7"]
+
+
+def test_with_settings_refuses_an_unknown_key():
+    with pytest.raises(ConfigError) as caught:
+        with_settings(load_config(), "env", {"max_step": 7})
+    text = str(caught.value)
+    assert text.startswith("env.max_step: unknown key (keyword arguments)")
+    assert "did you mean env.max_steps?" in text
 
 
 def test_cache_folder(monkeypatch, tmp_path):

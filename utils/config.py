@@ -1,197 +1,70 @@
 """The configuration: YAML and command line in, checked and typed objects out.
 
-`configs/default.yaml` is the one place of defaults; the classes below hold types and ranges
-only. A new section is a new `Section` class, a field of `Config` and its keys in that file.
-This module knows neither the simulator nor the networks.
+`configs/default.yaml` is the one place of defaults, `utils.config_schema` holds types and ranges,
+`utils.config_errors` says what is wrong. This module knows neither the simulator nor the networks.
 """
 
 from __future__ import annotations
 
 import argparse
-import difflib
 import json
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
+from utils.config_errors import (
+    DEFAULTS,
+    ConfigError,
+    Layer,
+    allowed,
+    alternatives,
+    explain,
+    known_keys,
+    schema_at,
+    unknown_key,
+)
+from utils.config_schema import (
+    OBJECT_SETS,
+    CameraConfig,
+    Config,
+    EnvConfig,
+    EvaluateConfig,
+    ExecutionConfig,
+    ObjectsConfig,
+    RobotConfig,
+    SceneConfig,
+    SimConfig,
+    WorkspaceConfig,
+)
 from utils.errors import UserError, did_you_mean
 
-DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"
-OBJECT_SETS = ("box", "primitives", "random_urdfs")
-
-
-class ConfigError(UserError):
-    """A config that cannot be used: the message holds key, value, what is allowed, nearest key."""
-
-
-# --- The schema -----------------------------------------------------------------------------
-
-
-def _object_set(value: str) -> str:
-    if value not in OBJECT_SETS and not Path(value).expanduser().is_dir():
-        raise ValueError("no such object set or folder")
-    return value
-
-
-def _no_repeats(values: tuple) -> tuple:
-    if len(set(values)) != len(values):
-        raise ValueError("an entry is repeated")
-    return values
-
-
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(gt=0, le=1)]
-Pixels = Annotated[int, Field(ge=16, le=4096)]
-Name = Annotated[str, Field(min_length=1)]
-# What a type alone cannot tell is put in `description`, which error messages quote.
-ObjectSet = Annotated[
-    str,
-    AfterValidator(_object_set),
-    Field(description=f"one of {', '.join(OBJECT_SETS)}, or an existing folder"),
+__all__ = [
+    "DEFAULTS",
+    "OBJECT_SETS",
+    "USER_ERRORS",
+    "CameraConfig",
+    "Config",
+    "ConfigError",
+    "EnvConfig",
+    "EvaluateConfig",
+    "ExecutionConfig",
+    "ObjectsConfig",
+    "RobotConfig",
+    "SceneConfig",
+    "SimConfig",
+    "WorkspaceConfig",
+    "changed_keys",
+    "dump_config",
+    "load_config",
+    "parse_args",
+    "run_script",
+    "with_settings",
 ]
-Scenario = Literal["isolated", "packed", "pile"]
-Mount = Literal["overhead", "wrist"]
-# YAML has lists where frozen objects hold tuples, hence strict=False; the items stay strict.
-Vector2 = Annotated[tuple[float, float], Field(strict=False)]
-Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
-JointVector = Annotated[tuple[float, float, float, float, float, float, float], Field(strict=False)]
-Several = Field(min_length=1, strict=False)
-
-
-class Section(BaseModel):
-    """Base of every section: no unknown keys, no silent conversions, no changes, no NaN."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class SimConfig(Section):
-    frequency: Annotated[int, Field(ge=60, le=2000)]
-    solver_iterations: Annotated[int, Field(ge=1, le=1000)]
-    renderer: Literal["auto", "tiny", "egl"]
-
-
-class RobotConfig(Section):
-    home: JointVector
-    grip_force: Positive
-    velocity_scale: Share
-    acceleration_scale: Share
-
-
-class CameraConfig(Section):
-    mount: Mount
-    width: Pixels
-    height: Pixels
-    fov_deg: Annotated[float, Field(ge=1, le=170)]
-    position: Vector3
-    target: Vector3
-    up: Vector3
-    near: Positive
-    far: Positive
-    wrist_position: Vector3
-    wrist_fov_deg: Annotated[float, Field(ge=1, le=170)]
-
-    @model_validator(mode="after")
-    def _near_before_far(self) -> CameraConfig:
-        if self.near >= self.far:
-            raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
-        return self
-
-
-class WorkspaceConfig(Section):
-    center: Vector2
-    size: Positive
-
-
-class ObjectsConfig(Section):
-    split: Literal["test", "train"]
-    scale: Positive | None
-    fit: Positive | None
-    density: Positive
-
-
-class SceneConfig(Section):
-    count: Annotated[int, Field(ge=1, le=50)]
-    settle_seconds: Positive
-
-
-class ExecutionConfig(Section):
-    pregrasp_height: Positive
-    approach_speed: Positive
-    lift_height: Positive
-    hold_seconds: Annotated[float, Field(ge=0)]
-    contact_stop: Positive
-
-
-class EvaluateConfig(Section):
-    policies: Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
-    scenarios: Annotated[tuple[Scenario, ...], Several, AfterValidator(_no_repeats)]
-    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
-    rounds: Count
-    workers: Count | None
-    max_failures: Count
-    videos: Annotated[int, Field(ge=0)]
-    film_format: Literal["mp4", "gif"]
-    gallery: Annotated[int, Field(ge=0)]
-    name: Name | None
-
-
-class EnvConfig(Section):
-    observations: Annotated[
-        tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(_no_repeats)
-    ]
-    control: Literal["ee", "ee_planar", "joint"]
-    resolution: Pixels
-    camera: Mount
-    objects: ObjectSet
-    scenario: Scenario
-    reward: Literal["dense", "sparse"]
-    max_steps: Count
-    substeps: Count
-    lift_height: Positive
-    hold_seconds: Annotated[float, Field(ge=0)]
-    position_step: Positive
-    rotation_step: Positive
-    joint_step: Positive
-
-
-class Config(Section):
-    """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
-
-    seed: Annotated[int, Field(ge=0, lt=2**32)]
-    cache_dir: Annotated[Path, Field(strict=False)] | None
-    sim: SimConfig
-    robot: RobotConfig
-    camera: CameraConfig
-    workspace: WorkspaceConfig
-    objects: ObjectsConfig
-    scene: SceneConfig
-    execution: ExecutionConfig
-    evaluate: EvaluateConfig
-    env: EnvConfig
-
-    @property
-    def cache_folder(self) -> Path:
-        """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist."""
-        chosen = self.cache_dir or os.environ.get("ROBOT_GRASPING_CACHE")
-        return Path(chosen or "~/.cache/robot_grasping").expanduser()
-
-
-# --- Loading --------------------------------------------------------------------------------
-
-
-class _Layer(NamedTuple):
-    """Keys from one source; a later layer wins over an earlier one."""
-
-    source: str
-    values: dict[str, Any]
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -201,29 +74,29 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     takes a list also takes "a,b" or a single item.
     Raises ConfigError on a missing file, bad YAML, an unknown key, a wrong type or range.
     """
-    layers = [_Layer(str(DEFAULTS), _read_yaml(DEFAULTS))]
+    layers = [Layer(str(DEFAULTS), _read_yaml(DEFAULTS))]
     if path is not None:
-        layers.append(_Layer(str(path), _read_yaml(Path(path))))
-    layers += [_Layer("command line", _parse_override(text)) for text in overrides]
+        layers.append(Layer(str(path), _read_yaml(Path(path))))
+    layers += [Layer("command line", _parse_override(text)) for text in overrides]
     merged: dict[str, Any] = {}
     for layer in layers:
         merged = _merge(merged, layer.values)
     try:
         return Config.model_validate(merged)
     except ValidationError as error:
-        raise ConfigError(_explain(error, layers)) from error
+        raise ConfigError(explain(error, layers)) from error
 
 
 def with_settings(config: Config, section: str, settings: Mapping[str, Any]) -> Config:
     """The config with some keys of one section changed, checked like everything else."""
     layers = [
-        _Layer("config", config.model_dump(mode="json")),
-        _Layer("keyword arguments", {section: dict(settings)}),
+        Layer("config", config.model_dump(mode="json")),
+        Layer("keyword arguments", {section: dict(settings)}),
     ]
     try:
         return Config.model_validate(_merge(layers[0].values, layers[1].values))
     except ValidationError as error:
-        raise ConfigError(_explain(error, layers)) from error
+        raise ConfigError(explain(error, layers)) from error
 
 
 def dump_config(config: Config) -> str:
@@ -292,19 +165,19 @@ def _parse_override(text: str) -> dict[str, Any]:
     if not equals or not key:
         raise ConfigError(
             f"{text!r}: not an override, expected KEY=VALUE such as evaluate.rounds=50"
-            f"{did_you_mean(key, _known_keys())}"
+            f"{did_you_mean(key, known_keys())}"
         )
-    schema = _schema_at(key)
+    schema = schema_at(key)
     if schema is None:
-        raise ConfigError(_unknown_key(key, "command line"))
-    types = {part.get("type") for part in _alternatives(schema)}
+        raise ConfigError(unknown_key(key, "command line"))
+    types = {part.get("type") for part in alternatives(schema)}
     try:
         value = yaml.load(raw, _Loader)
         if "array" in types and not isinstance(value, list | dict | None):
             value = yaml.load(f"[{raw}]", _Loader)
     except yaml.YAMLError as error:
         raise ConfigError(
-            f"{key}: cannot read {raw!r} as YAML: {_one_line(error)}; expected {_allowed(schema)}"
+            f"{key}: cannot read {raw!r} as YAML: {_one_line(error)}; expected {allowed(schema)}"
         ) from error
     if "string" in types and not isinstance(value, str | list | dict | None):
         value = raw.strip()  # evaluate.name=007 is text
@@ -321,150 +194,6 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(below, dict) and isinstance(value, dict)
         merged[key] = _merge(below, value) if both else value
     return merged
-
-
-# --- Saying what is wrong -------------------------------------------------------------------
-# What is allowed is read from the JSON schema, so that messages cannot disagree with the checks.
-
-
-@cache
-def _schema() -> dict[str, Any]:
-    return Config.model_json_schema()
-
-
-def _resolve(schema: dict[str, Any]) -> dict[str, Any]:
-    reference = schema.get("$ref")
-    return _schema()["$defs"][reference.rsplit("/", 1)[1]] if reference else schema
-
-
-def _schema_at(key: str) -> dict[str, Any] | None:
-    """The JSON schema of a dotted key, or None where there is no such key."""
-    schema = _schema()
-    for part in key.split("."):
-        schema = _resolve(schema).get("properties", {}).get(part)
-        if schema is None:
-            return None
-    return _resolve(schema)
-
-
-def _known_keys(schema: dict[str, Any] | None = None, prefix: str = "") -> Iterator[str]:
-    """Every dotted key, sections included."""
-    for name, child in (schema or _schema())["properties"].items():
-        yield prefix + name
-        child = _resolve(child)
-        if "properties" in child:
-            yield from _known_keys(child, f"{prefix}{name}.")
-
-
-def _alternatives(schema: dict[str, Any]) -> list[dict[str, Any]]:
-    return schema.get("anyOf", [schema])
-
-
-_NOUNS = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true/false"}
-_BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-
-
-def _allowed(schema: dict[str, Any]) -> str:
-    """What a key takes, in words: 'a whole number >= 1, or null'."""
-    if "anyOf" in schema:
-        return ", or ".join(_allowed(part) for part in schema["anyOf"])
-    if "properties" in schema:
-        return f"a section with the keys {', '.join(schema['properties'])}"
-    if schema.get("type") == "array":
-        fixed = schema.get("prefixItems")
-        if fixed:
-            return f"a list of {len(fixed)} {_NOUNS[fixed[0]['type']]}s"
-        return f"a list of at least one, each {_allowed(schema['items'])}"
-    if schema.get("type") == "null":
-        return "null"
-    if "enum" in schema:
-        return f"one of {', '.join(schema['enum'])}"
-    if "description" in schema:
-        return schema["description"]
-    noun = _NOUNS[schema["type"]]
-    bounds = " and ".join(f"{sign} {schema[k]}" for k, sign in _BOUNDS.items() if k in schema)
-    if schema["type"] == "string":
-        return "text that is not empty" if schema.get("minLength") else "text"
-    return f"a {noun} {bounds}".rstrip()
-
-
-def _explain(error: ValidationError, layers: Sequence[_Layer]) -> str:
-    """The first problem as one sentence, and how many more there are."""
-    problems = error.errors()
-    first = problems[0]
-    location = [str(part) for part in first["loc"] if isinstance(part, str)]
-    key = ".".join(location)
-    while location and _schema_at(".".join(location)) is None:
-        location.pop()  # pydantic may append names of its own after the key
-    source = _source(key.split("."), layers)
-    if first["type"] == "extra_forbidden":
-        message = _unknown_key(key, source)
-    elif first["type"] == "missing" and isinstance(first["loc"][-1], str):
-        message = f"{key}: not set in {DEFAULTS}; every key needs its default there"
-    elif not location:
-        message = f"{key or source}: {first['msg']}; keys are text as in {DEFAULTS.name}"
-    else:
-        known = ".".join(location)
-        items = [] if first["type"] == "missing" else first["loc"]  # there is no such item
-        index = "".join(f"[{part}]" for part in items if isinstance(part, int))
-        schema = _schema_at(known)
-        if isinstance(first["input"], dict | Section) and first["type"] == "value_error":
-            message = f"{known}: {first['ctx']['error']} ({source})"  # a rule between keys
-        else:
-            reason = f", {first['ctx']['error']}" if first["type"] == "value_error" else ""
-            message = (
-                f"{known}{index}: got {_shown(first['input'])} ({source}){reason}; "
-                f"expected {_allowed(schema)}{_near_choice(first['input'], schema)}"
-            )
-    more = len({tuple(p for p in e["loc"] if isinstance(p, str)) for e in problems}) - 1
-    return message + (f" (and {more} more problem{'s' * (more > 1)})" if more else "")
-
-
-def _unknown_key(key: str, source: str) -> str:
-    parent, _, leaf = key.rpartition(".")
-    section = _schema_at(parent) if parent else None
-    if section and "properties" in section:  # a misspelt key in a known section
-        known = list(_known_keys(section, f"{parent}."))
-    else:
-        known = list(_known_keys())
-    leaves = {name.rpartition(".")[2]: name for name in known}
-    near = [name for name in known if name.rpartition(".")[2] == leaf]
-    near = near or difflib.get_close_matches(key, known, n=1, cutoff=0.75)
-    near = near or [leaves[m] for m in difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.7)]
-    if near:
-        return f"{key}: unknown key ({source}); did you mean {' or '.join(near)}?"
-    keys = ", ".join((section or {}).get("properties", _schema()["properties"]))
-    return f"{key}: unknown key ({source}); allowed here: {keys}"
-
-
-def _near_choice(value: object, schema: dict[str, Any]) -> str:
-    choices: list[str] = []
-    for part in _alternatives(schema):
-        part = part.get("items", part)
-        if "description" in part:
-            choices += OBJECT_SETS
-        choices += part.get("enum", [])
-    return did_you_mean(value, choices) if isinstance(value, str) else ""
-
-
-def _source(parts: Sequence[str], layers: Sequence[_Layer]) -> str:
-    """The last layer that set a key or something inside it."""
-    for layer in reversed(layers):
-        values: Any = layer.values
-        for part in parts:
-            if not isinstance(values, dict) or part not in values:
-                break
-            values = values[part]
-        else:
-            return layer.source
-    return layers[-1].source
-
-
-def _shown(value: object) -> str:
-    text = (
-        "null" if value is None else str(value).lower() if isinstance(value, bool) else repr(value)
-    )
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _one_line(error: Exception) -> str:

@@ -181,7 +181,7 @@ def deproject(pixels, depth, K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
 
 
 def project(points, K: np.ndarray, T_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) and depths (...) of points in W (..., 3). Pixels behind the camera are NaN."""
+    """Pixels (..., 2) and depths (...) of points in W (..., 3); NaN pixels behind the camera."""
     in_camera = transform_points(inverse_pose(T_WC), np.asarray(points, dtype=float))
     depth = in_camera[..., 2]
     safe = np.where(depth > 1e-9, depth, np.nan)
