@@ -1,0 +1,168 @@
+"""URDF and mesh files: which of a folder are objects, and what one of them says.
+
+What is read stays in the file's own units and axes. This module knows neither mass nor physics
+client, and no object set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+import yourdfpy
+from scipy.spatial.transform import Rotation
+
+from envs.meshes import ObjectError, checked_mesh, load_mesh, write_mesh_obj
+
+SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
+DEFAULT_FRICTION = 0.7  # of a file that states none
+
+
+@dataclass(frozen=True)
+class FineVisual:
+    """The original mesh: a vertex v of the file is at rotation(quaternion) @ (scale * v) + position
+    in the body frame (metres; quaternion x, y, z, w)."""
+
+    path: Path
+    scale: tuple[float, float, float]
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ObjectSource:
+    """What a file says. visual: (mesh file, scale (3,), T (4, 4)) if there is just one, as read by
+    PyBullet; otherwise the mesh itself is what there is to see."""
+
+    mesh: trimesh.Trimesh
+    friction: float = DEFAULT_FRICTION
+    color: tuple[float, float, float, float] | None = None
+    visual: tuple[Path, np.ndarray, np.ndarray] | None = None
+    visual_mesh: trimesh.Trimesh | None = None
+
+
+def object_files(folder: Path) -> list[Path]:
+    """Sorted URDF and mesh files below a folder, without the meshes that its URDFs refer to.
+
+    Raises ObjectError for a folder that holds none, and for a URDF that is not XML.
+    """
+    files = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+    )
+    referred: set[Path] = set()
+    for path in files:
+        if path.suffix.lower() == ".urdf":
+            for mesh in _parse_xml(path).iter("mesh"):
+                referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
+    files = [path for path in files if path.resolve() not in referred]
+    if not files:
+        raise ObjectError(
+            f"objects: folder {folder} holds no object; "
+            f"put in files ending in {', '.join(SUFFIXES)}"
+        )
+    return files
+
+
+def read_object(path: Path) -> ObjectSource:
+    """What a URDF (all its links at zero joint angles, as one body) or mesh file says.
+
+    Raises ObjectError naming the file.
+    """
+    return _read_urdf(path) if path.suffix.lower() == ".urdf" else ObjectSource(load_mesh(path))
+
+
+def fine_visual(
+    path: Path, source: ObjectSource, scale: float, centre: np.ndarray, cache_dir: Path
+) -> FineVisual:
+    """What an object file shows, as a mesh that PyBullet reads, written to `cache_dir` if need be.
+
+    path: the file that `source` was read from. scale: of the body. centre: (3,) the origin of the
+    body frame in the file's, before scaling.
+    """
+    if source.visual is not None:
+        file, file_scale, T = source.visual
+    elif source.visual_mesh is not None:
+        file, file_scale, T = write_mesh_obj(source.visual_mesh, cache_dir), np.ones(3), np.eye(4)
+    else:
+        file, file_scale, T = path, np.ones(3), np.eye(4)
+    if file.suffix.lower() != ".obj":  # what PyBullet makes of the others differs from trimesh
+        file = write_mesh_obj(load_mesh(file), cache_dir)
+    return FineVisual(
+        path=file,
+        scale=tuple((scale * file_scale).tolist()),
+        position=tuple((scale * (T[:3, 3] - centre)).tolist()),
+        quaternion=tuple(Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
+    )
+
+
+def _parse_xml(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
+
+
+def _resolve_mesh(filename: str, urdf: Path) -> str:
+    """The file that a URDF's mesh element means: relative to it, or in a package around it."""
+    if filename.startswith("package://"):
+        inside = Path(filename.removeprefix("package://"))
+        for base in urdf.resolve().parents:
+            for candidate in (base / inside, base / Path(*inside.parts[1:])):
+                if candidate.is_file():
+                    return str(candidate)
+    return str(urdf.parent / filename.removeprefix("file://"))
+
+
+def _read_urdf(path: Path) -> ObjectSource:
+    xml = _parse_xml(path)
+    for element in xml.iter("mesh"):
+        # Checked first: its message names the mesh, which yourdfpy's may not.
+        load_mesh(_resolve_mesh(element.get("filename", ""), path))
+    try:
+        robot = yourdfpy.URDF.load(
+            str(path),
+            build_collision_scene_graph=True,
+            load_collision_meshes=True,
+            filename_handler=lambda fname: _resolve_mesh(fname, path),
+        )
+        # A link is solid where it collides; without any collision geometry, where it shows.
+        scene = robot.collision_scene if robot.collision_scene.geometry else robot.scene
+        mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
+        friction = xml.find(".//contact/lateral_friction")  # yourdfpy leaves <contact> out
+        friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
+    except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
+        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
+    if len(mesh.faces) == 0:
+        raise ObjectError(f"URDF {path} has neither collision nor visual geometry; add some")
+    shown = [(link, item) for link in robot.robot.links for item in link.visuals]
+    return ObjectSource(
+        mesh=checked_mesh(mesh, str(path)),
+        friction=friction,
+        color=_urdf_color(shown, robot),
+        visual=_single_visual(shown, robot, path),
+        visual_mesh=visual if len(visual.faces) else None,
+    )
+
+
+def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:
+    named = {material.name: material for material in robot.robot.materials}
+    for _, item in shown:
+        material = item.material and named.get(item.material.name, item.material)
+        color = (item.material and item.material.color) or (material and material.color)
+        if color is not None:
+            return tuple(float(c) for c in color.rgba)
+    return None
+
+
+def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
+    if len(shown) != 1 or shown[0][1].geometry.mesh is None:
+        return None
+    link, item = shown[0]
+    file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
+    scale = item.geometry.mesh.scale
+    scale = np.broadcast_to(1.0 if scale is None else scale, 3)
+    origin = np.eye(4) if item.origin is None else item.origin
+    return file, scale, robot.get_transform(link.name) @ origin

@@ -1,0 +1,312 @@
+"""Antipodal search on a height map: where two parallel fingers can close on opposite faces.
+
+First runs of matter along the closing line that fit between the fingers (dense, every angle and
+height); each survivor is then posed on the map, its contacts, clearances and lever arms measured,
+and it is centred and turned onto the faces. This module knows height maps only: neither the image
+nor the solids behind them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+
+from models.candidates import Candidates
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import HeightMap
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Margins and preferences of the search; metres and radians unless said."""
+
+    angles: int = 18  # bin k is centred at k * 180 / angles degrees
+    level_step: float = 0.006  # between the heights of the fingertips that are tried
+    table_clearance: float = 0.004  # under the fingertips
+    clearance: float = 0.003  # over whatever lies under fingers and palm
+    rooms: tuple[float, ...] = (0.004, 0.006, 0.008, 0.012)  # room beside each contact when open
+    inner_margin: float = 0.0015  # of that room, free of matter beside the descending finger
+    min_engagement: float = 0.006  # the object must rise this far over the fingertips
+    good_engagement: float = 0.022  # and gains nothing beyond this
+    max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
+    min_facing: float = 0.75  # cosine of an edge's gradient against the closing line, dense stage
+    reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
+    shortlist: int = 1000  # survivors of the dense stage that are measured
+    finalists: int = 250  # of these, turned onto the faces and measured again
+    returned: int = 20
+
+
+def search(
+    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+) -> Candidates:
+    """Feasible candidates on a height map, measured and scored, best first; may be empty.
+
+    Where nothing meets the margins, a second search gives some of them up: a poor attempt may clear
+    an object, none ends the round.
+    """
+    found = _search_once(heights, gripper, workspace, settings)
+    if len(found) == 0:
+        daring = replace(
+            settings,
+            clearance=0.0015,
+            rooms=(0.003, *settings.rooms),
+            inner_margin=0.0,
+            min_engagement=0.004,
+            max_wedge=np.deg2rad(38),
+            min_facing=0.6,
+        )
+        found = _search_once(heights, gripper, workspace, daring)
+    return found
+
+
+def _search_once(
+    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+) -> Candidates:
+    found = dense_candidates(heights, gripper, workspace, settings).best(settings.shortlist)
+    if len(found) == 0:
+        return found
+    found = measure(found, heights, gripper, settings).best(settings.finalists)
+    for _ in range(2):
+        turned = replace(found, angle=np.mod(found.angle + found.turn, np.pi))
+        found = found.better(measure(turned, heights, gripper, settings))
+    return found.best(len(found))
+
+
+def dense_candidates(
+    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+) -> Candidates:
+    """Every angle, fingertip height and row of the map: what might fit between the fingers."""
+    size, cell = heights.height.shape[0], heights.cell
+    half = (size - 1) / 2
+    middle = heights.origin + cell * half
+    lowest = heights.table_height + settings.table_clearance
+    levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
+    # Gradients of the blurred map point across an edge whatever its height.
+    slope = np.stack(
+        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1
+    )
+    slope /= np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9
+    thickness = gripper.finger_outline[1][0]
+    finger = np.ones(
+        (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
+    )
+    palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
+    palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
+    parts = [Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))]
+    for angle in np.arange(settings.angles) * np.pi / settings.angles if len(levels) else ():
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        axes = np.column_stack([along, across])
+        warp = np.column_stack([axes, half - axes @ (half, half)])
+        turned = cv2.warpAffine(
+            heights.height, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderValue=heights.table_height,
+        )  # fmt: skip
+        level, row, first, last = _runs(
+            turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell
+        )
+        tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
+        under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
+        limit = tip - settings.clearance
+        free = np.zeros(len(tip), bool)
+        for room in settings.rooms:  # a sloping flank asks for more of it
+            offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
+            left, right = (
+                np.clip(np.rint(at).astype(int), 0, size - 1)
+                for at in (first - offset, last + offset)
+            )
+            fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
+            free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
+        free &= under_palm[row, centre] < limit + gripper.palm_height
+        row, first, last, tip = row[free], first[free], last[free], tip[free]
+
+        base = middle + cell * (row - half)[:, None] * across
+        at_first, at_inside, xy, at_last = (
+            base + cell * (column - half)[:, None] * along
+            for column in (first, first + 1.5, (first + last) / 2, last)
+        )
+        reach = np.abs(xy - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
+        # Outward normals are minus the gradient: cosines against the closing line on both sides.
+        facing = np.minimum(
+            slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
+        )
+        inside = heights.label[heights.index(at_inside)]
+        arm = np.abs((heights.centres[inside, :2] - xy) @ across) if len(heights.centres) else 0.0
+        rise = turned[row, first] - tip
+        score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
+        score *= (
+            reach
+            * (facing > settings.min_facing)
+            * np.clip(rise / settings.good_engagement, 0.2, 1)
+        )
+        parts.append(
+            Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
+        )
+    return Candidates(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates))
+    )
+
+
+def _runs(
+    turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float
+) -> tuple[np.ndarray, ...]:
+    """Runs of cells over a level along the rows: level, row, first and last column, each (M,).
+
+    A run may bridge a gap to the next one or two of its row (a ring, a mug). Every second row is
+    enough: the pad spans several.
+    """
+    rows = np.nonzero(turned.max(axis=1) > levels[0])[0]
+    picked = np.arange(rows[0], rows[-1] + 1, 2) if len(rows) else rows
+    matter = turned[picked] > levels[:, None, None]
+    edge = np.diff(np.pad(matter, ((0, 0), (0, 0), (1, 1))).view(np.int8), axis=-1)
+    level, row, first = np.nonzero(edge == 1)
+    last = np.nonzero(edge == -1)[2] - 1
+    found = []
+    for bridge in range(3):
+        n = max(len(level) - bridge, 0)
+        fits = (level[:n] == level[bridge:]) & (row[:n] == row[bridge:])
+        fits &= (last[bridge:] - first[:n] + 1) * cell < max_width + cell
+        found.append((level[:n][fits], picked[row[:n][fits]], first[:n][fits], last[bridge:][fits]))
+    return tuple(np.concatenate(column) for column in zip(*found))
+
+
+def measure(
+    candidates: Candidates, heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings
+) -> Candidates:
+    """Pose each candidate on the map; centre it between its contacts and score it.
+
+    The pads are flat: a pad stops where the first of the lines across it meets matter. Slopes of
+    the meeting points across the pad give the angle to the face, their shift with height its tilt.
+    """
+    cell, N = heights.cell, len(candidates)
+    along, across = candidates.axes()
+    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + 0.004
+    u = np.arange(-np.ceil(reach / cell), np.ceil(reach / cell) + 1) * cell
+    v = np.linspace(-1, 1, 9) * gripper.finger_half_width
+    grid = (
+        candidates.xy[:, None, None]
+        + u[:, None, None] * along[:, None, None]
+        + v[:, None] * across[:, None, None]
+    )
+    where = heights.index(grid)  # (N, U, V)
+    H = heights.height[where]
+    tip = candidates.tip
+
+    # Contacts, searched a little beyond the width that the candidate claims.
+    window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
+    top = np.where(window[..., None], H, -np.inf).max(axis=(1, 2))
+    engagement = top - tip
+    upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
+    low_left, low_right = _first_contacts(H, window, tip + 0.001, u, cell)
+    high_left, high_right = _first_contacts(H, window, upper, u, cell)
+    left, right = low_left.min(axis=1), low_right.max(axis=1)
+    touched = np.isfinite(left) & np.isfinite(high_left.min(axis=1))
+    left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
+    width, shift = right - left, (right + left) / 2
+    slope_left, cover_left = _face(low_left - left[:, None], v)
+    slope_right, cover_right = _face(right[:, None] - low_right, v)
+    yaw_left, yaw_right = np.arctan(slope_left), -np.arctan(slope_right)
+    turn, wedge = -(yaw_left + yaw_right) / 2, np.abs(yaw_left - yaw_right) / 2
+    rise = upper - tip - 0.001
+    with np.errstate(invalid="ignore"):
+        tilt_left = np.arctan2(np.maximum(high_left.min(axis=1) - left, 0), rise)
+        tilt_right = np.arctan2(np.maximum(right - high_right.max(axis=1), 0), rise)
+    tilt = np.where(touched, (tilt_left + tilt_right) / 2, np.pi / 2)
+
+    # Clearance of fingers and palm on a straight descent, at the widest opening that is free.
+    xy = candidates.xy + shift[:, None] * along
+    free, opening, room = np.zeros(N, bool), np.zeros(N), np.zeros(N)
+    near = np.abs(u - shift[:, None])
+    obstacles = cv2.dilate(heights.height, np.ones((3, 3)))[where].max(axis=2)
+    for candidate_room in settings.rooms:
+        half = np.minimum(width / 2 + candidate_room, gripper.max_opening / 2)
+        outward = near - half[:, None]
+        # Between contact and finger only the closing pads pass, over anything below the tips.
+        sill = np.where(
+            near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
+        )
+        below_finger = gripper.finger_underside(np.maximum(outward, 0))
+        under = np.where(outward < -settings.inner_margin, sill, below_finger)
+        fits = (obstacles - under).max(axis=1) <= tip - settings.clearance
+        fits &= half >= width / 2 + settings.rooms[0] - 1e-9
+        free |= fits
+        opening, room = np.where(fits, 2 * half, opening), np.where(fits, half - width / 2, room)
+    under = gripper.finger_underside(near - opening[:, None] / 2)[..., None]
+    blind = ((heights.ceiling[where] - under > tip[:, None, None]) & (under < np.inf)).mean(
+        axis=(1, 2)
+    )
+    left_over = np.nonzero(free & touched)[0]
+    gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
+    free[left_over] = gap >= settings.clearance - tip[left_over]
+
+    # What is held, and how far from its centre of mass.
+    inner = np.minimum(0.003, width / 3)
+    ends = [
+        heights.label[heights.index(candidates.xy + (end[:, None] * along))]
+        for end in (left + inner, right - inner)
+    ]
+    label = np.maximum(*ends)
+    centre = heights.centres[label]
+    arm_across = np.abs(((centre[:, :2] - xy) * across).sum(axis=1))
+    arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
+    arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
+
+    score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
+    score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
+    score *= 0.4 + 0.6 * np.minimum(cover_left, cover_right)
+    score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
+    score *= np.interp(room, (0.003, 0.008), (0.4, 1.0))
+    score *= np.exp(-4 * blind)
+    score *= np.where(ends[0] == ends[1], 1.0, 0.5)
+    score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
+    feasible = (
+        touched & free & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    )
+    feasible &= (label >= 0) & (width > 0)
+    turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
+    return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
+
+
+def _first_contacts(H, window, level, u, cell) -> tuple[np.ndarray, np.ndarray]:
+    """(N, V) where lines across the pads first meet matter over `level`, from either side.
+
+    Lines that meet nothing hold +inf (left) and -inf (right).
+    """
+    matter = (level[:, None, None] < H) & window[..., None]
+    hit = matter.any(axis=1)
+    left = u[matter.argmax(axis=1)] - cell / 2
+    right = u[len(u) - 1 - matter[:, ::-1].argmax(axis=1)] + cell / 2
+    return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
+
+
+def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.0025):
+    """Slope (N,) of the gap between pad and face (N, V) across the pad, and share (N,) in touch."""
+    weight = (gap < near).astype(float)
+    gap = np.where(gap < near, gap, 0.0)
+    total = np.maximum(weight.sum(axis=1), 1)
+    mean_v = (weight * v).sum(axis=1) / total
+    spread = weight * (v - mean_v[:, None])
+    variance = (spread * v).sum(axis=1)
+    slope = (spread * gap).sum(axis=1) / np.where(variance > 1e-9, variance, np.inf)
+    return slope, (weight * (gap < touch)).mean(axis=1)
+
+
+def _palm_gap(
+    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
+) -> np.ndarray:
+    """(N,) smallest height of the palm's underside, fingertips at 0, over the scene in W."""
+    # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
+    # more cell for rounding to the grid.
+    radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    scene = cv2.dilate(heights.height, disc)
+    ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
+    u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
+    grid = (
+        xy[:, None, None]
+        + u[:, None, None] * along[:, None, None]
+        + v[:, None] * across[:, None, None]
+    )
+    return (gripper.palm_underside(v) - scene[heights.index(grid)]).min(axis=(1, 2))

@@ -1,0 +1,166 @@
+"""The schema of the configuration: types and ranges of every key, as frozen typed objects.
+
+`configs/default.yaml` holds defaults, units and meanings; a new section is a new `Section` class
+here, a field of `Config` and its keys in that file. This module knows neither files nor command
+line, and not how a mistake is told.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+OBJECT_SETS = ("box", "primitives", "random_urdfs")
+
+
+def _object_set(value: str) -> str:
+    if value not in OBJECT_SETS and not Path(value).expanduser().is_dir():
+        raise ValueError("no such object set or folder")
+    return value
+
+
+def _no_repeats(values: tuple) -> tuple:
+    if len(set(values)) != len(values):
+        raise ValueError("an entry is repeated")
+    return values
+
+
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(gt=0, le=1)]
+Pixels = Annotated[int, Field(ge=16, le=4096)]
+Name = Annotated[str, Field(min_length=1)]
+# What a type alone cannot tell is put in `description`, which error messages quote.
+ObjectSet = Annotated[
+    str,
+    AfterValidator(_object_set),
+    Field(description=f"one of {', '.join(OBJECT_SETS)}, or an existing folder"),
+]
+Scenario = Literal["isolated", "packed", "pile"]
+Mount = Literal["overhead", "wrist"]
+# YAML has lists where frozen objects hold tuples, hence strict=False; the items stay strict.
+Vector2 = Annotated[tuple[float, float], Field(strict=False)]
+Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
+JointVector = Annotated[tuple[float, float, float, float, float, float, float], Field(strict=False)]
+Several = Field(min_length=1, strict=False)
+
+
+class Section(BaseModel):
+    """Base of every section: no unknown keys, no silent conversions, no changes, no NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class SimConfig(Section):
+    frequency: Annotated[int, Field(ge=60, le=2000)]
+    solver_iterations: Annotated[int, Field(ge=1, le=1000)]
+    renderer: Literal["auto", "tiny", "egl"]
+
+
+class RobotConfig(Section):
+    home: JointVector
+    grip_force: Positive
+    velocity_scale: Share
+    acceleration_scale: Share
+
+
+class CameraConfig(Section):
+    mount: Mount
+    width: Pixels
+    height: Pixels
+    fov_deg: Annotated[float, Field(ge=1, le=170)]
+    position: Vector3
+    target: Vector3
+    up: Vector3
+    near: Positive
+    far: Positive
+    wrist_position: Vector3
+    wrist_fov_deg: Annotated[float, Field(ge=1, le=170)]
+
+    @model_validator(mode="after")
+    def _near_before_far(self) -> CameraConfig:
+        if self.near >= self.far:
+            raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
+        return self
+
+
+class WorkspaceConfig(Section):
+    center: Vector2
+    size: Positive
+
+
+class ObjectsConfig(Section):
+    split: Literal["test", "train"]
+    scale: Positive | None
+    fit: Positive | None
+    density: Positive
+
+
+class SceneConfig(Section):
+    count: Annotated[int, Field(ge=1, le=50)]
+    settle_seconds: Positive
+
+
+class ExecutionConfig(Section):
+    pregrasp_height: Positive
+    approach_speed: Positive
+    lift_height: Positive
+    hold_seconds: Annotated[float, Field(ge=0)]
+    contact_stop: Positive
+
+
+class EvaluateConfig(Section):
+    policies: Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
+    scenarios: Annotated[tuple[Scenario, ...], Several, AfterValidator(_no_repeats)]
+    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
+    rounds: Count
+    workers: Count | None
+    max_failures: Count
+    videos: Annotated[int, Field(ge=0)]
+    film_format: Literal["mp4", "gif"]
+    gallery: Annotated[int, Field(ge=0)]
+    name: Name | None
+
+
+class EnvConfig(Section):
+    observations: Annotated[
+        tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(_no_repeats)
+    ]
+    control: Literal["ee", "ee_planar", "joint"]
+    resolution: Pixels
+    camera: Mount
+    objects: ObjectSet
+    scenario: Scenario
+    reward: Literal["dense", "sparse"]
+    max_steps: Count
+    substeps: Count
+    lift_height: Positive
+    hold_seconds: Annotated[float, Field(ge=0)]
+    position_step: Positive
+    rotation_step: Positive
+    joint_step: Positive
+
+
+class Config(Section):
+    """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    cache_dir: Annotated[Path, Field(strict=False)] | None
+    sim: SimConfig
+    robot: RobotConfig
+    camera: CameraConfig
+    workspace: WorkspaceConfig
+    objects: ObjectsConfig
+    scene: SceneConfig
+    execution: ExecutionConfig
+    evaluate: EvaluateConfig
+    env: EnvConfig
+
+    @property
+    def cache_folder(self) -> Path:
+        """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist."""
+        chosen = self.cache_dir or os.environ.get("ROBOT_GRASPING_CACHE")
+        return Path(chosen or "~/.cache/robot_grasping").expanduser()
