@@ -262,9 +262,10 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
             )
         )  # fmt: skip
         if film is not None:
-            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}.{config.evaluate.film_format}"
-            film.write(task.film_folder / name)
-            films.append((task.film_folder / name, f"{policy} on {task.scenario}"))
+            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}"
+            path = task.film_folder / f"{name}.{config.evaluate.film_format}"
+            film.write(path)
+            films.append((path, f"{policy} on {task.scenario}"))
     return rounds, pictures, films
 
 

@@ -237,9 +237,6 @@ def parse_args(
     return load_config(path, options.overrides), options
 
 
-USER_ERRORS: tuple[type[Exception], ...] = (ConfigError, UserError)
-
-
 def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     """Run `main(argv)` and exit with its status (None is 0).
 
@@ -248,7 +245,7 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     """
     try:
         status = main(sys.argv[1:])
-    except USER_ERRORS as error:
+    except UserError as error:
         print(f"error: {_one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
