@@ -46,7 +46,6 @@ from utils.errors import UserError, did_you_mean
 __all__ = [
     "DEFAULTS",
     "OBJECT_SETS",
-    "USER_ERRORS",
     "CameraConfig",
     "Config",
     "ConfigError",
