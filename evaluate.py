@@ -15,6 +15,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a worker; the workers fill the cores
 
 import argparse
+import functools
 import multiprocessing
 import platform
 import signal
@@ -34,7 +35,7 @@ from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
 from models.planners import PLANNERS, make_planner
-from utils.config import OBJECT_SETS, Config, parse_args, run_script
+from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import draw_grasp
@@ -57,6 +58,8 @@ from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_policies(config)
+    check_resume(config, options.resume)
+    check_writable(config, options.results)
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     device = f"{platform.machine()} CPU, {worker_count(config)} workers"
@@ -65,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     outcome = evaluate(config, run)
 
     rows = summarise(outcome.rounds, config.seed)
+    print_table(rows)
     complete = interruption(len(outcome.rounds), config) is None
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, config, git_state().commit, device, complete)
@@ -72,10 +76,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     write_report(
         run / "report.html", rows, outcome.rounds, config, outcome.gallery, outcome.films, device
     )
-    print_table(rows)
+    print(f"report: {run / 'report.html'}")
     if not complete:
         print(f"{interruption(len(outcome.rounds), config)}; go on with --resume {run}")
-    print(f"report: {run / 'report.html'}")
+    if outcome.error is not None:
+        raise outcome.error
     return 130 if outcome.interrupted else 0
 
 
@@ -90,6 +95,30 @@ def check_policies(config: Config) -> None:
             raise unknown_choice("evaluate.policies", name, PLANNERS)
 
 
+def check_resume(config: Config, run: Path | None) -> None:
+    """Raise UserError if a resumed run would mix rounds of different experiments."""
+    if run is None:
+        return
+    free = {"rounds", "workers", "name", "videos", "gallery", "film_format"}
+    before = load_config(run / "config.yaml").model_dump()
+    now = config.model_dump()
+    for plan in (before["evaluate"], now["evaluate"]):
+        for key in free:
+            plan.pop(key)
+    if before != now:
+        raise UserError(
+            f"--resume {run}: only evaluate.{', evaluate.'.join(sorted(free))} may differ from the "
+            "run that is resumed; start a new run for anything else"
+        )
+
+
+def check_writable(config: Config, results: Path | None) -> None:
+    """Raise UserError if a file that the run will write at its end could not be written."""
+    config.make_cache_folder()
+    if results is not None and (results.is_dir() or not results.parent.is_dir()):
+        raise UserError(f"--results {results}: not a file in an existing folder; choose another")
+
+
 def check_objects(config: Config) -> None:
     """Raise UserError for an unusable object set. Someone's own meshes are read and cut into
     convex parts here, so that a broken one is named before any work is done."""
@@ -99,6 +128,7 @@ def check_objects(config: Config) -> None:
             prepare(objects, min(worker_count(config), len(objects)))
 
 
+@functools.cache
 def load_objects(name: str, config: Config) -> ObjectSet:
     return load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
 
@@ -134,12 +164,14 @@ class Task:
 
 @dataclass
 class Outcome:
-    """rounds: what was measured; films: (file, caption); interrupted: by Ctrl-C."""
+    """rounds: what was measured; films: (file, caption); interrupted: by Ctrl-C; error: what ended
+    the work early, to be raised once the rest has been written."""
 
     rounds: list[RoundRecord] = field(default_factory=list)
     gallery: list[GalleryItem] = field(default_factory=list)
     films: list[tuple[Path, str]] = field(default_factory=list)
     interrupted: bool = False
+    error: UserError | None = None
 
 
 def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
@@ -186,14 +218,17 @@ def evaluate(config: Config, run: Path) -> Outcome:
                 outcome.interrupted = True
                 progress.write("interrupted: finishing the scenes under way")
                 _collect(wait(pending).done, outcome, journal, progress)
-    except BrokenProcessPool as error:
-        raise UserError(
+    except BrokenProcessPool:
+        outcome.error = UserError(
             f"a worker process died (out of memory?); {len(outcome.rounds)} rounds are safe in "
             f"{journal}: go on with --resume {run}, perhaps with evaluate.workers=1"
-        ) from error
+        )
+    except UserError as error:  # a scene that cannot be made, an object that cannot be used
+        outcome.error = error
     finally:
         progress.close()
     outcome.rounds.sort(key=lambda r: _rank(r, config))
+    outcome.gallery.sort(key=lambda item: item.caption)  # not in the order of the workers' speed
     outcome.gallery = _balanced(outcome.gallery, config.evaluate.gallery)
     outcome.films.sort()
     return outcome
@@ -248,6 +283,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     rounds, pictures, films = [], [], []
     for policy in task.policies:
         planner = make_planner(policy, GripperGeometry(), workspace, task.seed)
+        privileged = getattr(planner, "needs_truth", False)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
             if task.keep_pictures:
@@ -257,7 +293,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
         rounds.append(
             run_round(
                 cell, scene, planner, policy=policy, objects=task.objects,
-                max_failures=config.evaluate.max_failures, with_truth=planner.needs_truth,
+                max_failures=config.evaluate.max_failures, with_truth=privileged,
                 on_attempt=keep,
             )
         )  # fmt: skip

@@ -12,12 +12,13 @@ import numpy as np
 import pybullet
 
 from envs.camera import Image, Intrinsics, load_renderer, render
-from envs.kinematics import forward_kinematics
+from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
 from envs.scenes import Scene, settle
 from envs.world import add_bin, add_table, on_table, set_up_physics
 from utils.config import CameraConfig, Config
+from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.transforms import RGBDFrame, look_at, pose_matrix
 
@@ -41,6 +42,12 @@ class Cell:
         self.config, self.fine = config, fine
         self.dt = 1.0 / config.sim.frequency
         self.home = np.array(config.robot.home)
+        if (self.home < JOINT_LOWER).any() or (self.home > JOINT_UPPER).any():
+            raise UserError(
+                f"robot.home {list(config.robot.home)} is outside the Panda's joint limits, "
+                f"{JOINT_LOWER.tolist()} to {JOINT_UPPER.tolist()} rad"
+            )
+        config.make_cache_folder()
         self.on_step: Callable[[Cell], None] | None = None
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.renderer = load_renderer(self.client, config.sim.renderer)
@@ -86,6 +93,13 @@ class Cell:
         """Simulated seconds since the scene was loaded."""
         return self.steps * self.dt
 
+    def check_physics(self) -> None:
+        """Raise PhysicsError if the robot or an object has left the realm of finite numbers."""
+        if not np.isfinite(self.robot.q).all():
+            raise PhysicsError("the robot's joint positions are not finite")
+        for index in self.remaining:
+            self.object_position(index)
+
     def object_pose(self, index: int) -> np.ndarray:
         """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""
         return pose_matrix(
@@ -102,8 +116,17 @@ class Cell:
         return np.array(position)
 
     def held_object(self) -> int | None:
-        """The object that both fingers press on, or None."""
+        """The object that both fingers grip, or None."""
         return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
+
+    def is_lifted(self, index: int, height: float) -> bool:
+        """Whether an object is gripped, off the table, and its centre of mass above `height` m."""
+        body = self.bodies[index]
+        return bool(
+            self.object_position(index)[2] > height
+            and self.robot.holds(body)
+            and not pybullet.getContactPoints(body, self.table, physicsClientId=self.client)
+        )
 
     def retire(self, index: int) -> None:
         """Take an object out of the game: it stays visible where it is but collides no more."""
@@ -187,7 +210,7 @@ def camera_intrinsics(camera: CameraConfig) -> Intrinsics:
 def wrist_mount(camera: CameraConfig) -> np.ndarray:
     """(4, 4) T_EC: the wrist camera beside the hand, looking along the approach."""
     T = np.eye(4)
-    # Image right is the closing line reversed, so that at home "up" points away from the robot.
+    # Image right is E's +y, the closing line; at home image up points away from the robot.
     T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     T[:3, 3] = camera.wrist_position
     return T

@@ -22,6 +22,7 @@ from envs.panda import MAX_OPENING
 from envs.world import BIN_CENTRE, BIN_HEIGHT
 from utils.transforms import Grasp, top_down_pose
 
+_LOOK_SECONDS = 0.05  # between two looks at the fingers or at the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _RELEASE_SECONDS = 0.35  # for the fingers to open and the object to fall into the bin
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp, other finger
@@ -58,10 +59,12 @@ class _Failure(Exception):
 def execute_grasp(cell: Cell, grasp: Grasp) -> GraspOutcome:
     """Reach, approach, close, lift, hold, carry to the bin, release, go home.
 
-    Success: one object pressed on by both fingers, its centre of mass above
-    execution.lift_height, for execution.hold_seconds and all the way to the bin. A picked object
-    is retired. Whatever happens, the arm is home again at the end.
+    Success: one object gripped by both fingers, off the table, its centre of mass above
+    execution.lift_height, for execution.hold_seconds and all the way to the bin (looked at every
+    0.05 s). A picked object is retired. Whatever happens, the arm is home again at the end. Raises
+    PhysicsError when the simulation blows up.
     """
+    cell.check_physics()
     start = cell.seconds
     try:
         index = _pick(cell, grasp)
@@ -72,6 +75,7 @@ def execute_grasp(cell: Cell, grasp: Grasp) -> GraspOutcome:
     except _Failure as failure:
         outcome, index = failure.reason, failure.object_index
     _go_home(cell)
+    cell.check_physics()
     cell.retire_lost_objects()
     return GraspOutcome(outcome, cell.seconds - start, index)
 
@@ -97,19 +101,27 @@ def _pick(cell: Cell, grasp: Grasp) -> int:
     lifted = target.copy()
     lifted[2, 3] = max(grasp.position[2], 0.0) + settings.lift_height + 0.05
     _follow(cell, _line(cell, cell.robot.q, lifted))
-    high = cell.object_position(index)[2] > settings.lift_height
-    if not (high and cell.robot.holds(cell.bodies[index])):
+    if not cell.is_lifted(index, settings.lift_height):
         raise _Failure("slipped", index)
-    cell.step(round(settings.hold_seconds / cell.dt))
+    for _ in range(round(settings.hold_seconds / _LOOK_SECONDS)):
+        cell.step(round(_LOOK_SECONDS / cell.dt))
+        _still_lifted(cell, index)
     return index
+
+
+def _still_lifted(cell: Cell, index: int) -> None:
+    if not cell.is_lifted(index, cell.config.execution.lift_height):
+        raise _Failure("dropped", index)
 
 
 def _carry_to_bin(cell: Cell, index: int) -> None:
     over_bin = top_down_pose([*BIN_CENTRE, BIN_HEIGHT + 0.17], -np.pi / 2)
     posture = choose_posture(cell, over_bin)
-    _follow(cell, cell.robot.joint_move(cell.robot.q, posture, **_scales(cell)))
-    if not cell.robot.holds(cell.bodies[index]):
-        raise _Failure("dropped", index)
+    carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
+    every = round(_LOOK_SECONDS / cell.dt)
+    for start in range(0, len(carry), every):
+        _follow(cell, carry[start : start + every])
+        _still_lifted(cell, index)
     cell.robot.command_gripper(MAX_OPENING)
     cell.step(round(_RELEASE_SECONDS / cell.dt))
     cell.retire(index)
@@ -119,8 +131,8 @@ def _close(cell: Cell) -> None:
     """Close the fingers until they stop moving."""
     cell.robot.command_gripper(0.0)
     before = cell.robot.opening
-    for _ in range(round(_CLOSE_SECONDS / 0.05)):
-        cell.step(round(0.05 / cell.dt))
+    for _ in range(round(_CLOSE_SECONDS / _LOOK_SECONDS)):
+        cell.step(round(_LOOK_SECONDS / cell.dt))
         opening = cell.robot.opening
         if abs(opening - before) < 2e-4:
             return

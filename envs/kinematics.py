@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from utils.errors import UserError
@@ -202,6 +203,9 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __getitem__(self, part: slice) -> Trajectory:
+        return Trajectory(self.positions[part], self.velocities[part])
+
 
 def time_path(
     waypoints: np.ndarray,
@@ -217,24 +221,32 @@ def time_path(
 
     lengths (M,) is the path coordinate of each waypoint (metres or any unit); max_speed and
     max_acceleration bound its first two derivatives. The profile is the quintic
-    s(u) = 10u^3 - 15u^4 + 6u^5, whose peaks are 1.875 L/T and 5.7735 L/T^2.
+    s(u) = 10u^3 - 15u^4 + 6u^5, whose peaks are 1.875 L/T and 5.7735 L/T^2; a cubic spline joins
+    the waypoints. The duration is then stretched until the sampled velocities and accelerations
+    are within the limits, curvature included.
     """
     total = lengths[-1] - lengths[0]
     if total < 1e-9:
         return Trajectory(waypoints[-1:].copy(), np.zeros((1, 7)))
     share = (lengths - lengths[0]) / total
-    slope = abs(np.diff(waypoints, axis=0)) / np.maximum(np.diff(share), 1e-9)[:, None]
-    steepest = slope.max(axis=0)
-    duration = max(
-        1.875 * total / max_speed,
-        np.sqrt(5.7735 * total / max_acceleration),
-        float(np.max(1.875 * steepest / (JOINT_VELOCITY * velocity_scale))),
-        float(np.sqrt(np.max(5.7735 * steepest / (JOINT_ACCELERATION * acceleration_scale)))),
-        dt,
-    )
-    steps = int(np.ceil(duration / dt))
-    u = np.arange(1, steps + 1) / steps
-    s = u**3 * (10 - 15 * u + 6 * u**2)
-    positions = np.column_stack([np.interp(s, share, waypoints[:, j]) for j in range(7)])
-    velocities = np.diff(np.vstack([waypoints[:1], positions]), axis=0) / dt
-    return Trajectory(positions, velocities)
+    path = CubicSpline(share, waypoints) if len(waypoints) > 2 else None
+    fastest = JOINT_VELOCITY * velocity_scale
+    strongest = JOINT_ACCELERATION * acceleration_scale
+    duration = max(1.875 * total / max_speed, np.sqrt(5.7735 * total / max_acceleration), dt)
+    while True:
+        steps = int(np.ceil(duration / dt))
+        u = np.arange(steps + 1) / steps
+        s = u**3 * (10 - 15 * u + 6 * u**2)
+        if path is None:
+            positions = waypoints[0] + s[:, None] * (waypoints[1] - waypoints[0])
+        else:
+            positions = path(s)
+        velocities = np.diff(positions, axis=0) / dt
+        accelerations = np.diff(velocities, axis=0, prepend=np.zeros((1, 7))) / dt
+        excess = max(
+            float((abs(velocities) / fastest).max()),
+            float(np.sqrt((abs(accelerations) / strongest).max())),
+        )
+        if excess <= 1.0:
+            return Trajectory(positions[1:], velocities)
+        duration = max(duration * excess, (steps + 0.5) * dt)

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -302,13 +304,20 @@ def _content_hash(mesh: trimesh.Trimesh) -> str:
     return digest.hexdigest()[:20]
 
 
+# What numpy and zipfile raise on a damaged file, depending on where the damage is.
+_UNREADABLE = (
+    OSError, EOFError, KeyError, ValueError, TypeError, IndexError, MemoryError, OverflowError,
+    NotImplementedError, SyntaxError, struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
 def _read_parts(path: Path) -> list[np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as data:
             vertices, counts = data["vertices"], data["counts"]
         if len(counts) == 0 or counts.sum() != len(vertices) or not np.isfinite(vertices).all():
             raise ValueError("its numbers do not fit together")
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise _corrupt(path, str(error)) from error
     return np.split(vertices, np.cumsum(counts)[:-1])
 

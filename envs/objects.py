@@ -26,10 +26,11 @@ from tqdm import tqdm
 from envs.bullet_shapes import collision_shape, visual_shape
 from envs.meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_files import FineVisual, fine_visual, object_files, read_object
+from envs.panda import MAX_OPENING
 from envs.primitives import NativeShape, make_primitive, random_color
+from utils.config_schema import OBJECT_SETS
 from utils.geometry import ConvexSolid
 
-NAMED_SETS = ("box", "primitives", "random_urdfs")
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
@@ -38,7 +39,6 @@ RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda han
 DEFAULT_DENSITY = 1000.0
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
-HAND_OPENING = 0.08
 LARGEST_EXTENT = 0.5
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
@@ -180,7 +180,7 @@ def load_object_set(
     folder = Path(name_or_path).expanduser()
     if not folder.is_dir():
         raise ObjectError(
-            f"objects: {str(folder)!r} is neither one of the sets {', '.join(NAMED_SETS)} nor an "
+            f"objects: {str(folder)!r} is neither one of the sets {', '.join(OBJECT_SETS)} nor an "
             "existing folder"
         )
     files = object_files(folder)
@@ -280,13 +280,13 @@ class FileSet(ObjectSet):
             path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
         )
         # random_urdfs is known to hold a few that no hand can take; of a folder it is a surprise.
-        ungraspable = model.extents.min() > HAND_OPENING or model.extents.max() > LARGEST_EXTENT
+        ungraspable = model.extents.min() > MAX_OPENING or model.extents.max() > LARGEST_EXTENT
         if ungraspable and not self._warned:
             self._warned = True
             sides = " x ".join(f"{side:.3g}" for side in model.extents)
             warnings.warn(
                 f"object {path} measures {sides} m, too large for a hand that opens "
-                f"{HAND_OPENING} m (and so may others be); set objects.fit, for example to 0.06, "
+                f"{MAX_OPENING} m (and so may others be); set objects.fit, for example to 0.06, "
                 "or objects.scale",
                 stacklevel=3,
             )

@@ -40,7 +40,7 @@ LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 class Panda:
     """The robot's body in one physics client."""
 
-    def __init__(self, client: int, dt: float, urdf: Path, grip_force: float = 20.0):
+    def __init__(self, client: int, dt: float, urdf: Path, grip_force: float):
         self.client, self.dt, self.grip_force = client, dt, grip_force
         self.body = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
@@ -114,6 +114,12 @@ class Panda:
         velocity = np.array([state[1] for state in states[:7]])
         return q, velocity, states[7][0] + states[8][0]
 
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis, read from the physics."""
+        state = pybullet.getLinkState(self.body, LEFT_FINGER, physicsClientId=self.client)
+        x, y, z, w = state[5]
+        return np.array([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)])
+
     def tip_position(self) -> np.ndarray:
         """(3,) origin of E in W, read from the physics."""
         state = pybullet.getLinkState(self.body, ARM[-1], physicsClientId=self.client)
@@ -170,19 +176,38 @@ class Panda:
             max_speed=speed, max_acceleration=CARTESIAN_ACCELERATION, **scales,
         )  # fmt: skip
 
-    def finger_contacts(self, body: int) -> tuple[float, float]:
-        """Normal forces in newtons of the left and the right finger on a body."""
-        forces = []
-        for finger in FINGERS:
-            contacts = pybullet.getContactPoints(
+    def grip_forces(self, body: int) -> tuple[float, float]:
+        """Newtons with which the left and the right finger press a body towards each other.
+
+        A contact counts only where its normal lies within 70 degrees of the closing line and points
+        inwards: a body that lies on the fingers, or is pushed down by a fist, is not gripped.
+        """
+        contacts = [
+            pybullet.getContactPoints(
                 bodyA=self.body, bodyB=body, linkIndexA=finger, physicsClientId=self.client
             )
-            forces.append(sum(contact[9] for contact in contacts))
-        return forces[0], forces[1]
+            for finger in FINGERS
+        ]
+        if not (contacts[0] and contacts[1]):
+            return 0.0, 0.0
+        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
+        closing = self.closing_direction()
+        inwards = []
+        for sign, touching in zip((-1.0, 1.0), contacts):
+            force = 0.0
+            for contact in touching:
+                normal = contact[7]  # on the body, pointing at the finger
+                share = -sign * (
+                    normal[0] * closing[0] + normal[1] * closing[1] + normal[2] * closing[2]
+                )
+                if share > _GRIP_COSINE:
+                    force += share * contact[9]
+            inwards.append(force)
+        return inwards[0], inwards[1]
 
     def holds(self, body: int, min_force: float = 0.1) -> bool:
-        """Whether both fingers press on the body with at least `min_force` newtons each."""
-        return min(self.finger_contacts(body)) >= min_force
+        """Whether both fingers grip the body with at least `min_force` newtons each."""
+        return min(self.grip_forces(body)) >= min_force
 
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the whole robot."""
@@ -194,6 +219,7 @@ _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
 _POSITION_GAINS = [0.3] * 7
 _VELOCITY_GAINS = [1.0] * 7
 _DRIVE_GAIN = 0.1
+_GRIP_COSINE = np.cos(np.radians(70))
 _STATE_JOINTS = [*ARM, *FINGERS]
 _WAYPOINT_SPACING = 0.01  # m
 _MAX_JUMP = 0.3  # rad between neighbouring waypoints
@@ -215,8 +241,8 @@ def panda_urdf(cache_dir: Path, fine: bool) -> Path:
         mesh.set("filename", str(stock.parent / name))
     _weld_fixed_joints(robot)
     path = cache_dir / f"panda_{'fine' if fine else 'low_polygon'}.urdf"
-    text = ElementTree.tostring(robot, encoding="unicode")
-    if not path.exists() or path.read_text() != text:
+    text = ElementTree.tostring(robot, encoding="utf-8")
+    if not path.exists() or path.read_bytes() != text:
         write_atomic(path, text)
     return path
 

@@ -15,13 +15,11 @@ from envs.scenes import Scene
 from utils.results import NO_PLAN, AttemptRecord, RoundRecord
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
-Planner = Callable[[RGBDFrame], list[Grasp]]
-
 
 def run_round(
     cell: Cell,
     scene: Scene,
-    plan: Planner,
+    plan: Callable[[RGBDFrame], list[Grasp]],
     *,
     policy: str,
     objects: str,
@@ -36,12 +34,12 @@ def run_round(
     """
     cell.load(scene)
     attempts: list[AttemptRecord] = []
-    failures_in_a_row, ended = 0, "cleared"
+    failures_in_a_row, plan_seconds, ended = 0, 0.0, "cleared"
     try:
         while cell.remaining and failures_in_a_row < max_failures:
             frame = cell.frame(with_truth)
             start = time.perf_counter()
-            grasps = plan(frame)
+            grasps = plan(frame if with_truth else frame.without_truth())
             plan_seconds = time.perf_counter() - start
             if not grasps:
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
@@ -58,6 +56,7 @@ def run_round(
             if on_attempt is not None:
                 on_attempt(frame, grasps[0], outcome)
     except PhysicsError:
+        attempts.append(AttemptRecord(False, "physics", plan_seconds, 0.0))
         ended = "physics"
     if ended == "cleared" and cell.remaining:
         ended = "failures"

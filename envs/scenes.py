@@ -24,7 +24,7 @@ _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the ta
 _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
 _PILE_WALLS = {"half_size": 0.12, "height": 0.30, "thickness": 0.02}  # m
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
-_PACKED_GAP = 0.004  # m, least gap between the bounding circles' chords
+_PACKED_GAP = 0.004  # m, least distance between neighbours
 _REST_SPEED = 0.01  # m/s or (times 10) rad/s under which an object counts as resting
 _TRIES = 50
 

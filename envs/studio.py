@@ -77,6 +77,8 @@ class Film:
     def write(self, path: Path, speed: float = 2.0) -> None:
         """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
         self._cell.on_step = None
+        if not self._pictures:  # nothing was done: at least show the scene
+            self._pictures.append(self._studio.picture())
         self._studio.close()
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".gif":

@@ -4,14 +4,16 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Cell
-from envs.execution import execute_grasp
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Cell, PhysicsError
+from envs.execution import choose_posture, execute_grasp
+from envs.kinematics import forward_kinematics, inverse_kinematics
 from envs.objects import load_object_set
+from envs.panda import FINGERS
 from envs.rounds import run_round
 from envs.scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.world import BIN_CENTRE, BIN_HALF_SIZE
 from utils.config import with_settings
-from utils.transforms import Grasp
+from utils.transforms import Grasp, top_down_pose
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +124,7 @@ def test_failures_are_named(cell, box_set, grasp, reason):
 def test_a_frictionless_object_slips(cell, box_set):
     cell.load(cube_scene(box_set))
     # Pads and cube without any friction: the lift leaves the cube behind.
-    for body, link in ((cell.bodies[0], -1), (cell.robot.body, 9), (cell.robot.body, 10)):
+    for body, link in ((cell.bodies[0], -1), *((cell.robot.body, f) for f in FINGERS)):
         pybullet.changeDynamics(
             body, link, lateralFriction=0.0, spinningFriction=0.0, rollingFriction=0.0,
             physicsClientId=cell.client,
@@ -130,12 +132,75 @@ def test_a_frictionless_object_slips(cell, box_set):
     assert execute_grasp(cell, cube_grasp()).reason == "slipped"
 
 
-def test_an_object_flung_upwards_is_no_success(cell, box_set):
+def test_an_object_flung_upwards_is_not_lifted(cell, box_set):
     cell.load(cube_scene(box_set))
     pybullet.resetBaseVelocity(cell.bodies[0], [0, 0, 4], [0, 0, 0], physicsClientId=cell.client)
     cell.step(24)
-    assert cell.object_position(0)[2] > cell.config.execution.lift_height
+    assert cell.object_position(0)[2] > 0.15
+    assert cell.held_object() is None and not cell.is_lifted(0, 0.15)
+
+
+def test_a_fist_on_the_cube_is_no_grip(cell, box_set):
+    cell.load(cube_scene(box_set))
+    above = choose_posture(cell, top_down_pose([0.5, 0.0, 0.075], 0.0))
+    cell.robot.place(above, opening=0.0)
+    target = forward_kinematics(above)
+    target[2, 3] -= 0.03
+    pressing = inverse_kinematics(target, above, above)
+    for _ in range(60):
+        cell.robot.drive_arm_to(pressing)
+        cell.step()
+    assert cell.robot.contact_force() > 10
     assert cell.held_object() is None
+
+
+def test_a_cube_lying_on_the_fingers_is_no_grip(cell, box_set):
+    cell.load(cube_scene(box_set, position=(0.5, 0.3, 0.03)))
+    level = cell.home + [0, 0, 0, 0, 0, np.pi / 2, 0]  # the hand points forwards, fingers level
+    cell.robot.place(level, opening=0.02)
+    tip = cell.robot.tip_position()
+    pybullet.resetBasePositionAndOrientation(
+        cell.bodies[0], tip + [-0.01, 0, 0.045], [0, 0, 0, 1], physicsClientId=cell.client
+    )
+    cell.step(60)
+    touching = [
+        pybullet.getContactPoints(cell.robot.body, cell.bodies[0], f, physicsClientId=cell.client)
+        for f in FINGERS
+    ]
+    assert all(touching), "the test needs the cube to rest on both fingers"
+    assert cell.held_object() is None
+
+
+def test_a_gripped_object_that_stands_on_the_table_is_not_lifted(cell, box_set):
+    cell.load(cube_scene(box_set))
+    posture = choose_posture(cell, cube_grasp().pose)
+    cell.robot.place(posture, opening=0.08)
+    cell.robot.command_gripper(0.0)
+    cell.step(240)
+    assert cell.held_object() == 0
+    assert not cell.is_lifted(0, height=0.02)
+
+
+def test_non_finite_physics_is_noticed(cell, box_set):
+    cell.load(cube_scene(box_set))
+    pybullet.resetBasePositionAndOrientation(
+        cell.bodies[0], [np.nan, 0, 0], [0, 0, 0, 1], physicsClientId=cell.client
+    )
+    with pytest.raises(PhysicsError):
+        cell.check_physics()
+    record = run_round(
+        cell, cube_scene(box_set), _break_physics(cell), policy="x", objects="b", max_failures=2
+    )
+    assert record.ended == "physics"
+    assert [attempt.reason for attempt in record.attempts] == ["physics"]
+
+
+def _break_physics(cell):
+    def plan(frame):
+        pybullet.resetJointState(cell.robot.body, 0, np.nan, physicsClientId=cell.client)
+        return [cube_grasp()]
+
+    return plan
 
 
 def test_lost_objects_are_retired(cell, box_set):

@@ -11,13 +11,13 @@ import trimesh
 
 from envs.objects import (
     BROKEN_RANDOM_URDFS,
-    HAND_OPENING,
     ObjectError,
     load_object,
     load_object_set,
     prepare,
     spawn,
 )
+from envs.panda import MAX_OPENING
 from envs.primitives import FAMILIES, make_primitive
 
 DATA = Path(pybullet_data.getDataPath())
@@ -319,7 +319,7 @@ def test_objects_in_wrong_units_warn_once(tmp_path):
     for name in ("a", "b"):
         trimesh.creation.box((3, 4, 8)).export(tmp_path / "big" / f"{name}.stl")
     objects = load_object_set(str(tmp_path / "big"), cache_dir=tmp_path / "cache")
-    with pytest.warns(UserWarning, match=f"a.stl .* opens {HAND_OPENING} m .*objects.fit"):
+    with pytest.warns(UserWarning, match=f"a.stl .* opens {MAX_OPENING} m .*objects.fit"):
         objects[0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

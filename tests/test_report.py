@@ -87,7 +87,8 @@ def test_summary_by_hand():
     assert heuristic.sim_seconds_per_pick == pytest.approx(30 / 3)
     assert heuristic.picks_per_hour == pytest.approx(360)
     assert heuristic.failures == {
-        "no_plan": 1, "ik": 0, "collision": 0, "missed": 1, "slipped": 1, "dropped": 1
+        "no_plan": 1, "ik": 0, "collision": 0, "missed": 1, "slipped": 1, "dropped": 1,
+        "physics": 0,
     }  # fmt: skip
     assert (random.attempts, random.successes, random.success_rate) == (2, 0, 0.0)
     assert random.sim_seconds_per_pick is None and random.picks_per_hour is None

@@ -11,7 +11,11 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from utils.errors import UserError
+from utils.transforms import look_at
 
 OBJECT_SETS = ("box", "primitives", "random_urdfs")
 
@@ -62,7 +66,7 @@ class SimConfig(Section):
 
 class RobotConfig(Section):
     home: JointVector
-    grip_force: Positive
+    grip_force: Annotated[float, Field(gt=0, le=35)]  # beyond it the gear between fingers yields
     velocity_scale: Share
     acceleration_scale: Share
 
@@ -84,12 +88,22 @@ class CameraConfig(Section):
     def _near_before_far(self) -> CameraConfig:
         if self.near >= self.far:
             raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
+        look_at(self.position, self.target, self.up)  # raises ValueError where that is undefined
         return self
 
 
 class WorkspaceConfig(Section):
     center: Vector2
-    size: Positive
+    size: Annotated[float, Field(gt=0, le=0.5)]
+
+    @model_validator(mode="after")
+    def _within_reach(self) -> WorkspaceConfig:
+        x, y = (abs(c) + self.size / 2 for c in self.center)
+        if np.hypot(x, y) > 0.8 or self.center[0] - self.size / 2 < 0.2:
+            raise ValueError(
+                "the workspace must lie within 0.8 m of the robot and at least 0.2 m in front of it"
+            )
+        return self
 
 
 class ObjectsConfig(Section):
@@ -105,9 +119,9 @@ class SceneConfig(Section):
 
 
 class ExecutionConfig(Section):
-    pregrasp_height: Positive
-    approach_speed: Positive
-    lift_height: Positive
+    pregrasp_height: Annotated[float, Field(gt=0, le=0.3)]
+    approach_speed: Annotated[float, Field(gt=0, le=1.7)]
+    lift_height: Annotated[float, Field(gt=0, le=0.3)]
     hold_seconds: Annotated[float, Field(ge=0)]
     contact_stop: Positive
 
@@ -136,8 +150,8 @@ class EnvConfig(Section):
     scenario: Scenario
     reward: Literal["dense", "sparse"]
     max_steps: Count
-    substeps: Count
-    lift_height: Positive
+    substeps: Annotated[int, Field(ge=1, le=1000)]
+    lift_height: Annotated[float, Field(gt=0, le=0.4)]
     hold_seconds: Annotated[float, Field(ge=0)]
     position_step: Positive
     rotation_step: Positive
@@ -164,3 +178,13 @@ class Config(Section):
         """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist."""
         chosen = self.cache_dir or os.environ.get("ROBOT_GRASPING_CACHE")
         return Path(chosen or "~/.cache/robot_grasping").expanduser()
+
+    def make_cache_folder(self) -> None:
+        """Make the cache folder, or raise UserError where that cannot be done."""
+        try:
+            self.cache_folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"cache_dir {self.cache_folder}: cannot make this folder ({error.strerror}); set "
+                "cache_dir or $ROBOT_GRASPING_CACHE to one that can be written"
+            ) from error

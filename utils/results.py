@@ -32,6 +32,7 @@ FAILURES = {  # reason: what a reader sees, in the order in which a grasp can fa
     "missed": "missed",
     "slipped": "slipped",
     "dropped": "dropped",
+    "physics": "simulation blew up",
 }
 ENDINGS = {  # why a round ended
     "cleared": "every object removed",
@@ -234,12 +235,16 @@ def append_round(path: Path, record: RoundRecord) -> None:
 def read_rounds(path: Path) -> list[RoundRecord]:
     """The rounds of a journal; an empty list where there is none yet.
 
-    A last line cut short by a crash is left out; any other line that is not a round raises
-    UserError.
+    A last line cut short by a crash is taken off the file; any other line that is not a round
+    raises UserError.
     """
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").split("\n")
+    text = path.read_text(encoding="utf-8", errors="replace")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        write_atomic(path, whole)
+    lines = whole.split("\n")
     rounds = []
     for number, line in enumerate(lines[:-1], start=1):  # what follows the last newline is cut
         try:
