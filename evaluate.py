@@ -59,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_policies(config)
     check_resume(config, options.resume)
-    check_writable(config, options.results)
+    check_results_path(options.results)
+    Cell(config).close()  # an impossible robot or cache is named here, not by a dying worker
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     device = f"{platform.machine()} CPU, {worker_count(config)} workers"
@@ -112,9 +113,8 @@ def check_resume(config: Config, run: Path | None) -> None:
         )
 
 
-def check_writable(config: Config, results: Path | None) -> None:
-    """Raise UserError if a file that the run will write at its end could not be written."""
-    config.make_cache_folder()
+def check_results_path(results: Path | None) -> None:
+    """Raise UserError if --results could not be written at the end."""
     if results is not None and (results.is_dir() or not results.parent.is_dir()):
         raise UserError(f"--results {results}: not a file in an existing folder; choose another")
 
