@@ -1,0 +1,480 @@
+"""GraspNet: from an RGB-D image to ranked grasps (the tutorial's chapter 3).
+
+In order: an image becomes the network's input; the network; labels become training targets and
+the loss; the network's maps become grasps. Angles on the image are those of the closing line from
++u (right) towards +v (down), modulo pi; bin k of K is centred at k * 180 / K degrees. Widths are
+metres. This module knows no simulator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from models.backbones import BACKBONES
+from utils.errors import UserError, unknown_choice
+from utils.geometry import GripperGeometry
+from utils.grasp_labels import LabelSettings, grasp_below_surface
+from utils.transforms import Grasp, ImageGrasp
+
+# --- From an image to the input ------------------------------------------------------------
+
+INPUT_CHANNELS = 4  # red, green, blue, depth
+PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
+DEPTH_UNIT = 0.1  # metres of depth that count 1 in the input: objects are about that high
+DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is cut off
+
+
+def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
+    """The network's input (4, H, W) float32 of one image; the one place of normalisation.
+
+    rgb: (H, W, 3) uint8. depth: (H, W) metres; 0, negative or not finite means unknown.
+    Colours become -0.5..0.5. Depth is filled from the nearest known pixel, centred by its median
+    (so that the camera's distance does not matter) and cut off at +-0.3 m, which become +-3.
+    Raises UserError for images that cannot be meant.
+    """
+    check_rgbd(rgb, depth)
+    filled = fill_holes(depth)
+    centred = np.clip(filled - np.median(filled), -DEPTH_LIMIT, DEPTH_LIMIT) / DEPTH_UNIT
+    image = np.empty((INPUT_CHANNELS, *depth.shape), np.float32)
+    image[:3] = np.moveaxis(rgb, -1, 0)
+    image[:3] /= 255
+    image[:3] -= 0.5
+    image[3] = centred
+    return torch.from_numpy(image)
+
+
+def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> None:
+    """Raise one UserError that says what is wrong with an RGB-D image, if anything is."""
+    if rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise UserError(f"rgb: got an array of shape {rgb.shape}, expected (H, W, 3) channels")
+    if rgb.dtype != np.uint8:
+        raise UserError(f"rgb: got {rgb.dtype}, expected uint8 from 0 to 255")
+    if depth.ndim != 2:
+        raise UserError(f"depth: got an array of shape {depth.shape}, expected one channel, (H, W)")
+    if rgb.shape[:2] != depth.shape:
+        raise UserError(
+            f"rgb and depth differ in size: {rgb.shape[1]}x{rgb.shape[0]} and "
+            f"{depth.shape[1]}x{depth.shape[0]} pixels; register the depth to the colour image"
+        )
+    known = depth[_known(depth)]
+    if len(known) == 0:
+        raise UserError("depth: no pixel is known; all are zero, negative or NaN")
+    typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
+    if not low <= typical <= high:
+        hint = "; are these millimetres? Divide by 1000" if typical > high else ""
+        raise UserError(
+            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
+        )
+
+
+def fill_holes(depth: np.ndarray) -> np.ndarray:
+    """(H, W) float32 depth whose unknown pixels take the value of the nearest known one."""
+    depth = np.asarray(depth, np.float32)
+    known = _known(depth)
+    if known.all() or not known.any():
+        return depth
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value = np.zeros(label.max() + 1, np.float32)
+    value[label[known]] = depth[known]
+    return value[label]
+
+
+def _known(depth: np.ndarray) -> np.ndarray:
+    return np.isfinite(depth) & (depth > 0)
+
+
+# --- The network ---------------------------------------------------------------------------
+
+
+class GraspNet(nn.Module):
+    """Quality, angle and width of the best grasp at every pixel.
+
+    input_channels: 4 for `to_input`. num_angle_bins: K bins over [0, pi). max_width: metres, the
+    largest width that can be told; 0.15 in the tutorial, 0.08 fits the Panda hand. backbone: one
+    of `models.backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder.
+    `model_args` holds these four, so that `GraspNet(**model_args)` is the same architecture.
+    """
+
+    def __init__(
+        self,
+        input_channels: int = INPUT_CHANNELS,
+        num_angle_bins: int = 18,
+        max_width: float = 0.15,
+        backbone: str = "tutorial",
+    ):
+        super().__init__()
+        if backbone not in BACKBONES:
+            raise unknown_choice("GraspNet backbone", backbone, BACKBONES)
+        self.model_args = {
+            "input_channels": input_channels,
+            "num_angle_bins": num_angle_bins,
+            "max_width": max_width,
+            "backbone": backbone,
+        }
+        self.input_channels = input_channels
+        self.num_angle_bins = num_angle_bins
+        self.max_width = max_width
+        self.backbone = BACKBONES[backbone](input_channels)
+        features = self.backbone.out_channels
+        self.quality_head = nn.Conv2d(features, 1, kernel_size=1)
+        self.angle_head = nn.Conv2d(features, num_angle_bins, kernel_size=1)
+        self.width_head = nn.Conv2d(features, 1, kernel_size=1)
+
+    def forward(
+        self, x: torch.Tensor, logits: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Maps of the input's height and width, whatever these are.
+
+        x: (B, C, H, W). Returns quality (B, 1, H, W) in [0, 1], angle logits (B, K, H, W) and
+        width (B, 1, H, W) in metres. With `logits` the quality comes before its sigmoid, which is
+        what GraspLoss wants; it is an argument, not a method, so that DistributedDataParallel
+        sees the call.
+        """
+        if x.ndim != 4 or x.shape[1] != self.input_channels:
+            raise UserError(
+                f"GraspNet: got an input of shape {tuple(x.shape)}, "
+                f"expected (B, {self.input_channels}, H, W)"
+            )
+        height, width = x.shape[-2:]
+        below, right = -height % self.backbone.stride, -width % self.backbone.stride
+        if below or right:
+            x = F.pad(x, (0, right, 0, below), mode="replicate")
+        features = self.backbone(x)[..., :height, :width]
+        quality = self.quality_head(features)
+        angle = self.angle_head(features)
+        metres = torch.sigmoid(self.width_head(features)) * self.max_width
+        return quality if logits else torch.sigmoid(quality), angle, metres
+
+    @torch.no_grad()
+    def predict_grasp(
+        self,
+        x: torch.Tensor,
+        K: np.ndarray | None = None,
+        T_WC: np.ndarray | None = None,
+        depth: np.ndarray | None = None,
+        **decoding,
+    ) -> dict:
+        """The best pixel of one image as in the tutorial, and, given the camera, metric grasps.
+
+        x: (1, C, H, W). Returns x and y in fractions of the image, theta in fractions of 180
+        degrees (bin k is centred at k / num_angle_bins), width in metres, quality. With K, T_WC
+        and depth also `grasps`, what `decode_grasps(..., **decoding)` returns, best first.
+        """
+        if len(x) != 1:
+            raise ValueError(f"predict_grasp takes one image, got a batch of {len(x)}")
+        training = self.training
+        self.eval()
+        try:
+            quality, angle, width = self(x)
+        finally:
+            self.train(training)
+        rows, columns = quality.shape[-2:]
+        row, column = divmod(int(quality.argmax()), columns)
+        found = {
+            "x": column / columns,
+            "y": row / rows,
+            "theta": int(angle[0, :, row, column].argmax()) / self.num_angle_bins,
+            "width": float(width[0, 0, row, column]),
+            "quality": float(quality[0, 0, row, column]),
+        }
+        if K is not None and T_WC is not None and depth is not None:
+            found["grasps"] = decode_grasps(quality, angle, width, K, T_WC, depth, **decoding)
+        return found
+
+
+def create_model(
+    input_channels: int = INPUT_CHANNELS,
+    num_angle_bins: int = 18,
+    *,
+    name: str = "tutorial",
+    max_width: float = 0.15,
+) -> GraspNet:
+    """A GraspNet with the backbone `name`; UserError with the known ones if there is no such."""
+    return GraspNet(input_channels, num_angle_bins, max_width, backbone=name)
+
+
+# --- Targets and loss ----------------------------------------------------------------------
+
+
+class GraspTargets(NamedTuple):
+    """What the network should say about B images.
+
+    quality: (B, 1, H, W) in [0, 1]. angle: (B, K, H, W), at each pixel a distribution over bins.
+    width: (B, 1, H, W) metres. valid: (B, 1, H, W) weight of the pixel in the quality loss, 0 to
+    leave it out. graspable: (B, 1, H, W) its weight in the angle and width losses.
+    """
+
+    quality: torch.Tensor
+    angle: torch.Tensor
+    width: torch.Tensor
+    valid: torch.Tensor
+    graspable: torch.Tensor
+
+
+def targets_from_labels(
+    quality: torch.Tensor,
+    width: torch.Tensor,
+    valid: torch.Tensor | None = None,
+    graspable_from: float = 0.5,
+) -> GraspTargets:
+    """Targets from dense labels: what a grasp at each pixel AND in each angle bin is worth.
+
+    quality, width: (B, K, H, W), in [0, 1] and metres. valid: (B, 1, H, W) weights or None for 1.
+    At each pixel the quality is the best bin's, the width the best bin's, and the angle's target
+    gives every bin its share of the summed quality: where several angles are good, all of them
+    are right (one hard angle makes the head collapse, see notes/grasping.md). Pixels that reach
+    `graspable_from` teach angle and width.
+    """
+    best, bin_ = quality.max(dim=1, keepdim=True)
+    total = quality.sum(dim=1, keepdim=True)
+    bins = quality.shape[1]
+    angle = torch.where(total > 0, quality / total.clamp(min=1e-12), 1 / bins)
+    of_best = width.gather(1, bin_).nan_to_num(0.0)
+    valid = torch.ones_like(best) if valid is None else valid.to(best.dtype)
+    return GraspTargets(best, angle, of_best, valid, valid * (best >= graspable_from))
+
+
+class GraspLoss(nn.Module):
+    """Quality, angle and width losses, each averaged over its pixels in an image, then over images.
+
+    Binary cross-entropy of the quality; cross-entropy of the angle against the target's whole
+    distribution; L1 of the width in metres, so `width_weight` is per metre (10: one centimetre
+    counts 0.1). Averaging image by image makes every image count alike, and makes the mean over
+    processes with batches of equal size the loss of the joint batch.
+    """
+
+    def __init__(
+        self, quality_weight: float = 1.0, angle_weight: float = 1.0, width_weight: float = 10.0
+    ):
+        super().__init__()
+        self.quality_weight = quality_weight
+        self.angle_weight = angle_weight
+        self.width_weight = width_weight
+
+    def forward(
+        self,
+        quality_logits: torch.Tensor,
+        angle_logits: torch.Tensor,
+        width: torch.Tensor,
+        targets: GraspTargets,
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """The weighted sum, and its unweighted parts (detached scalars).
+
+        The first three are `model(x, logits=True)`; half precision is widened here.
+        """
+        quality = F.binary_cross_entropy_with_logits(
+            quality_logits.float(), targets.quality, reduction="none"
+        )
+        angle = -(targets.angle * angle_logits.float().log_softmax(dim=1)).sum(1, keepdim=True)
+        distance = (width.float() - targets.width).abs()
+        quality_loss = mean_per_image(quality, targets.valid)
+        angle_loss = mean_per_image(angle, targets.graspable)
+        width_loss = mean_per_image(distance, targets.graspable)
+        total = (
+            self.quality_weight * quality_loss
+            + self.angle_weight * angle_loss
+            + self.width_weight * width_loss
+        )
+        return total, {
+            "quality_loss": quality_loss.detach(),
+            "angle_loss": angle_loss.detach(),
+            "width_loss": width_loss.detach(),
+        }
+
+
+def mean_per_image(value: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Weighted means of (B, ...) over each image, averaged; an image without weight counts 0."""
+    summed = (value * weight).flatten(1).sum(1)
+    return (summed / weight.flatten(1).sum(1).clamp(min=1e-6)).mean()
+
+
+# --- From maps to grasps -------------------------------------------------------------------
+
+PANDA_HAND = GripperGeometry()
+LABELS = LabelSettings()
+
+
+@dataclass(frozen=True)
+class PeakSettings:
+    """Which pixels become grasps."""
+
+    threshold: float = 0.5  # the quality that a peak has to exceed
+    count: int = 20  # most peaks returned
+    radius: int = 4  # pixels; no two peaks are this close in both u and v
+    blur: float = 1.0  # pixels, standard deviation of the Gaussian over the quality; 0: none
+
+
+class Peaks(NamedTuple):
+    """N peaks of the quality, best first: pixel (N, 2) as (u, v), not rounded; angle (N,) on the
+    image in [0, pi); width (N,) metres; quality (N,)."""
+
+    pixel: np.ndarray
+    angle: np.ndarray
+    width: np.ndarray
+    quality: np.ndarray
+
+
+def decode_grasps(
+    quality: torch.Tensor,
+    angle: torch.Tensor,
+    width: torch.Tensor,
+    K: np.ndarray,
+    T_WC: np.ndarray,
+    depth: np.ndarray,
+    gripper: GripperGeometry = PANDA_HAND,
+    table_height: float = 0.0,
+    labels: LabelSettings = LABELS,
+    peaks: PeakSettings = PeakSettings(),
+) -> list[Grasp]:
+    """Ranked top-down grasps in W, best first; an empty list if no quality exceeds the threshold.
+
+    quality, angle, width: what `GraspNet` returns for one image. K: (3, 3), T_WC: (4, 4), depth:
+    (H, W) metres, 0 = unknown. table_height: z of the table in W. The fingertips go as far straight
+    down from the surface point that the pixel shows as the labels say (`grasp_below_surface`), the
+    width ends at the gripper's. Peaks without known depth beside them are left out.
+    """
+    found = find_peaks(quality, angle, width, peaks)
+    grasps = []
+    for pixel, direction, opening, value, surface in zip(
+        *found, surface_depth(depth, found.pixel).tolist()
+    ):
+        if not np.isnan(surface):
+            opening = min(float(opening), gripper.max_opening)
+            on_image = ImageGrasp(pixel, float(direction), surface, opening, float(value))
+            grasps.append(grasp_below_surface(on_image, K, T_WC, table_height, gripper, labels))
+    return grasps
+
+
+def find_peaks(
+    quality: torch.Tensor,
+    angle: torch.Tensor,
+    width: torch.Tensor,
+    settings: PeakSettings = PeakSettings(),
+) -> Peaks:
+    """Local maxima of one image's quality map, with the angle and width that belong to them.
+
+    quality, width: (..., H, W) and angle: (..., K, H, W) with only ones in front. A peak is the
+    highest pixel of its window (max-pool non-maximum suppression); of equal ones, the first.
+    """
+    shape = quality.shape[-2:]
+    score = quality.detach().reshape(shape).float().cpu().numpy()
+    if settings.blur > 0:
+        score = cv2.GaussianBlur(score, (0, 0), settings.blur)
+    side = 2 * settings.radius + 1
+    highest = cv2.dilate(score, np.ones((side, side), np.uint8))  # a max-pool of stride 1
+    rows, columns = np.nonzero((score > settings.threshold) & (score >= highest))
+    ranked = np.argsort(-score[rows, columns], kind="stable")
+    row, column = _first_apart(rows[ranked], columns[ranked], shape, settings)
+    at = (..., torch.from_numpy(row), torch.from_numpy(column))
+    probability = angle.detach().reshape(-1, *shape)[at].float().softmax(dim=0).cpu().numpy()
+    return Peaks(
+        np.stack([column, row], axis=-1) + _subpixel(score, row, column),
+        _angles(probability.T),
+        width.detach().reshape(shape)[at].float().cpu().numpy(),
+        score[row, column],
+    )
+
+
+def _first_apart(
+    rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], settings: PeakSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first `count` of ranked pixels that keep `radius` apart; equal neighbours need this."""
+    free = np.ones(shape, bool)
+    chosen = []
+    for row, column in zip(rows, columns):
+        if len(chosen) == settings.count:
+            break
+        if free[row, column]:
+            chosen.append((row, column))
+            top, left = max(row - settings.radius, 0), max(column - settings.radius, 0)
+            free[top : row + settings.radius + 1, left : column + settings.radius + 1] = False
+    row, column = np.array(chosen, int).reshape(-1, 2).T
+    return row, column
+
+
+def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """(N, 2) offsets (u, v) of the maxima of quadratics through the 3x3 pixels around peaks.
+
+    Newton's step with central differences (Brown and Lowe 2002) on the logarithm, which is exact
+    where the peak is Gaussian. No step where the surface is not a cap.
+    """
+    rows, columns = score.shape
+    log = np.log(np.maximum(score, 1e-6))
+    step = np.arange(-1, 2)
+    v = np.clip(row[:, None] + step, 0, rows - 1)[:, :, None]
+    u = np.clip(column[:, None] + step, 0, columns - 1)[:, None, :]
+    f = log[v, u].astype(float)  # (N, v, u)
+    gu, gv = (f[:, 1, 2] - f[:, 1, 0]) / 2, (f[:, 2, 1] - f[:, 0, 1]) / 2
+    guu = f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]
+    gvv = f[:, 2, 1] - 2 * f[:, 1, 1] + f[:, 0, 1]
+    guv = (f[:, 2, 2] - f[:, 2, 0] - f[:, 0, 2] + f[:, 0, 0]) / 4
+    determinant = guu * gvv - guv**2
+    cap = (guu < 0) & (determinant > 1e-9)
+    step_uv = np.stack([guv * gv - gvv * gu, guv * gu - guu * gv], axis=-1)
+    step_uv /= np.where(cap, determinant, 1.0)[:, None]
+    return np.clip(np.where(cap[:, None], step_uv, 0.0), -1, 1)
+
+
+def _angles(probability: np.ndarray) -> np.ndarray:
+    """(N,) angles in [0, pi) of distributions (N, K) over bins that wrap around.
+
+    The bins are smoothed around the circle by (1, 4, 6, 4, 1) / 16, which finds the middle of a
+    range of equally good ones, and a parabola through the logarithms of the highest and its
+    neighbours tells the place between bins; exact for Gaussian-shaped distributions.
+    """
+    bins = probability.shape[1]
+    smooth = sum(
+        share / 16 * np.roll(probability, shift, axis=1)
+        for shift, share in zip(range(-2, 3), (1, 4, 6, 4, 1))
+    )
+    best = smooth.argmax(axis=1)
+    around = (best[:, None] + np.arange(-1, 2)) % bins
+    left, middle, right = np.log(
+        np.maximum(np.take_along_axis(smooth, around, axis=1), 1e-12).astype(float)
+    ).T
+    curvature = 2 * middle - left - right
+    offset = (right - left) / 2 / np.where(curvature > 1e-9, curvature, np.inf)
+    return np.mod((best + np.clip(offset, -0.5, 0.5)) * np.pi / bins, np.pi)
+
+
+def surface_depth(depth: np.ndarray, pixels: np.ndarray, radius: int = 1) -> np.ndarray:
+    """(N,) median of the known depths within `radius` of pixels (N, 2); NaN where none is known."""
+    rows, columns = depth.shape
+    u, v = np.rint(pixels).astype(int).reshape(-1, 2).T
+    step = np.arange(-radius, radius + 1)
+    v = np.clip(v[:, None] + step, 0, rows - 1)[:, :, None]
+    u = np.clip(u[:, None] + step, 0, columns - 1)[:, None, :]
+    window = depth[v, u].reshape(len(u), len(step) ** 2).astype(float)
+    known = _known(window)
+    ordered = np.sort(np.where(known, window, np.inf), axis=1)
+    middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
+    median = ordered[np.arange(len(ordered)), middle]
+    return np.where(np.isfinite(median), median, np.nan)
+
+
+def main() -> None:
+    """Print the parameters and output shapes of every backbone, as in the tutorial."""
+    x = torch.randn(2, INPUT_CHANNELS, 224, 224)
+    for name in BACKBONES:
+        model = create_model(name=name)
+        with torch.no_grad():
+            quality, angle, width = model(x)
+        print(f"{name}")
+        print(f"  parameters: {sum(p.numel() for p in model.parameters()):,}")
+        print(f"  input:      {tuple(x.shape)}")
+        print(f"  quality:    {tuple(quality.shape)}")
+        print(f"  angle:      {tuple(angle.shape)}")
+        print(f"  width:      {tuple(width.shape)}")
+
+
+if __name__ == "__main__":
+    main()

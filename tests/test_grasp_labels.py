@@ -1,0 +1,219 @@
+"""Dense grasp labels on scenes whose grasps are known by construction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.test_geometry import CORNERS, T_WC, K, boxes_frame, yaw_pose
+from utils.geometry import (
+    ConvexSolid,
+    GripperGeometry,
+    SceneGeometry,
+    SolidObject,
+    Workspace,
+    intersect_lines,
+)
+from utils.grasp_labels import (
+    GraspLabels,
+    LabelSettings,
+    bin_angles,
+    dense_labels,
+    grasp_below_surface,
+    grasp_depth,
+)
+from utils.transforms import (
+    Grasp,
+    ImageGrasp,
+    RGBDFrame,
+    angle_difference,
+    grasp_to_image,
+    look_at,
+    project,
+)
+
+BOX = (0.04, 0.10, 0.05)
+
+
+def labels_of(frame: RGBDFrame) -> GraspLabels:
+    return dense_labels(frame, GripperGeometry(), Workspace())
+
+
+def solids_frame(solids: list[ConvexSolid], T_WC: np.ndarray = T_WC) -> RGBDFrame:
+    """The frame of convex solids on the table; depth by ray casting."""
+    v, u = np.mgrid[0:224, 0:224]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    rays = rays @ T_WC[:3, :3].T
+    depth = -T_WC[2, 3] / rays[..., 2]
+    for solid in solids:
+        corners, _ = project(solid.vertices, K, T_WC)
+        (left, top), (right, bottom) = corners.min(axis=0).astype(int), corners.max(axis=0) + 2
+        window = np.s_[top : int(bottom), left : int(right)]
+        toward = rays[window].reshape(-1, 3)
+        hits = intersect_lines(solid, np.broadcast_to(T_WC[:3, 3], toward.shape), toward)
+        depth[window] = np.minimum(depth[window], hits.enter.reshape(depth[window].shape))
+    things = [SolidObject((s,), s.vertices.mean(axis=0), 0.7) for s in solids]
+    rgb = np.zeros((224, 224, 3), np.uint8)
+    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=SceneGeometry(tuple(things)))
+
+
+def box_solid(size, yaw: float, xy) -> ConvexSolid:
+    pose = yaw_pose(*xy, size[2] / 2, yaw)
+    return ConvexSolid.from_vertices(CORNERS * np.array(size) / 2).transformed(pose)
+
+
+def pixel_over(frame: RGBDFrame, point) -> tuple[int, int]:
+    """Row and column of the pixel that sees a point in W."""
+    (u, v), _ = project(np.array(point, dtype=float), frame.K, frame.T_WC)
+    return int(round(v)), int(round(u))
+
+
+def image_angle(frame: RGBDFrame, point, yaw: float) -> float:
+    return grasp_to_image(Grasp(np.array(point), yaw, 0.05, 1.0), frame.K, frame.T_WC).angle
+
+
+@pytest.mark.parametrize("degrees", [*range(0, 180, 15), 4, 86, 94, 176, 179, 182, 270, 356])
+def test_a_box_is_closed_on_across_its_short_side_only(degrees: int) -> None:
+    yaw, xy = np.deg2rad(degrees), (0.52, -0.04)
+    frame = boxes_frame([(BOX, yaw, xy)])
+    labels, top = labels_of(frame), (*xy, BOX[2])
+    v, u = pixel_over(frame, top)
+    quality = labels.quality[:, v, u]
+    off = angle_difference(bin_angles(), image_angle(frame, top, yaw))
+    assert off[quality.argmax()] == pytest.approx(off.min(), abs=np.deg2rad(1))
+    assert quality.max() > 0.8
+    assert (quality[off > np.deg2rad(60)] == 0).all()  # 8 cm and more between the fingers
+    settings = LabelSettings()
+    if off.min() < np.deg2rad(0.1):  # faces and pads parallel
+        offset = abs((frame.points()[v, u, :2] - xy) @ (np.cos(yaw), np.sin(yaw)))
+        expected = 0.04 + 2 * (offset + settings.room)
+        assert labels.width[quality.argmax(), v, u] == pytest.approx(expected, abs=0.002)
+
+
+@pytest.mark.parametrize("side", [0.02, 0.03, 0.04, 0.055])
+def test_width_is_the_opening_that_clears_both_sides_from_the_pixel(side: float) -> None:
+    """Off the middle, the farther side decides: 2 (side / 2 + offset + room), at most 8 cm."""
+    frame = boxes_frame([((side, 0.08, 0.05), 0.0, (0.5, 0.0))])
+    labels, points, settings = labels_of(frame), frame.points(), LabelSettings()
+    bin_ = round(image_angle(frame, (0.5, 0, 0.05), 0.0) / (np.pi / 18)) % 18
+    on_top = np.abs(points[..., 2] - 0.05) < 1e-4
+    near_middle = on_top & (np.abs(points[..., 1]) < 0.01) & (np.abs(points[..., 0] - 0.5) < 0.008)
+    expected = 2 * (side / 2 + np.abs(points[near_middle][:, 0] - 0.5) + settings.room)
+    assert len(expected) > 20
+    assert labels.width[bin_][near_middle] == pytest.approx(np.minimum(expected, 0.08), abs=0.002)
+    assert labels.width.max() <= GripperGeometry().max_opening + 1e-6
+
+
+def test_a_ball_is_grasped_alike_from_all_sides() -> None:
+    ball = trimesh.creation.icosphere(3, 0.025).vertices + (0.5, 0.0, 0.025)
+    frame = solids_frame([ConvexSolid.from_vertices(ball)])
+    labels = labels_of(frame)
+    v, u = pixel_over(frame, (0.5, 0.0, 0.05))
+    quality, width = labels.quality[:, v, u], labels.width[:, v, u]
+    assert quality.min() > 0.7
+    assert np.ptp(quality) < 0.06
+    assert np.ptp(width) <= 0.0041
+
+
+def test_nothing_closes_across_a_gap_between_two_objects() -> None:
+    frame = boxes_frame(
+        [((0.03, 0.06, 0.05), 0.0, (0.48, 0.0)), ((0.03, 0.06, 0.05), 0.0, (0.52, 0.0))]
+    )
+    labels = labels_of(frame)
+    across = image_angle(frame, (0.5, 0.0, 0.05), 0.0)
+    off = np.rad2deg(angle_difference(bin_angles(), across))
+    assert (labels.quality[off < 15] == 0).all()
+    assert labels.quality[off < 25].max() < LabelSettings().positive  # round a corner, both outside
+    assert labels.quality[off > 85].max() > LabelSettings().positive  # along the gap
+
+
+def test_the_palm_is_kept_off_a_tall_neighbour() -> None:
+    """9 cm beside the grasp, under the hand but not under a finger."""
+    low, tall = ((0.03, 0.03, 0.03), 0.0, (0.5, 0.0)), ((0.02, 0.02, 0.09), 0.0, (0.5, 0.085))
+    v, u = pixel_over(boxes_frame([low]), (0.5, 0.0, 0.03))
+    alone, beside = (labels_of(boxes_frame(b)).quality[:, v, u] for b in ([low], [low, tall]))
+    frame = boxes_frame([low])
+    along_y, along_x = (
+        int(round(image_angle(frame, (0.5, 0, 0.03), yaw) / (np.pi / 18))) % 18
+        for yaw in (np.pi / 2, 0.0)
+    )
+    assert alone[along_y] > 0.5 and alone[along_x] > 0.5
+    assert beside[along_y] == 0 and beside[along_x] == alone[along_x]
+
+
+def test_pads_close_on_nothing_under_an_overhang() -> None:
+    """A plate 4 mm thick, 7.6 cm up: 2 cm below its top only the pads' rims would touch it."""
+    plate = ConvexSolid.from_vertices(CORNERS * (0.02, 0.02, 0.002))
+    raised = plate.transformed(yaw_pose(0.5, 0.0, 0.078, 0.0))
+    assert not labels_of(solids_frame([raised])).quality.any()
+    block = box_solid((0.04, 0.04, 0.080), 0.0, (0.5, 0.0))  # the same from above
+    assert labels_of(solids_frame([block])).quality.max() > 0.5
+
+
+def test_an_empty_table_has_no_grasp() -> None:
+    labels = labels_of(boxes_frame([]))
+    assert labels.valid.all()
+    assert not labels.quality.any() and not labels.width.any()
+
+
+def test_unknown_depth_and_the_robot_are_not_valid() -> None:
+    frame = boxes_frame([(BOX, 0.0, (0.5, 0.0))])
+    depth, segmentation = frame.depth.copy(), np.full(frame.depth.shape, -1, np.int32)
+    depth[100:105], segmentation[120:125] = 0, -2
+    labels = labels_of(replace(frame, depth=depth, segmentation=segmentation))
+    assert not labels.valid[100:105].any() and not labels.valid[120:125].any()
+    assert not labels.quality[:, ~labels.valid].any()
+
+
+def test_labels_without_truth_say_what_is_missing() -> None:
+    with pytest.raises(ValueError, match=r"frame\.truth"):
+        labels_of(boxes_frame([]).without_truth())
+
+
+def test_labels_turn_with_the_scene() -> None:
+    """A quarter turn about the optical axis is np.rot90, nine bins on."""
+    solids = [box_solid(BOX, 0.3, (0.45, -0.03)), box_solid((0.03, 0.03, 0.04), 1.0, (0.56, 0.05))]
+    # The image's sense: np.rot90 turns the image anticlockwise; the camera's up is W's x.
+    turn = np.eye(4)
+    turn[:2, :2] = [[0, -1], [1, 0]]
+    turn[:2, 3] = np.array((0.5, 0)) - turn[:2, :2] @ (0.5, 0)
+    one = labels_of(solids_frame(solids))
+    two = labels_of(solids_frame([solid.transformed(turn) for solid in solids]))
+    expected = np.roll(np.rot90(one.quality, axes=(1, 2)), 9, axis=0)
+    assert (expected > 0).sum() > 3000
+    assert np.abs(expected - two.quality).max() < 1e-3
+    turned_width = np.roll(np.rot90(one.width, axes=(1, 2)), 9, axis=0)
+    assert np.abs(turned_width - two.width).max() < 1e-6
+
+
+def test_an_oblique_camera_gets_the_grasps_of_the_overhead_one() -> None:
+    """Decoded into W, the best grasp of either view closes across the box."""
+    oblique = look_at((0.25, 0.3, 0.7), (0.5, 0.0, 0.0))
+    for T in (T_WC, oblique):
+        frame = solids_frame([box_solid(BOX, 0.7, (0.5, 0.02))], T)
+        labels = labels_of(frame)
+        k, v, u = np.unravel_index(labels.quality.argmax(), labels.quality.shape)
+        at_surface = ImageGrasp(
+            np.array([u, v]), bin_angles()[k], frame.depth[v, u], labels.width[k, v, u], 1.0
+        )
+        grasp = grasp_below_surface(at_surface, K, T, 0.0, GripperGeometry())
+        assert angle_difference(grasp.angle, 0.7) < np.deg2rad(10)
+        assert np.linalg.norm(grasp.position[:2] - (0.5, 0.02)) < 0.02
+        assert grasp.position[2] == pytest.approx(0.05 - 0.020 + 0.0072, abs=1e-4)
+
+
+def test_depth_rule_by_hand() -> None:
+    """2 cm below the surface, 4 mm over the table."""
+    assert grasp_depth(np.array([0.05, 0.024, 0.010]), 0.0) == pytest.approx([0.02, 0.02, 0.006])
+    assert grasp_depth(0.110, 0.1) == pytest.approx(0.006)
+
+
+def test_labels_are_the_same_every_time() -> None:
+    frame = boxes_frame([(BOX, 0.4, (0.5, 0.0)), ((0.03, 0.05, 0.06), 1.2, (0.58, 0.04))])
+    one, two = labels_of(frame), labels_of(frame)
+    assert one.quality.dtype == one.width.dtype == np.float32
+    assert one.quality.shape == (18, 224, 224)
+    for name in ("quality", "width", "valid"):
+        assert np.array_equal(getattr(one, name), getattr(two, name))
+    assert ((one.width > 0) == (one.quality > 0)).all()

@@ -1,0 +1,528 @@
+"""GraspNet: sizes against closed forms, the loss against a hand computation, decoding of maps
+whose peaks are known, and grasps that go through labels and back."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from models.backbones import BACKBONES, GGCNNBackbone, GRConvNetBackbone
+from models.graspnet import (
+    GraspLoss,
+    GraspNet,
+    PeakSettings,
+    create_model,
+    decode_grasps,
+    fill_holes,
+    find_peaks,
+    main,
+    surface_depth,
+    targets_from_labels,
+    to_input,
+)
+from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.errors import UserError
+from utils.geometry import GripperGeometry
+from utils.grasp_labels import LabelSettings
+from utils.transforms import Grasp, angle_difference, grasp_to_image, look_at, project
+
+BINS = 18
+STEP = np.pi / BINS
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+# --- The network ---------------------------------------------------------------------------
+
+
+def conv(inputs: int, outputs: int, kernel: int) -> int:
+    """Weights and biases of a convolution, transposed or not."""
+    return inputs * outputs * kernel**2 + outputs
+
+
+def conv_norm(inputs: int, outputs: int, kernel: int) -> int:
+    """The same with batch normalisation's scale and shift."""
+    return conv(inputs, outputs, kernel) + 2 * outputs
+
+
+def test_the_tutorials_parameter_count_layer_by_layer() -> None:
+    encoder = sum(
+        conv_norm(a, b, 3) + 3 * conv_norm(b, b, 3)
+        for a, b in ((4, 32), (32, 64), (64, 128), (128, 256))
+    )
+    decoder = sum(conv_norm(a, b, 4) for a, b in ((256, 128), (128, 64), (64, 32), (32, 32)))
+    heads = conv(32, 1, 1) + conv(32, 18, 1) + conv(32, 1, 1)
+    for name in ("tutorial", "tutorial_skip"):
+        assert parameters(create_model(4, 18, name=name)) == encoder + decoder + heads
+
+
+@pytest.mark.parametrize(
+    ("backbone", "inputs", "published"),
+    [(GGCNNBackbone, 1, 62_420), (GRConvNetBackbone, 4, 1_900_900)],
+)
+def test_published_counts_of_the_peers(backbone, inputs: int, published: int) -> None:
+    # The papers' networks end in four heads (quality, cos, sin, width) of 2x2 pixels.
+    assert parameters(backbone(inputs)) + 4 * conv(32, 1, 2) == published
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+@pytest.mark.parametrize("size", [(64, 64), (37, 50), (16, 95), (1, 1)])
+def test_maps_have_the_images_size_and_range(name: str, size: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    model = create_model(name=name, max_width=0.08).eval()
+    with torch.no_grad():
+        quality, angle, width = model(3 * torch.randn(2, 4, *size))
+    assert quality.shape == width.shape == (2, 1, *size) and angle.shape == (2, 18, *size)
+    assert quality.min() >= 0 and quality.max() <= 1
+    assert width.min() >= 0 and width.max() <= 0.08
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_the_part_inside_does_not_depend_on_the_padding(name: str) -> None:
+    torch.manual_seed(0)
+    model = create_model(name=name).eval()
+    side = 2 * model.backbone.stride
+    x = torch.randn(1, 4, side - 3, side - 1)
+    padded = torch.nn.functional.pad(x, (0, 1, 0, 3), mode="replicate")
+    with torch.no_grad():
+        for small, large in zip(model(x), model(padded)):
+            torch.testing.assert_close(small, large[..., : side - 3, : side - 1])
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_a_map_answers_where_the_image_changes(name: str) -> None:
+    # Untrained maps shift with the image by whole strides: pixels stay where they are.
+    torch.manual_seed(0)
+    model = create_model(name=name).eval()
+    stride = model.backbone.stride
+    middle = max(120 // stride, 8) * stride  # far enough from the image's edge
+    x = torch.zeros(1, 4, 2 * middle, 2 * middle)
+    x[..., middle - stride : middle, middle - stride : middle] = 1
+    moved = x.roll((stride, 2 * stride), dims=(2, 3))
+    inner = slice(middle - 2 * stride, middle + 2 * stride)
+    with torch.no_grad():
+        first = model(x, logits=True)[0].roll((stride, 2 * stride), dims=(2, 3))
+        second = model(moved, logits=True)[0]
+    torch.testing.assert_close(first[..., inner, inner], second[..., inner, inner])
+
+
+def test_logits_are_the_quality_before_its_sigmoid() -> None:
+    torch.manual_seed(0)
+    model, x = create_model().eval(), torch.randn(1, 4, 32, 32)
+    torch.testing.assert_close(torch.sigmoid(model(x, logits=True)[0]), model(x)[0])
+
+
+def test_evaluation_is_deterministic_and_batches_do_not_mix() -> None:
+    torch.manual_seed(0)
+    model, x = create_model().eval(), torch.randn(3, 4, 48, 48)
+    with torch.no_grad():
+        together, again, alone = model(x), model(x), model(x[1:2])
+    for a, b, c in zip(together, again, alone):
+        assert torch.equal(a, b)
+        torch.testing.assert_close(a[1:2], c)
+
+
+def test_unknown_backbone_and_wrong_channels_are_the_users_error() -> None:
+    with pytest.raises(UserError, match="'gg-cnn'.*ggcnn.*did you mean ggcnn"):
+        create_model(name="gg-cnn")
+    with pytest.raises(UserError, match=r"\(1, 3, 32, 32\).*\(B, 4, H, W\)"):
+        create_model()(torch.zeros(1, 3, 32, 32))
+
+
+def test_a_checkpoint_rebuilds_the_network(tmp_path) -> None:
+    torch.manual_seed(0)
+    model, path = create_model(name="ggcnn", max_width=0.08).eval(), tmp_path / "net.pt"
+    save_checkpoint(path, kind="graspnet", model_args=model.model_args, model=model)
+    stored = load_checkpoint(path, "graspnet")
+    rebuilt = GraspNet(**stored["model_args"]).eval()
+    load_weights(rebuilt, stored, path)
+    x = torch.randn(1, 4, 30, 40)
+    assert all(torch.equal(a, b) for a, b in zip(model(x), rebuilt(x)))
+    with pytest.raises(UserError, match="net.pt.*backbone is 'ggcnn', expected 'tutorial'"):
+        load_checkpoint(path, "graspnet", model_args=create_model(max_width=0.08).model_args)
+
+
+def test_the_module_prints_every_backbone(capsys) -> None:
+    main()
+    printed = capsys.readouterr().out
+    assert all(f"{name}\n" in printed for name in BACKBONES)
+    assert "3,450,004" in printed and "(2, 18, 224, 224)" in printed
+
+
+# --- Targets and loss ----------------------------------------------------------------------
+
+
+def random_labels(seed: int = 0, batch: int = 2, size: tuple[int, int] = (5, 7)):
+    random = np.random.default_rng(seed)
+    quality = random.uniform(size=(batch, BINS, *size)).astype(np.float32) ** 8
+    width = random.uniform(0, 0.08, size=quality.shape).astype(np.float32)
+    valid = random.integers(0, 2, size=(batch, 1, *size)).astype(np.float32)
+    return torch.from_numpy(quality), torch.from_numpy(width), torch.from_numpy(valid)
+
+
+def test_targets_of_a_pixel_with_two_good_angles() -> None:
+    quality, width = torch.zeros(1, BINS, 1, 2), torch.full((1, BINS, 1, 2), torch.nan)
+    quality[0, 0, 0, 0], quality[0, 9, 0, 0] = 0.9, 0.6
+    width[0, 0, 0, 0], width[0, 9, 0, 0] = 0.02, 0.05
+    targets = targets_from_labels(quality, width)
+    assert targets.quality[0, 0, 0, 0] == pytest.approx(0.9)
+    assert targets.angle[0, 0, 0, 0] == pytest.approx(0.6)
+    assert targets.angle[0, 9, 0, 0] == pytest.approx(0.4)
+    assert targets.width[0, 0, 0, 0] == pytest.approx(0.02)
+    assert targets.graspable.flatten().tolist() == [1, 0]
+    # The pixel without a grasp: nothing undefined, and a distribution all the same.
+    torch.testing.assert_close(targets.angle.sum(1), torch.ones(1, 1, 2))
+    assert all(torch.isfinite(target).all() for target in targets)
+
+
+def test_loss_against_numpy() -> None:
+    quality, width, valid = random_labels()
+    targets = targets_from_labels(quality, width, valid, graspable_from=0.5)
+    torch.manual_seed(1)
+    q, a, w = torch.randn(2, 1, 5, 7), torch.randn(2, BINS, 5, 7), 0.08 * torch.rand(2, 1, 5, 7)
+    total, parts = GraspLoss(2.0, 3.0, 5.0)(q, a, w, targets)
+
+    sums = np.zeros(3)
+    for image in range(2):
+        found = [[], [], []]
+        for row, column in np.ndindex(5, 7):
+            at = image, slice(None), row, column
+            label, best = quality[at].double().numpy(), int(quality[at].argmax())
+            if not valid[image, 0, row, column]:
+                continue
+            p = 1 / (1 + np.exp(-float(q[image, 0, row, column])))
+            found[0].append(-label[best] * np.log(p) - (1 - label[best]) * np.log(1 - p))
+            if label[best] >= 0.5:
+                share = np.exp(a[at].double().numpy())
+                share /= share.sum()
+                found[1].append(-(label / label.sum() * np.log(share)).sum())
+                found[2].append(abs(float(w[image, 0, row, column]) - float(width[at][best])))
+        sums += [np.mean(part) / 2 for part in found]
+    assert [float(parts[f"{n}_loss"]) for n in ("quality", "angle", "width")] == pytest.approx(
+        sums.tolist(), rel=1e-5
+    )
+    assert float(total) == pytest.approx(2 * sums[0] + 3 * sums[1] + 5 * sums[2], rel=1e-5)
+
+
+def test_logits_that_say_nothing_cost_ln_18_and_ln_2() -> None:
+    targets = targets_from_labels(*random_labels())
+    _, parts = GraspLoss()(
+        torch.zeros(2, 1, 5, 7), torch.zeros(2, 18, 5, 7), targets.width, targets
+    )
+    assert float(parts["angle_loss"]) == pytest.approx(np.log(18), rel=1e-6)
+    assert float(parts["quality_loss"]) == pytest.approx(np.log(2), rel=1e-6)
+    assert float(parts["width_loss"]) == 0
+
+
+def test_masked_pixels_do_not_count_and_an_image_without_grasps_is_fine() -> None:
+    quality, width, _ = random_labels()
+    valid = torch.ones(2, 1, 5, 7)
+    valid[:, :, :, 3:] = 0
+    targets = targets_from_labels(quality, width, valid)
+    torch.manual_seed(1)
+    maps = [torch.randn(2, channels, 5, 7) for channels in (1, BINS, 1)]
+    first, _ = GraspLoss()(*maps, targets)
+    for values in maps:
+        values[..., 3:] += 100
+    assert GraspLoss()(*maps, targets)[0] == first
+
+    empty = targets_from_labels(torch.zeros(2, BINS, 5, 7), width)
+    total, parts = GraspLoss()(*maps, empty)
+    assert torch.isfinite(total)
+    assert parts["angle_loss"] == 0 and parts["width_loss"] == 0
+
+
+def test_two_halves_average_to_the_joint_batch() -> None:
+    # What data-parallel training relies on.
+    targets = targets_from_labels(*random_labels(batch=4))
+    torch.manual_seed(1)
+    maps = [torch.randn(4, channels, 5, 7) for channels in (1, BINS, 1)]
+    whole, _ = GraspLoss()(*maps, targets)
+    halves = [
+        GraspLoss()(*(m[part] for m in maps), type(targets)(*(t[part] for t in targets)))[0]
+        for part in (slice(0, 2), slice(2, 4))
+    ]
+    torch.testing.assert_close(sum(halves) / 2, whole)
+
+
+def test_extreme_logits_stay_finite_in_half_precision() -> None:
+    targets = targets_from_labels(*random_labels())
+    q = torch.full((2, 1, 5, 7), 6e4, dtype=torch.float16, requires_grad=True)
+    a = torch.full((2, BINS, 5, 7), -6e4, dtype=torch.float16, requires_grad=True)
+    total, _ = GraspLoss()(q, a, targets.width.half(), targets)
+    total.backward()
+    assert torch.isfinite(total) and torch.isfinite(q.grad).all() and torch.isfinite(a.grad).all()
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_the_gradient_reaches_every_parameter(name: str) -> None:
+    torch.manual_seed(0)
+    model = create_model(name=name)
+    targets = targets_from_labels(*random_labels(size=(32, 32)))
+    GraspLoss()(*model(torch.randn(2, 4, 32, 32), logits=True), targets)[0].backward()
+    for part, parameter in model.named_parameters():
+        assert parameter.grad is not None, part
+    for head in (model.quality_head, model.angle_head, model.width_head):
+        assert head.weight.grad.abs().max() > 0
+
+
+def test_a_few_steps_learn_one_image() -> None:
+    torch.manual_seed(0)
+    model, loss = create_model(name="tutorial_skip"), GraspLoss()
+    targets, x = targets_from_labels(*random_labels(size=(16, 16))), torch.randn(2, 4, 16, 16)
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
+    values = []
+    for _ in range(12):
+        optimizer.zero_grad()
+        total, _ = loss(*model(x, logits=True), targets)
+        total.backward()
+        optimizer.step()
+        values.append(total.item())
+    assert values[-1] < 0.8 * values[0]
+
+
+# --- From maps to grasps -------------------------------------------------------------------
+
+
+def circular_gaussian(angle: float, sigma: float) -> np.ndarray:
+    """(18,) worth of each bin for a grasp at an angle, over the wrapped line."""
+    return np.exp(-0.5 * (angle_difference(np.arange(BINS) * STEP, angle) / sigma) ** 2)
+
+
+def labels_of(blobs, size: tuple[int, int], sigma: float = 3.0, sigma_angle: float = 0.25):
+    """Dense labels (1, 18, H, W) of blobs (u, v, angle, width, worth); of two, the better."""
+    v, u = np.mgrid[0 : size[0], 0 : size[1]]
+    quality, width = np.zeros((2, BINS, *size))
+    for at_u, at_v, angle, opening, worth in blobs:
+        near = worth * np.exp(-((u - at_u) ** 2 + (v - at_v) ** 2) / (2 * sigma**2))
+        mine = near * circular_gaussian(angle, sigma_angle)[:, None, None]
+        width = np.where(mine > quality, opening, width)
+        quality = np.maximum(mine, quality)
+    return torch.from_numpy(quality)[None].float(), torch.from_numpy(width)[None].float()
+
+
+def maps_of(blobs, size: tuple[int, int], **shape) -> tuple[torch.Tensor, ...]:
+    """The maps of a network that has learnt these labels perfectly."""
+    targets = targets_from_labels(*labels_of(blobs, size, **shape))
+    return targets.quality, targets.angle.clamp(min=1e-9).log(), targets.width
+
+
+@pytest.mark.parametrize("degrees", [0.0, 3.0, 7.5, 44.0, 90.0, 174.0, 176.0, 178.9, 179.9])
+def test_peaks_are_found_between_pixels_and_between_bins(degrees: float) -> None:
+    blobs = [
+        (20.3, 31.8, np.deg2rad(degrees), 0.03, 0.9),
+        (55.5, 12.2, np.deg2rad(degrees + 61), 0.05, 0.8),
+        (60.0, 44.5, np.deg2rad(degrees + 119), 0.07, 0.7),
+    ]
+    found = find_peaks(*maps_of(blobs, (60, 80)))
+    assert len(found.quality) == 3
+    for number, (u, v, angle, width, _) in enumerate(blobs):
+        assert np.abs(found.pixel[number] - (u, v)).max() < 0.05
+        assert np.rad2deg(angle_difference(found.angle[number], angle)) < 1
+        assert 0 <= found.angle[number] < np.pi
+        assert found.width[number] == pytest.approx(width)
+    assert np.all(np.diff(found.quality) < 0)
+
+
+@pytest.mark.parametrize("sigma", [0.12, 0.2, 0.35, 0.5])
+def test_angles_of_narrow_and_wide_distributions(sigma: float) -> None:
+    for degrees in np.arange(0, 180, 3.7):
+        blob = (10, 10, np.deg2rad(degrees), 0.05, 0.9)
+        found = find_peaks(*maps_of([blob], (21, 21), sigma_angle=sigma))
+        assert np.rad2deg(angle_difference(found.angle[0], np.deg2rad(degrees))) < 1
+
+
+def test_of_a_range_of_equally_good_angles_the_middle_is_taken() -> None:
+    quality, _, width = maps_of([(10, 10, 0.0, 0.05, 0.9)], (21, 21))
+    angle = torch.full((1, BINS, 21, 21), -12.0)
+    angle[:, [16, 17, 0, 1, 2]] = 0  # 155 to 25 degrees, across the seam
+    found = find_peaks(quality, angle, width)
+    assert np.rad2deg(angle_difference(found.angle[0], 0.0)) < 1
+
+
+def test_an_oblique_ridge_is_still_located() -> None:
+    v, u = np.mgrid[0:40, 0:40] - np.array([18.3, 21.6])[:, None, None]
+    along, across = (u + v) / np.sqrt(2), (u - v) / np.sqrt(2)
+    quality = torch.from_numpy(0.9 * np.exp(-(along**2) / 50 - across**2 / 8))
+    found = find_peaks(quality, torch.zeros(BINS, 40, 40), torch.full((40, 40), 0.05))
+    assert np.abs(found.pixel[0] - (21.6, 18.3)).max() < 0.05
+
+
+def test_at_the_images_edge_and_on_a_plateau() -> None:
+    quality = torch.zeros(1, 1, 30, 40)
+    quality[0, 0, 0, 0] = 0.9  # a corner
+    quality[0, 0, 10:22, 10:30] = 0.7  # as after saturation
+    settings = PeakSettings(blur=0)
+    found = find_peaks(quality, torch.zeros(1, BINS, 30, 40), 0.05 + 0 * quality, settings)
+    assert found.quality[0] == pytest.approx(0.9) and np.abs(found.pixel[0]).max() <= 1
+    for i, pixel in enumerate(found.pixel):
+        assert all(np.abs(pixel - other).max() > 2 for other in found.pixel[:i])
+    assert 2 <= len(found.quality) <= settings.count
+
+
+def test_nothing_over_the_threshold_is_an_empty_list() -> None:
+    K, T_WC, depth = camera(0.0)
+    maps = maps_of([(50, 50, 1.0, 0.05, 0.45)], depth.shape)
+    assert decode_grasps(*maps, K, T_WC, depth) == []
+    assert len(decode_grasps(*maps, K, T_WC, depth, peaks=PeakSettings(threshold=0.3))) == 1
+
+
+@pytest.mark.slow
+def test_decoding_takes_under_4_ms_at_224_pixels() -> None:
+    K, T_WC, depth = camera(0.0, (224, 224))
+    torch.manual_seed(0)
+    angle, width = torch.randn(1, BINS, 224, 224), torch.full((1, 1, 224, 224), 0.05)
+    for quality in (torch.rand(1, 1, 224, 224), torch.full((1, 1, 224, 224), 0.9)):
+        taken = []
+        for _ in range(20):
+            start = time.perf_counter()
+            found = decode_grasps(quality, angle, width, K, T_WC, depth)
+            taken.append(time.perf_counter() - start)
+        assert len(found) == PeakSettings().count
+        assert min(taken) < 0.004  # the least: a busy machine is not the code's fault
+
+
+SURFACE = 0.05  # m, height of the plane that the test camera sees
+
+
+def camera(tilt: float, size: tuple[int, int] = (200, 224)):
+    """K, T_WC and the depth of a level surface, seen from above at a tilt in metres."""
+    height, width = size
+    K = np.array([[450.0, 0, (width - 1) / 2], [0, 450.0, (height - 1) / 2], [0, 0, 1]])
+    T_WC = look_at((0.5 - tilt, 0.1 * tilt, 0.8), (0.5, 0.0, 0.0), up=(1, 0, 0))
+    v, u = np.mgrid[0:height, 0:width]
+    rays = np.stack([(u - K[0, 2]) / 450, (v - K[1, 2]) / 450, np.ones(size)], axis=-1)
+    depth = (SURFACE - T_WC[2, 3]) / (rays @ T_WC[2, :3])
+    return K, T_WC, depth.astype(np.float32)
+
+
+# The surface is read off at whole pixels, which on a tilted image is up to 1 mm of depth.
+@pytest.mark.parametrize(("tilt", "tolerance"), [(0.0, 2e-4), (0.5, 1e-3)])
+def test_grasps_go_through_labels_and_back(tilt: float, tolerance: float) -> None:
+    K, T_WC, depth = camera(tilt)
+    gripper, labels = GripperGeometry(), LabelSettings(depth=0.03)
+    random = np.random.default_rng(2)
+    wanted = []
+    for quality, (x, y) in zip(
+        np.linspace(0.95, 0.6, 5),
+        ((0.5, 0.0), (0.42, -0.08), (0.57, 0.07), (0.44, 0.09), (0.58, -0.06)),
+    ):
+        position = (
+            x + random.uniform(0, 0.01),
+            y + random.uniform(0, 0.01),
+            SURFACE - 0.03 + 0.0072,
+        )
+        width = random.uniform(0.02, 0.07)
+        wanted.append(Grasp(position, random.uniform(0, np.pi), width, quality))
+    blobs = []
+    for grasp in wanted:
+        top = Grasp((*grasp.position[:2], SURFACE), grasp.angle, grasp.width, grasp.quality)
+        on_image = grasp_to_image(top, K, T_WC)
+        blobs.append((*on_image.pixel, on_image.angle, grasp.width, grasp.quality))
+    found = decode_grasps(
+        *maps_of(blobs, depth.shape), K, T_WC, depth, gripper=gripper, labels=labels
+    )
+    assert len(found) == len(wanted)
+    for grasp, true in zip(found, wanted):
+        assert np.abs(grasp.position - true.position).max() < tolerance
+        assert np.rad2deg(angle_difference(grasp.angle, true.angle)) < 1
+        assert grasp.width == pytest.approx(true.width, abs=1e-6)
+
+
+def test_the_fingertips_stay_off_the_table_and_the_hand_within_its_opening() -> None:
+    K, T_WC, depth = camera(0.0)
+    u, v = project(np.array([0.5, 0.0, SURFACE]), K, T_WC)[0]
+    maps = maps_of([(u, v, 0.5, 0.12, 0.9)], depth.shape)
+    gripper = GripperGeometry()
+    # The grasp's position lies 7.2 mm over the tips' lowest point.
+    for labelled, table, tip in (
+        (LabelSettings(depth=0.03), 0.0, SURFACE - 0.03),
+        (LabelSettings(depth=0.5, table_clearance=0.004), 0.0, 0.004),
+        (LabelSettings(depth=0.5, table_clearance=0.01), 0.02, 0.03),
+    ):
+        (grasp,) = decode_grasps(*maps, K, T_WC, depth, table_height=table, labels=labelled)
+        assert grasp.position[2] == pytest.approx(tip + 0.0072, abs=2e-4)
+        assert grasp.width == gripper.max_opening
+
+
+def test_surface_depth_ignores_holes_and_a_peak_in_the_dark_is_left_out() -> None:
+    depth = np.full((20, 20), 0.7, np.float32)
+    depth[9:11, 9:12] = 0
+    depth[0:8, 0:8] = np.nan
+    found = surface_depth(depth, np.array([[10.2, 9.8], [3.0, 3.0], [19.4, 19.4]]))
+    assert found[[0, 2]] == pytest.approx([0.7, 0.7]) and np.isnan(found[1])
+    K, T_WC, seen = camera(0.0)
+    maps = maps_of([(100, 100, 0.5, 0.05, 0.9)], seen.shape)
+    assert decode_grasps(*maps, K, T_WC, np.zeros_like(seen)) == []
+
+
+def test_predict_grasp_keeps_the_tutorials_dict_and_adds_metric_grasps() -> None:
+    K, T_WC, depth = camera(0.0, (64, 80))
+
+    class Known(GraspNet):
+        def forward(self, x, logits=False):
+            return maps_of([(40, 16, np.deg2rad(70), 0.05, 0.9)], (64, 80))
+
+    model = Known(backbone="ggcnn").train()
+    found = model.predict_grasp(torch.zeros(1, 4, 64, 80))
+    assert found == pytest.approx(
+        {"x": 0.5, "y": 0.25, "theta": 70 / 180, "width": 0.05, "quality": 0.9}
+    )
+    assert model.training
+    (grasp,) = model.predict_grasp(torch.zeros(1, 4, 64, 80), K, T_WC, depth)["grasps"]
+    assert project(grasp.position, K, T_WC)[0] == pytest.approx((40, 16), abs=0.5)
+    with pytest.raises(ValueError, match="batch of 2"):
+        model.predict_grasp(torch.zeros(2, 4, 64, 80))
+
+
+# --- From an image to the input ------------------------------------------------------------
+
+
+def picture(height: int = 20, width: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    rgb = random.integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return rgb, np.full((height, width), 0.8, np.float32)
+
+
+def test_input_is_centred_scaled_and_cut_off() -> None:
+    rgb, depth = picture()
+    depth[0, :3] = 0.75, 0.1, 5.0  # 5 cm nearer, then beyond both limits
+    rgb[0, 0] = 0, 51, 255
+    x = to_input(rgb, depth)
+    assert x.shape == (4, 20, 30) and x.dtype == torch.float32
+    assert x[:3, 0, 0].tolist() == pytest.approx([-0.5, -0.3, 0.5])
+    assert x[3, 0, :4].tolist() == pytest.approx([-0.5, -3, 3, 0], abs=1e-5)
+    torch.testing.assert_close(to_input(rgb, depth + 0.3)[3, 5:], x[3, 5:])
+
+
+@pytest.mark.parametrize("unknown", [0.0, -1.0, np.nan, np.inf])
+def test_holes_take_the_nearest_depth(unknown: float) -> None:
+    rgb, depth = picture()
+    depth[:, 15:] = 0.7
+    whole = depth.copy()
+    depth[5:9, 3:6] = depth[2:5, 22:25] = unknown
+    assert np.array_equal(fill_holes(depth), whole)
+    assert torch.equal(to_input(rgb, depth), to_input(rgb, whole))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rgb, depth: (rgb, depth[:-1]), "30x20 and 30x19"),
+        (lambda rgb, depth: (rgb, depth * 1000), "800 m.*millimetres"),
+        (lambda rgb, depth: (rgb, (depth * 1000).astype(np.uint16)), "millimetres"),
+        (lambda rgb, depth: (rgb, depth / 1000), "0.0008 m, expected 0.05 to 10 m"),
+        (lambda rgb, depth: (rgb, depth * 0), "no pixel is known"),
+        (lambda rgb, depth: (rgb, depth * np.nan), "no pixel is known"),
+        (lambda rgb, depth: (rgb, np.stack([depth] * 3, axis=-1)), "one channel"),
+        (lambda rgb, depth: (rgb[..., 0], depth), r"rgb.*\(20, 30\)"),
+        (lambda rgb, depth: (np.dstack([rgb, rgb[..., :1]]), depth), r"rgb.*\(20, 30, 4\)"),
+        (lambda rgb, depth: (rgb / np.float32(255), depth), "uint8"),
+    ],
+)
+def test_an_image_that_cannot_be_meant_is_one_clear_error(change, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        to_input(*change(*picture()))
