@@ -63,8 +63,8 @@ class RobotGraspingEnv(gymnasium.Env):
     workspace and the joint limits, and are scaled down as a whole where a joint would have to
     exceed its velocity limit. The command stays where it is when the arm cannot reach the new
     one, or is held up by something on its way.
-    Legal joint speeds are commanded; in physics a joint was measured at up to 1.2 times its limit for
-    single steps of 1/240 s (2 of 4,000). The acceleration is bounded by the torque limits alone.
+    Legal joint speeds are commanded; in physics a joint was measured at up to 1.2 times its limit
+    for single steps of 1/240 s (2 of 4,000); the torque limits alone bound its acceleration.
 
     Reward (`dense`): 1 at success, plus the change of a progress measure, r = [success] + Phi(s')
     - Phi(s), with the stages of ManiSkill's PickCube. An episode's sum telescopes to [success] +
