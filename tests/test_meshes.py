@@ -146,3 +146,23 @@ def test_a_mesh_turned_inside_out_is_turned_back(tmp_path):
     box.invert()
     box.export(tmp_path / "box.stl")
     assert load_mesh(tmp_path / "box.stl").volume == pytest.approx(1.0)
+
+
+def test_a_damaged_byte_anywhere_in_the_cache_is_told_or_harmless(tmp_path):
+    bracket = trimesh.util.concatenate(
+        [trimesh.creation.box([1, 1, 4]), trimesh.creation.box([3, 1, 1])]
+    )
+    decompose(bracket, tmp_path)
+    (path,) = tmp_path.glob("parts-*.npz")
+    whole = path.read_bytes()
+    told = 0
+    for place in range(0, len(whole), 7):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        path.write_bytes(bytes(damaged))
+        try:
+            decompose(bracket, tmp_path)
+        except ObjectError as error:
+            assert path.name in str(error)
+            told += 1
+    assert told > len(whole) / 7 / 2
