@@ -103,6 +103,11 @@ def check_resume(config: Config, run: Path | None) -> None:
     free = {"rounds", "workers", "name", "videos", "gallery", "film_format"}
     before = load_config(run / "config.yaml").model_dump()
     now = config.model_dump()
+    if now["evaluate"]["rounds"] < before["evaluate"]["rounds"]:
+        raise UserError(
+            f"--resume {run}: evaluate.rounds is {now['evaluate']['rounds']}, the run was begun with "
+            f"{before['evaluate']['rounds']}; it can only grow"
+        )
     for plan in (before["evaluate"], now["evaluate"]):
         for key in free:
             plan.pop(key)
