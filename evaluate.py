@@ -105,7 +105,7 @@ def check_resume(config: Config, run: Path | None) -> None:
     now = config.model_dump()
     if now["evaluate"]["rounds"] < before["evaluate"]["rounds"]:
         raise UserError(
-            f"--resume {run}: evaluate.rounds is {now['evaluate']['rounds']}, the run was begun with "
+            f"--resume {run}: evaluate.rounds is {now['evaluate']['rounds']}, the run began with "
             f"{before['evaluate']['rounds']}; it can only grow"
         )
     for plan in (before["evaluate"], now["evaluate"]):
