@@ -8,6 +8,7 @@ This module knows no network and no simulator.
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,8 +95,9 @@ class RealDataset(Sequence[RealSample]):
     def __iter__(self) -> Iterator[RealSample]:
         return (self.read(record) for record in self.records)
 
+    @abstractmethod
     def read(self, record: Record) -> RealSample:
-        raise NotImplementedError
+        """Read one image; raises UserError naming the file that is at fault."""
 
 
 class CornellDataset(RealDataset):
