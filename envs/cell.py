@@ -160,9 +160,17 @@ class Cell:
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:
         """What the configured camera sees now; `with_truth` adds the true geometry."""
-        intrinsics = camera_intrinsics(self.config.camera)
-        T_WC = self.camera_pose()
-        image = render(self.client, intrinsics, T_WC, self.renderer)
+        return self.look(camera_intrinsics(self.config.camera), self.camera_pose(), with_truth)
+
+    def look(
+        self,
+        intrinsics: Intrinsics,
+        T_WC: np.ndarray,
+        with_truth: bool = False,
+        light: dict | None = None,
+    ) -> RGBDFrame:
+        """What a camera at T_WC (4, 4) sees now; `light` as in `envs.camera.render`."""
+        image = render(self.client, intrinsics, T_WC, self.renderer, light)
         truth = self.truth() if with_truth else None
         return RGBDFrame(
             image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
