@@ -1,0 +1,82 @@
+"""GraspNet on disk: the one format that training, planner and `predict.py` share.
+
+A file holds weights, architecture, config and the pixel size of the training images. This module
+knows neither how a network is trained nor what it is used for.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from models.graspnet import GraspNet
+from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.errors import UserError
+
+KIND = "graspnet"  # also of training checkpoints, which hold an optimiser besides
+PIXEL_SIZE = "metres_per_pixel"  # its entry in a checkpoint's `extra`
+
+
+class SavedGraspNet(NamedTuple):
+    """model: in evaluation mode. metres_per_pixel: what one pixel of a training image spans at the
+    image's median depth; convolutions know no other scale. config: the resolved config, plain.
+    extra: anything else plain that was saved, such as metrics."""
+
+    model: GraspNet
+    metres_per_pixel: float
+    config: dict[str, Any]
+    extra: dict[str, Any]
+
+
+def metres_per_pixel(K: np.ndarray, depth: float) -> float:
+    """What one pixel of a camera with matrix K (3, 3) spans at a depth in metres."""
+    return 2 * depth / float(K[0, 0] + K[1, 1])
+
+
+def save_graspnet(
+    path: Path | str,
+    model: GraspNet,
+    metres_per_pixel: float,
+    config: dict[str, Any] | None = None,
+    **extra: Any,
+) -> None:
+    """Write a network for use, without what only training needs.
+
+    model: the bare module, not its DistributedDataParallel. metres_per_pixel, config, extra: see
+    SavedGraspNet. Raises TypeError for what could not be loaded again.
+    """
+    if not 0 < metres_per_pixel < np.inf:
+        raise ValueError(f"metres_per_pixel must be > 0 and finite, got {metres_per_pixel}")
+    save_checkpoint(
+        path,
+        kind=KIND,
+        model_args=model.model_args,
+        model=model,
+        config=config,
+        extra={**extra, PIXEL_SIZE: float(metres_per_pixel)},
+    )
+
+
+def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") -> SavedGraspNet:
+    """The network in a file of `save_graspnet`, or in a training checkpoint of kind `KIND` whose
+    `extra` holds `PIXEL_SIZE`.
+
+    Raises UserError, naming the file, if it is missing, damaged, no GraspNet of ours, of another
+    version or architecture, or holds weights that are not finite.
+    """
+    checkpoint = load_checkpoint(path, KIND, map_location=map_location)
+    try:
+        model = GraspNet(**checkpoint["model_args"])
+    except (TypeError, ValueError, RuntimeError) as error:  # UserError is a ValueError
+        raise UserError(f"{path}: a checkpoint of another architecture: {error}") from None
+    load_weights(model, checkpoint, path)
+    if not all(bool(torch.isfinite(value).all()) for value in model.state_dict().values()):
+        raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
+    extra = dict(checkpoint["extra"])
+    pixel_size = extra.pop(PIXEL_SIZE, None)
+    if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
+        raise UserError(f"{path}: does not say the pixel size it was trained at ({PIXEL_SIZE})")
+    return SavedGraspNet(model.to(map_location).eval(), pixel_size, checkpoint["config"], extra)

@@ -1,0 +1,110 @@
+"""A GraspNet on disk gives the same maps again, and says why where it cannot."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from models.graspnet import GraspNet
+from models.graspnet_io import KIND, load_graspnet, save_graspnet
+from utils.checkpoint import save_checkpoint
+from utils.errors import UserError
+
+PIXEL = 0.8 / 449.21  # m, the default camera: 224 pixels, 28 degrees, 0.8 m
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(0)
+    return GraspNet(max_width=0.08, backbone="ggcnn")
+
+
+def test_round_trip(tmp_path, model):
+    save_graspnet(tmp_path / "net.pt", model, PIXEL, {"seed": 3}, epoch=7)
+    saved = load_graspnet(tmp_path / "net.pt")
+    assert saved.metres_per_pixel == PIXEL
+    assert saved.config == {"seed": 3} and saved.extra == {"epoch": 7}
+    assert saved.model.model_args == model.model_args and not saved.model.training
+    x = torch.rand(2, 4, 36, 40)
+    with torch.no_grad():
+        for ours, theirs in zip(saved.model(x), model.eval()(x)):
+            assert torch.equal(ours, theirs)
+
+
+def test_a_training_checkpoint_loads_too(tmp_path, model):
+    save_checkpoint(
+        tmp_path / "last.pt",
+        kind=KIND,
+        model_args=model.model_args,
+        model=model,
+        optimizer=torch.optim.Adam(model.parameters()),
+        step=5,
+        extra={"metres_per_pixel": PIXEL},
+    )
+    assert load_graspnet(tmp_path / "last.pt").metres_per_pixel == PIXEL
+
+
+def spoil_backbone(content):
+    content["model_args"]["backbone"] = "transformer"
+
+
+def spoil_argument(content):
+    content["model_args"]["depth"] = 3
+
+
+def spoil_bins(content):
+    content["model_args"]["num_angle_bins"] = 12
+
+
+def spoil_version(content):
+    content["format_version"] = 99
+
+
+def spoil_kind(content):
+    content["kind"] = "policy"
+
+
+def spoil_pixel(content):
+    del content["extra"]["metres_per_pixel"]
+
+
+def spoil_weights(content):
+    content["model"]["width_head.bias"][0] = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (spoil_backbone, "another architecture.*transformer"),
+        (spoil_argument, "another architecture"),
+        (spoil_bins, "another architecture"),
+        (spoil_version, "version 99"),
+        (spoil_kind, "kind 'policy'"),
+        (spoil_pixel, "metres_per_pixel"),
+        (spoil_weights, "not finite"),
+    ],
+)
+def test_what_does_not_fit_is_said(tmp_path, model, spoil, message):
+    path = tmp_path / "net.pt"
+    save_graspnet(path, model, PIXEL)
+    content = torch.load(path, weights_only=True)
+    spoil(content)
+    torch.save(content, path)
+    with pytest.raises(UserError, match=message) as caught:
+        load_graspnet(path)
+    assert "net.pt" in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", [0, 1, 1000, -10])
+def test_a_truncated_file_is_said(tmp_path, model, kept):
+    path = tmp_path / "net.pt"
+    save_graspnet(path, model, PIXEL)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(UserError, match="net.pt"):
+        load_graspnet(path)
+
+
+def test_a_pixel_size_of_zero_is_a_bug(tmp_path, model):
+    with pytest.raises(ValueError, match="metres_per_pixel"):
+        save_graspnet(tmp_path / "net.pt", model, 0.0)
+    assert not (tmp_path / "net.pt").exists()
