@@ -342,16 +342,24 @@ def decode_grasps(
     down from the surface point that the pixel shows as the labels say (`grasp_below_surface`), the
     width ends at the gripper's. Peaks without known depth beside them are left out.
     """
-    found = find_peaks(quality, angle, width, peaks)
-    grasps = []
-    for pixel, direction, opening, value, surface in zip(
-        *found, surface_depth(depth, found.pixel).tolist()
-    ):
-        if not np.isnan(surface):
-            opening = min(float(opening), gripper.max_opening)
-            on_image = ImageGrasp(pixel, float(direction), surface, opening, float(value))
-            grasps.append(grasp_below_surface(on_image, K, T_WC, table_height, gripper, labels))
-    return grasps
+    found = surface_grasps(find_peaks(quality, angle, width, peaks), depth, gripper)
+    return [grasp_below_surface(grasp, K, T_WC, table_height, gripper, labels) for grasp in found]
+
+
+def surface_grasps(
+    found: Peaks, depth: np.ndarray, gripper: GripperGeometry = PANDA_HAND, radius: int = 1
+) -> list[ImageGrasp]:
+    """The peaks on the visible surface: with the depth seen around them, and openings that the
+    gripper has. Peaks without known depth within `radius` pixels are left out."""
+    return [
+        ImageGrasp(
+            pixel, float(angle), surface, min(float(width), gripper.max_opening), float(quality)
+        )
+        for pixel, angle, width, quality, surface in zip(
+            *found, surface_depth(depth, found.pixel, radius).tolist()
+        )
+        if not np.isnan(surface)
+    ]
 
 
 def find_peaks(

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy import ndimage
 
 from utils.errors import UserError, unknown_choice
+from utils.image_files import open_image
 from utils.rectangles import GraspRectangle, rectangles_from_corners
 
 MIN_DEPTH, MAX_DEPTH = 0.3, 10.0  # m: outside, a pixel is a hole; a whole image, a unit error
@@ -159,7 +159,7 @@ class JacquardDataset(RealDataset):
         positives = _read_jacquard_rectangles(record.files["_grasps.txt"])
         rgb, depth = _read_rgbd(record.files["_RGB.png"], record.files[self.depth_file])
         mask_file = record.files["_mask.png"]
-        mask = np.asarray(_open_image(mask_file).convert("L")) > 0
+        mask = np.asarray(open_image(mask_file).convert("L")) > 0
         if mask.shape != depth.shape:
             raise UserError(f"{mask_file}: {_size(mask)}, but the colour image is {_size(rgb)}")
         return RealSample(record.name, record.object_id, rgb, depth, positives, object_mask=mask)
@@ -203,8 +203,8 @@ def fill_depth_holes(depth: np.ndarray) -> np.ndarray:
 
 def _read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) uint8 and (H, W) float32 metres without holes."""
-    rgb = np.array(_open_image(rgb_file).convert("RGB"))
-    depth = np.asarray(_open_image(depth_file))
+    rgb = np.array(open_image(rgb_file).convert("RGB"))
+    depth = np.asarray(open_image(depth_file))
     if depth.ndim != 2:
         raise UserError(f"{depth_file}: need one channel of depth, got shape {depth.shape}")
     if depth.shape != rgb.shape[:2]:
@@ -271,15 +271,6 @@ def _read_numbers(file: Path, columns: int, separator: str | None) -> np.ndarray
             raise UserError(f"{file}, line {number}: need {columns} numbers, got {line.strip()!r}")
         rows.append(row)
     return np.array(rows, dtype=float).reshape(-1, columns)
-
-
-def _open_image(file: Path) -> Image.Image:
-    try:
-        with Image.open(file) as image:
-            image.load()
-            return image.copy()
-    except (OSError, SyntaxError, ValueError) as error:  # Pillow raises any of these when cut short
-        raise UserError(f"{file}: not a readable image, or cut short ({error})") from error
 
 
 def _size(image: np.ndarray) -> str:
