@@ -7,6 +7,7 @@ build and observe the world; what to do in it is for others to say.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pybullet
@@ -18,6 +19,7 @@ from envs.panda import Panda, panda_urdf
 from envs.scenes import Scene, settle
 from envs.world import add_bin, add_table, on_table, set_up_physics
 from utils.config import CameraConfig, Config
+from utils.depth_noise import KinectNoise
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.transforms import RGBDFrame, look_at, pose_matrix
@@ -25,6 +27,8 @@ from utils.transforms import RGBDFrame, look_at, pose_matrix
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the game.
 _REACH = 0.63
+# Keeps the depth noise of a seed apart from the scene of the same seed.
+_DEPTH_NOISE_STREAM = 1
 
 
 class PhysicsError(RuntimeError):
@@ -78,6 +82,7 @@ class Cell:
         self._index_of_body = {body: i for i, body in enumerate(self.bodies)}
         self.remaining = set(range(len(self.bodies)))
         self.steps = 0
+        self.frames = 0
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
@@ -159,8 +164,19 @@ class Cell:
         return forward_kinematics(self.robot.q) @ wrist_mount(camera)
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:
-        """What the configured camera sees now; `with_truth` adds the true geometry."""
-        return self.look(camera_intrinsics(self.config.camera), self.camera_pose(), with_truth)
+        """What the configured camera sees now; `with_truth` adds the true geometry.
+
+        `camera.depth_noise` changes the depth alone. It is a function of the scene's seed and the
+        number of frames since it was loaded, so that every policy meets the same.
+        """
+        camera = self.config.camera
+        frame = self.look(camera_intrinsics(camera), self.camera_pose(), with_truth)
+        if camera.depth_noise == "kinect":
+            rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
+            noise = KinectNoise(image_focal=float(frame.K[0, 0]))
+            frame = replace(frame, depth=noise(frame.depth, rng))
+        self.frames += 1
+        return frame
 
     def look(
         self,
@@ -169,7 +185,8 @@ class Cell:
         with_truth: bool = False,
         light: dict | None = None,
     ) -> RGBDFrame:
-        """What a camera at T_WC (4, 4) sees now; `light` as in `envs.camera.render`."""
+        """What a camera at T_WC (4, 4) sees now, without noise; `light` as in
+        `envs.camera.render`."""
         image = render(self.client, intrinsics, T_WC, self.renderer, light)
         truth = self.truth() if with_truth else None
         return RGBDFrame(

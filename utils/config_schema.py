@@ -81,6 +81,7 @@ class CameraConfig(Section):
     up: Vector3
     near: Positive
     far: Positive
+    depth_noise: Literal["none", "kinect"]
     wrist_position: Vector3
     wrist_fov_deg: Annotated[float, Field(ge=1, le=170)]
 
