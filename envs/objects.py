@@ -136,6 +136,20 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
         return self._models[index]
 
 
+class ObjectPart(ObjectSet):
+    """Some objects of a set, given by their numbers there."""
+
+    def __init__(self, whole: ObjectSet, indices: Sequence[int]) -> None:
+        super().__init__(whole.name)
+        self._whole, self._indices = whole, tuple(indices)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def _build(self, index: int) -> ObjectModel:
+        return self._whole[self._indices[index]]
+
+
 def load_object_set(
     name_or_path: str,
     *,

@@ -205,19 +205,24 @@ class Augmentation:
     colour: ColourJitter | None = ColourJitter()
     depth_noise: DepthNoise | None = None
 
-    def draw(self, rng: np.random.Generator, shape: tuple[int, int]) -> Similarity:
-        """The change for an image of shape (H, W); always four draws, whatever the ranges."""
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, int], zoom: float = 1.0
+    ) -> Similarity:
+        """The change for an image of shape (H, W), whose scale is drawn around `zoom`; always the
+        same number of draws, whatever the ranges."""
         turn = rng.uniform(-self.max_turn, self.max_turn)
         if self.turn_step:
             turn = np.round(turn / self.turn_step) * self.turn_step
         dv, du = rng.uniform(-self.max_shift, self.max_shift, size=2) * shape
-        scale = np.exp(rng.uniform(*np.log(self.scale)))
+        scale = zoom * np.exp(rng.uniform(*np.log(self.scale)))
         mirror = rng.random() < self.mirror
         return Similarity(float(turn), (float(du), float(dv)), float(scale), bool(mirror))
 
-    def __call__(self, image: LabelledImage, rng: np.random.Generator) -> LabelledImage:
+    def __call__(
+        self, image: LabelledImage, rng: np.random.Generator, zoom: float = 1.0
+    ) -> LabelledImage:
         """The changed image with its labels; the one given is left as it is."""
-        image = apply_similarity(image, self.draw(rng, tuple(image.depth.shape)))
+        image = apply_similarity(image, self.draw(rng, tuple(image.depth.shape), zoom))
         if self.colour is not None:
             image = replace(image, rgb=self.colour(image.rgb, rng))
         if self.depth_noise is not None:

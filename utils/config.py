@@ -39,6 +39,7 @@ from utils.config_schema import (
     RobotConfig,
     SceneConfig,
     SimConfig,
+    TrainConfig,
     WorkspaceConfig,
 )
 from utils.errors import UserError, did_you_mean
@@ -56,6 +57,7 @@ __all__ = [
     "RobotConfig",
     "SceneConfig",
     "SimConfig",
+    "TrainConfig",
     "WorkspaceConfig",
     "changed_keys",
     "dump_config",

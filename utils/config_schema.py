@@ -140,6 +140,44 @@ class EvaluateConfig(Section):
     name: Name | None
 
 
+class DataConfig(Section):
+    kind: Literal["simulated", "cornell", "jacquard"]
+    root: Annotated[Path, Field(strict=False)] | None
+    frames: Count
+    validation_frames: Count
+    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
+    max_objects: Annotated[int, Field(ge=2, le=12)]
+    randomise: bool
+    executed_share: Annotated[float, Field(ge=0, le=1)]
+    workers: Count | None
+
+    @model_validator(mode="after")
+    def _real_data_have_a_root(self) -> DataConfig:
+        if self.kind != "simulated" and self.root is None:
+            raise ValueError(f"kind {self.kind} needs root, the folder that holds the data set")
+        return self
+
+
+class TrainConfig(Section):
+    backbone: Name
+    max_width: Positive
+    initial: Annotated[Path, Field(strict=False)] | None
+    epochs: Count
+    batch_size: Count
+    lr: Positive
+    weight_decay: Annotated[float, Field(ge=0)]
+    warmup_share: Annotated[float, Field(ge=0, lt=1)]
+    quality_weight: Annotated[float, Field(ge=0)]
+    angle_weight: Annotated[float, Field(ge=0)]
+    width_weight: Annotated[float, Field(ge=0)]
+    graspable_from: Share
+    depth_noise_share: Annotated[float, Field(ge=0, le=1)]
+    precision: Literal["auto", "float32", "bfloat16", "float16"]
+    device: Name
+    workers: Annotated[int, Field(ge=0)] | None
+    name: Name | None
+
+
 class EnvConfig(Section):
     observations: Annotated[
         tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(_no_repeats)
@@ -171,6 +209,8 @@ class Config(Section):
     objects: ObjectsConfig
     scene: SceneConfig
     execution: ExecutionConfig
+    data: DataConfig
+    train: TrainConfig
     evaluate: EvaluateConfig
     env: EnvConfig
 

@@ -1,0 +1,233 @@
+"""Simulated grasp data: seeded scenes in the cell, photographed, labelled, and partly executed.
+
+Every shard is a pure function of the config, the split and its number; worker processes write
+them one by one, so an interrupted generation goes on with the shards that are missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from tqdm import tqdm
+
+from envs.appearance import Appearance, draw_camera
+from envs.cell import Cell, camera_intrinsics
+from envs.execution import execute_grasp
+from envs.objects import ObjectPart, ObjectSet, load_object_set
+from envs.scenes import LAYOUTS, Scene, SceneError, make_scene
+from utils.config import Config, dump_config, with_settings
+from utils.errors import UserError
+from utils.files import write_atomic
+from utils.geometry import GripperGeometry, Workspace
+from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
+from utils.grasp_labels import dense_labels
+from utils.label_trials import Trial, draw_pairs
+
+SPLITS = ("train", "validation")
+HELD_OUT = 10  # every tenth training object is kept for validation
+FRAMES_PER_SCENE = 4  # the whole scene, then parts of it as they are met on the way to clearing it
+SCENES_PER_SHARD = 8
+_LAYOUT_SHARES = {"isolated": 0.15, "packed": 0.35, "pile": 0.5}
+_FIRST_SEED = {"train": 1_000_000_000, "validation": 2_000_000_000}  # never met in evaluation
+
+
+def data_folder(config: Config, root: Path = Path("data")) -> Path:
+    """Where the simulated data of a config lies: named by what its content depends on."""
+    if config.data.root is not None:
+        return config.data.root
+    return root / f"simulated-{hashlib.sha256(_content(config).encode()).hexdigest()[:8]}"
+
+
+def _content(config: Config) -> str:
+    """What one shard depends on, as YAML; how many shards there are does not belong to it."""
+    everything = config.model_dump(mode="json")
+    chosen = {key: everything[key] for key in ("seed", "sim", "camera", "workspace", "scene")}
+    chosen["camera"].pop("depth_noise")  # images are stored clean
+    chosen["objects"] = everything["objects"] | {"split": "train"}
+    data = everything["data"]
+    chosen["data"] = {
+        key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")
+    }
+    return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
+
+
+def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
+    """Write the shards that the data set of a config still lacks; returns its folder.
+
+    rank, ranks: this process makes every ranks-th shard (`torchrun`).
+    Raises UserError if the folder holds data of another config, or a worker died.
+    """
+    folder = data_folder(config)
+    _claim(folder, config)
+    missing = [
+        (split, number)
+        for split in SPLITS
+        for number in range(shard_count(config, split))
+        if not shard_path(folder, split, number).exists()
+    ][rank::ranks]
+    if not missing:
+        return folder
+    workers = min(config.data.workers or os.cpu_count() or 1, len(missing))
+    pool = ProcessPoolExecutor(
+        workers,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(config,),
+    )
+    jobs = []
+    try:
+        with (
+            pool,
+            tqdm(
+                total=len(missing) * SCENES_PER_SHARD * FRAMES_PER_SCENE, unit="frame", desc="data"
+            ) as progress,
+        ):
+            try:
+                jobs = [pool.submit(_make_shard, folder, *job) for job in missing]
+                for job in as_completed(jobs):
+                    progress.update(job.result())
+            except KeyboardInterrupt:
+                progress.write("interrupted: finishing the shards under way")
+                pool.shutdown(cancel_futures=True)
+                raise
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a worker process died (out of memory?); what is done is safe in {folder}: start "
+            "again, perhaps with data.workers=1"
+        ) from error
+    return folder
+
+
+def shard_count(config: Config, split: str) -> int:
+    """Shards that hold at least the configured number of frames."""
+    frames = config.data.frames if split == "train" else config.data.validation_frames
+    return -(-frames // (FRAMES_PER_SCENE * SCENES_PER_SHARD))
+
+
+def _claim(folder: Path, config: Config) -> None:
+    """Make the folder, or raise UserError if it holds something else."""
+    content, mark = _content(config), folder / "content.yaml"
+    if mark.exists():
+        if mark.read_text(encoding="utf-8") != content:
+            raise UserError(
+                f"data.root {folder}: holds data made with other settings (see {mark}); choose "
+                "another folder, or leave data.root out"
+            )
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"data.root {folder}: not empty and no data set; choose another folder")
+    write_atomic(folder / "config.yaml", dump_config(config))
+    write_atomic(mark, content)
+
+
+# --- In a worker process --------------------------------------------------------------------
+
+_worker_config: Config
+_worker_cell: Cell
+_worker_sets: dict[tuple[str, str], ObjectSet]
+
+
+def _start_worker(config: Config) -> None:
+    global _worker_config, _worker_cell, _worker_sets
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    cv2.setNumThreads(1)  # the workers fill the cores
+    _worker_config, _worker_cell = config, Cell(config)
+    _worker_sets = object_sets(config)
+
+
+def _make_shard(folder: Path, split: str, number: int) -> int:
+    frames: list[LabelledFrame] = []
+    trials: list[Trial] = []
+    first = number * SCENES_PER_SHARD
+    for scene_number in range(first, first + SCENES_PER_SHARD):
+        seed = _FIRST_SEED[split] + scene_number
+        scene, name = draw_scene(_worker_config, split, seed, _worker_sets, _worker_cell)
+        for frame, more_trials in label_scene(_worker_config, scene, name, _worker_cell):
+            frames.append(frame)
+            trials += more_trials
+    write_shard(shard_path(folder, split, number), frames, trials)
+    return len(frames)
+
+
+def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
+    """The training objects of each set, parted: (set, split) -> objects. No test object."""
+    parts = {}
+    settings = config.objects.model_dump() | {"split": "train"}
+    for name in config.data.object_sets:
+        whole = load_object_set(name, cache_dir=config.cache_folder, **settings)
+        held_out = set(range(0, len(whole), HELD_OUT))
+        parts[name, "validation"] = ObjectPart(whole, sorted(held_out))
+        parts[name, "train"] = ObjectPart(whole, sorted(set(range(len(whole))) - held_out))
+    return parts
+
+
+def draw_scene(
+    config: Config, split: str, seed: int, sets: dict[tuple[str, str], ObjectSet], cell: Cell
+) -> tuple[Scene, str]:
+    """A scene of random layout, object set and number of objects, and the name of its set."""
+    rng = np.random.default_rng([config.seed, seed])
+    while True:
+        layout = LAYOUTS[rng.choice(len(LAYOUTS), p=[_LAYOUT_SHARES[name] for name in LAYOUTS])]
+        name = config.data.object_sets[rng.integers(len(config.data.object_sets))]
+        count = int(rng.integers(2, config.data.max_objects + 1))
+        crowded = with_settings(config, "scene", {"count": count})
+        try:
+            scene_seed = int(rng.integers(2**62))
+            scene = make_scene(layout, sets[name, split], scene_seed, crowded, cell.client)
+        except SceneError:  # too many for this layout: another draw, from the same generator
+            continue
+        return Scene(layout, seed, scene.placements), name
+
+
+def label_scene(
+    config: Config, scene: Scene, set_name: str, cell: Cell
+) -> Iterator[tuple[LabelledFrame, list[Trial]]]:
+    """Labelled frames of a scene and of random parts of it, some with trials of their labels."""
+    rng = np.random.default_rng([config.seed, scene.seed, 1])
+    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    configured = cell.config.camera
+    for number in range(FRAMES_PER_SCENE):
+        part = _part(scene, rng) if number else scene
+        cell.load(part)
+        look = Appearance.draw(rng, len(part.placements))
+        intrinsics, T_WC = draw_camera(rng, configured)
+        if not config.data.randomise:
+            look = Appearance()
+            intrinsics, T_WC = camera_intrinsics(configured), cell.camera_pose()
+        look.paint(cell)
+        frame = look.photograph(cell, intrinsics, T_WC, rng)
+        labels = dense_labels(frame, GripperGeometry(), workspace)
+        trials = []
+        if rng.random() < config.data.executed_share:
+            trials = execute_pairs(cell, part, frame, labels, rng)
+        yield (
+            LabelledFrame(frame, labels, f"{scene.layout} {set_name} {scene.seed}"),
+            trials,
+        )
+
+
+def _part(scene: Scene, rng: np.random.Generator) -> Scene:
+    """A scene without up to three of its objects; at least one stays."""
+    total = len(scene.placements)
+    count = int(rng.integers(max(total - 3, 1), total + 1))
+    kept = np.sort(rng.choice(total, count, replace=False))
+    return Scene(scene.layout, scene.seed, tuple(scene.placements[i] for i in kept))
+
+
+def execute_pairs(cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator) -> list[Trial]:
+    """Carry out labelled pairs of every quality, each on the scene freshly loaded."""
+    trials = []
+    for grasp, quality, weight in draw_pairs(frame, labels, rng):
+        cell.load(scene)
+        trials.append(Trial(quality, weight, execute_grasp(cell, grasp).success))
+    return trials

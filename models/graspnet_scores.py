@@ -1,0 +1,79 @@
+"""How good a network's grasps are by the dense labels of images that it was not trained on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from models.grasp_examples import LabelledImages
+from models.graspnet import GraspNet, Peaks, PeakSettings, find_peaks, to_input
+from utils.augmentation import LabelledImage
+from utils.grasp_labels import LabelSettings
+from utils.transforms import angle_difference
+
+BEST = PeakSettings(threshold=0.0, count=1)
+
+
+class LabelScores(NamedTuple):
+    """Of the top grasps of N images that have something to grasp.
+
+    label_quality: mean label of the grasp's pixel and angle bin, 0 where none is feasible.
+    precision: share whose label counts as positive. angle_error: mean, radians, to the nearest
+    positive label (nearest in the image; of its angles the nearest). width_error: mean, metres, to
+    the width of that label. distance: mean, pixels, to it. images: N.
+    """
+
+    label_quality: float
+    precision: float
+    angle_error: float
+    width_error: float
+    distance: float
+    images: int
+
+
+@torch.inference_mode()
+def predict(model: GraspNet, image: LabelledImage) -> tuple[torch.Tensor, ...]:
+    """The network's maps (1, C, H, W) of one labelled image."""
+    device = next(model.parameters()).device
+    rgb = np.ascontiguousarray(image.rgb.permute(1, 2, 0).numpy())
+    x = to_input(rgb, image.depth.numpy())[None].to(device, memory_format=torch.channels_last)
+    return model(x)
+
+
+def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
+    """Top grasps against dense labels; the model is left in evaluation mode."""
+    model.eval()
+    rows = []
+    for index in range(len(images)):
+        image = images[index]
+        if (image.quality >= LabelSettings().positive).any():
+            found = find_peaks(*predict(model, image), BEST)
+            rows.append(score_peak(found, image))
+    if not rows:
+        return LabelScores(0.0, 0.0, np.pi / 2, float("nan"), float("nan"), 0)
+    quality, angle, width, distance = np.array(rows).T
+    precision = float((quality >= LabelSettings().positive).mean())
+    return LabelScores(
+        float(quality.mean()), precision, float(angle.mean()), float(width.mean()),
+        float(distance.mean()), len(rows),
+    )  # fmt: skip
+
+
+def score_peak(found: Peaks, image: LabelledImage) -> tuple[float, float, float, float]:
+    """Label quality, angle error, width error and distance of the first peak."""
+    bins = image.quality.shape[0]
+    centres = np.arange(bins) * np.pi / bins
+    (u, v), angle, width = found.pixel[0], found.angle[0], found.width[0]
+    row, column = (int(np.clip(round(x), 0, n - 1)) for x, n in zip((v, u), image.depth.shape))
+    nearest_bin = int(angle_difference(centres, angle).argmin())
+    label = float(image.quality[nearest_bin, row, column])
+
+    k, rows, columns = np.nonzero(image.quality.numpy() >= LabelSettings().positive)
+    distance = np.hypot(rows - v, columns - u)
+    beside = np.flatnonzero(distance <= max(distance.min(), 1.0))  # within one pixel: all angles
+    turn = angle_difference(centres[k[beside]], angle)
+    best = beside[turn.argmin()]
+    labelled_width = float(image.width[k[best], rows[best], columns[best]])
+    return label, float(turn.min()), abs(float(width) - labelled_width), float(distance.min())

@@ -1,0 +1,205 @@
+"""Training steps of GraspNet: precision, schedule, checkpoints that resume exactly, many processes.
+
+Knows neither where batches come from nor how a trained network is judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from models.grasp_examples import Example
+from models.graspnet import GraspLoss, GraspNet
+from models.graspnet_io import KIND, PIXEL_SIZE
+from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
+from utils.config import Config, TrainConfig
+from utils.errors import UserError
+
+GRADIENT_LIMIT = 5.0  # of the gradient's norm; only the first steps ever reach it
+
+
+class Team(NamedTuple):
+    """The processes that train together: this one's rank, how many there are, its device."""
+
+    rank: int
+    ranks: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes files and prints."""
+        return self.rank == 0
+
+    def wait(self) -> None:
+        """Until all have come here."""
+        if self.ranks > 1:
+            dist.barrier()
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in any process."""
+        if self.ranks == 1:
+            return flag
+        found = torch.tensor(float(flag), device=self.device)
+        dist.all_reduce(found, dist.ReduceOp.MAX)
+        return bool(found)
+
+    def broadcast(self, value: Any) -> Any:
+        """The first process's value, for all."""
+        holder = [value]
+        if self.ranks > 1:
+            dist.broadcast_object_list(holder, src=0)
+        return holder[0]
+
+
+@contextmanager
+def team(device: str, environment: dict[str, str]) -> Iterator[Team]:
+    """This process's place among those that `torchrun` started (its variables in `environment`),
+    or alone. device: auto | cpu | cuda | cuda:N; auto takes a GPU where there is one."""
+    ranks = int(environment.get("WORLD_SIZE", 1))
+    local = int(environment.get("LOCAL_RANK", 0))
+    chosen = choose_device(device, local)
+    if ranks == 1:
+        yield Team(0, 1, chosen)
+        return
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    try:
+        yield Team(dist.get_rank(), ranks, chosen)
+    finally:
+        dist.destroy_process_group()
+
+
+def choose_device(name: str, local_rank: int = 0) -> torch.device:
+    """The torch device of that name; UserError if it does not exist here."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UserError(f"train.device: {name!r} is no device; use auto, cpu or cuda") from None
+    if device.type == "cuda":
+        count = torch.cuda.device_count()
+        index = local_rank if device.index is None else device.index
+        if index >= count:
+            raise UserError(
+                f"train.device={name}: this machine has {count} CUDA GPUs; use train.device=auto"
+            )
+        device = torch.device("cuda", index)
+    return device
+
+
+def choose_precision(name: str, device: torch.device) -> torch.dtype:
+    """What matrix products are computed in. auto: float16 on a GPU, bfloat16 on a CPU that has
+    instructions for it, else float32."""
+    if name != "auto":
+        return getattr(torch, name)
+    if device.type == "cuda":
+        return torch.float16
+    has_bfloat16 = torch.cpu.get_capabilities().get("avx512_bf16", False)
+    return torch.bfloat16 if has_bfloat16 else torch.float32
+
+
+def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
+    """Factor on the learning rate: up in a line, then down to 0 as a half cosine (Loshchilov and
+    Hutter 2017, without restarts)."""
+    warmup = warmup_share * total
+    if step < warmup:
+        return (step + 1) / (warmup + 1)
+    return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))
+
+
+class Trainer:
+    """A network in training.
+
+    total_steps: length of the schedule. model is the bare network; gradients are averaged over the
+    processes of `team`, so that together they take the step of the joint batch (with
+    batch-normalisation statistics of each process's part, except on GPUs).
+    """
+
+    def __init__(self, model: GraspNet, settings: TrainConfig, total_steps: int, team: Team):
+        self.settings, self.team, self.total_steps, self.step = settings, team, total_steps, 0
+        self.precision = choose_precision(settings.precision, team.device)
+        model = model.to(team.device, memory_format=torch.channels_last)
+        self.model, self._parallel = model, model
+        if team.ranks > 1:
+            if team.device.type == "cuda":
+                model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
+                self.model = model
+            self._parallel = DistributedDataParallel(model)
+        self.loss = GraspLoss(settings.quality_weight, settings.angle_weight, settings.width_weight)
+        self.optimizer = torch.optim.AdamW(
+            model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
+        )
+        self.scheduler = torch.optim.lr_scheduler.LambdaLR(
+            self.optimizer,
+            lambda step: warm_up_and_cosine(step, total_steps, settings.warmup_share),
+        )
+        self.scaler = torch.amp.GradScaler(
+            team.device.type, enabled=self.precision == torch.float16
+        )
+
+    def train_step(self, batch: Example) -> dict[str, float]:
+        """One optimiser step; the loss and its parts. UserError if the loss is not finite."""
+        self._parallel.train()
+        total, parts = self.losses(batch)
+        if not torch.isfinite(total):
+            raise UserError(
+                f"the loss is {total.item()} at step {self.step}; the weights of the last "
+                "checkpoint are sound: lower train.lr or use train.precision=float32"
+            )
+        self.optimizer.zero_grad(set_to_none=True)
+        self.scaler.scale(total).backward()
+        self.scaler.unscale_(self.optimizer)
+        nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_LIMIT)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        self.scheduler.step()
+        self.step += 1
+        return {"loss": total.item(), **{name: value.item() for name, value in parts.items()}}
+
+    def losses(self, batch: Example) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """The loss of a batch and its parts, in the chosen precision."""
+        device = self.team.device
+        image = batch.image.to(device, memory_format=torch.channels_last, non_blocking=True)
+        targets = type(batch.targets)(*(t.to(device, non_blocking=True) for t in batch.targets))
+        mixed = self.precision != torch.float32
+        with torch.autocast(device.type, dtype=self.precision, enabled=mixed):
+            predicted = self._parallel(image, logits=True)
+        return self.loss(*predicted, targets)
+
+    def save(self, path: Path, config: Config, metres_per_pixel: float, **extra: Any) -> None:
+        """Everything that `load` needs to go on as if nothing had happened."""
+        save_checkpoint(
+            path,
+            kind=KIND,
+            model_args=self.model.model_args,
+            model=self.model,
+            optimizer=self.optimizer,
+            scheduler=self.scheduler,
+            step=self.step,
+            rng=rng_states({}),
+            config=config.model_dump(mode="json"),
+            extra={PIXEL_SIZE: metres_per_pixel, "scaler": self.scaler.state_dict(), **extra},
+        )
+
+    def load(self, path: Path) -> dict[str, Any]:
+        """Go on from a checkpoint of `save`; returns its extra entries."""
+        checkpoint = load_checkpoint(
+            path, KIND, model_args=self.model.model_args, map_location=self.team.device
+        )
+        if checkpoint["optimizer"] is None:
+            raise UserError(f"{path}: holds weights only, no training to go on with")
+        load_weights(self.model, checkpoint, path)
+        self.optimizer.load_state_dict(checkpoint["optimizer"])
+        self.scheduler.load_state_dict(checkpoint["scheduler"])
+        self.scaler.load_state_dict(checkpoint["extra"]["scaler"])
+        self.step = checkpoint["step"]
+        restore_rng(checkpoint["rng"], {})
+        return checkpoint["extra"]

@@ -1,0 +1,78 @@
+"""What GraspNet learns from and is judged by while it learns, for each kind of data.
+
+Knows how images become examples; not how the simulated ones are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from models.grasp_examples import AtPixelSize, GraspExamples, LabelledImages
+from models.graspnet import GraspNet
+from models.graspnet_scores import score_labels
+from utils.augmentation import Augmentation
+from utils.config import Config
+from utils.depth_noise import KinectNoise
+from utils.grasp_data import SimulatedDataset
+from utils.grasp_labels import ANGLE_BINS
+
+CROP = 160  # pixels, side of a training example: all context that the network uses, half the work
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """train, validation: what to learn from and what to choose the checkpoint by. score: of a
+    network on the validation images, by name. chosen_by: the score of which higher is better.
+    metres_per_pixel: the scale of all images.
+    """
+
+    train: GraspExamples
+    validation: LabelledImages
+    score: Callable[[GraspNet], dict[str, float]]
+    chosen_by: str
+    metres_per_pixel: float
+
+
+def simulated_data(config: Config, folder: Path, focal: float, distance: float) -> TrainingData:
+    """Simulated images as a camera of focal length `focal` pixels sees the table from `distance`
+    metres; judged by the dense labels of held-out objects."""
+    metres_per_pixel = distance / focal
+    train, validation = (
+        AtPixelSize(SimulatedDataset(folder, split, frames), metres_per_pixel)
+        for split, frames in (
+            ("train", config.data.frames),
+            ("validation", config.data.validation_frames),
+        )
+    )
+    augmentation = Augmentation(
+        turn_step=np.pi / ANGLE_BINS,  # whole bins are quick; the cameras' own turns fill the gaps
+        max_shift=0.0,  # the crop shifts
+        scale=(0.97, 1.03),
+        depth_noise=NoisyShare(config.train.depth_noise_share, KinectNoise(image_focal=focal)),
+    )
+    settings = config.train
+    examples = GraspExamples(train, config.seed, settings.graspable_from, augmentation, CROP)
+    return TrainingData(
+        examples,
+        validation,
+        lambda model: score_labels(model, validation)._asdict(),
+        "label_quality",
+        metres_per_pixel,
+    )
+
+
+@dataclass(frozen=True)
+class NoisyShare:
+    """Depth noise of a structured-light camera on a share of the images."""
+
+    share: float
+    noise: KinectNoise
+
+    def __call__(self, depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+        noisy = rng.random() < self.share
+        return self.noise.on_tensor(depth, rng) if noisy else depth

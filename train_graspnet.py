@@ -1,0 +1,239 @@
+"""Train GraspNet: simulated data (made first if they are not there), checkpoints, curves, pictures.
+
+    python train_graspnet.py
+    python train_graspnet.py --config configs/quick.yaml
+    python train_graspnet.py train.backbone=ggcnn data.frames=2000
+    torchrun --nproc_per_node=2 train_graspnet.py
+
+Leaves best.pt (chosen on held-out training objects), last.pt, graspnet.pt (the best one's weights
+alone), results.json, curves.png, predictions.png and TensorBoard events in
+runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it was, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from envs.cell import camera_intrinsics
+from envs.data_generation import generate
+from models.grasp_examples import EpochBatches
+from models.graspnet import create_model
+from models.graspnet_io import KIND, load_graspnet, save_graspnet
+from models.graspnet_pictures import draw_curves, draw_predictions
+from models.graspnet_training import Team, Trainer, team
+from models.training_data import TrainingData, simulated_data
+from utils.checkpoint import load_checkpoint, load_weights
+from utils.config import Config, load_config, parse_args, run_script
+from utils.errors import UserError
+from utils.grasp_data import read_trials
+from utils.label_trials import label_truth
+from utils.results import write_json_atomic
+from utils.runs import git_state, new_run_folder
+
+SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
+FREE_TO_CHANGE = (("train", "name"), ("train", "device"), ("train", "workers"), ("data", "workers"))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    config, options = parse_args(argv, "Train GraspNet.")
+    check_resume(config, options.resume)
+    with team(config.train.device, dict(os.environ)) as us:
+        data = make_data(config, us)
+        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
+        trainer = make_trainer(config, data, us)
+        history = trainer.load(run / "last.pt")["history"] if options.resume else []
+        if us.leads:
+            announce(config, run, data, trainer)
+
+        finished = train(config, run, data, trainer, history)
+
+        if us.leads:
+            save_results(config, run, data, history)
+            if not finished:
+                print(f"stopped after {trainer.step} steps; go on with --resume {run}")
+    return 0 if finished else 130
+
+
+def check_resume(config: Config, run: Path | None) -> None:
+    """Raise UserError if a run cannot be gone on with, or not with this config."""
+    if run is None:
+        return
+    if not (run / "last.pt").is_file():
+        raise UserError(f"--resume {run}: no last.pt in there; start a new run")
+    before, now = (c.model_dump() for c in (load_config(run / "config.yaml"), config))
+    for section, key in FREE_TO_CHANGE:
+        before[section].pop(key), now[section].pop(key)
+    if before != now:
+        free = ", ".join(".".join(key) for key in FREE_TO_CHANGE)
+        raise UserError(
+            f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
+            "for anything else, from its weights with train.initial"
+        )
+
+
+def make_data(config: Config, us: Team) -> TrainingData:
+    """What to train on; simulated images are made here as far as they lack."""
+    folder = generate(config, us.rank, us.ranks)
+    us.wait()
+    truth = label_truth(read_trials(folder))
+    if us.leads and truth.positives:
+        low, high = truth.precision_ci95
+        print(
+            f"labels against physics: {truth.executed} executed, precision "
+            f"{100 * truth.precision:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of "
+            f"{truth.positives} positive ones, recall {100 * truth.recall_weighted:.0f} %"
+        )
+    camera = config.camera
+    focal, distance = camera_intrinsics(camera).K[0, 0], math.dist(camera.position, camera.target)
+    return simulated_data(config, folder, float(focal), distance)
+
+
+def open_run(config: Config) -> str:
+    return str(new_run_folder("train_graspnet", config.train.name, config))
+
+
+def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
+    """A new network, or one that starts from train.initial, and its optimiser."""
+    torch.manual_seed(config.seed)
+    model = create_model(name=config.train.backbone, max_width=config.train.max_width)
+    if config.train.initial is not None:
+        load_weights(model, load_checkpoint(config.train.initial, KIND), config.train.initial)
+    total_steps = steps_per_epoch(config, data) * config.train.epochs
+    return Trainer(model, config.train, total_steps, us)
+
+
+def steps_per_epoch(config: Config, data: TrainingData) -> int:
+    batch = config.train.batch_size
+    if len(data.train) < batch:
+        raise UserError(f"train.batch_size is {batch}, but there are only {len(data.train)} images")
+    return len(data.train) // batch
+
+
+def announce(config: Config, run: Path, data: TrainingData, trainer: Trainer) -> None:
+    parameters = sum(p.numel() for p in trainer.model.parameters())
+    print(
+        f"GraspNet {config.train.backbone}, {parameters:,} parameters, on {len(data.train)} "
+        f"{config.data.kind} images for {config.train.epochs} epochs, {trainer.team.ranks} "
+        f"process(es), {trainer.team.device}, {str(trainer.precision).removeprefix('torch.')}, "
+        f"seed {config.seed}; results in {run}",
+        flush=True,
+    )
+
+
+def train(
+    config: Config, run: Path, data: TrainingData, trainer: Trainer, history: list[dict]
+) -> bool:
+    """Train to the end of the schedule, or until Ctrl-C; whether the end was reached.
+
+    history gets a row an epoch: mean losses and the scores on the validation images.
+    """
+    us, steps = trainer.team, steps_per_epoch(config, data)
+    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if us.leads else None
+    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not us.leads)
+    last_save = time.monotonic()
+    with stop_on_interrupt() as interrupted, bar:
+        while trainer.step < trainer.total_steps:
+            epoch, skip = divmod(trainer.step, steps)
+            losses = []
+            for batch in batches(config, data, trainer.team, epoch, skip):
+                losses.append(trainer.train_step(batch))
+                bar.update()
+                bar.set_postfix(loss=f"{losses[-1]['loss']:.3f}", epoch=epoch + 1)
+                if us.any(interrupted.is_set()):
+                    save_last(run, config, data, trainer, history)
+                    return False
+                if time.monotonic() - last_save > SAVE_SECONDS:
+                    save_last(run, config, data, trainer, history)
+                    last_save = time.monotonic()
+            if us.leads:
+                row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
+                row |= data.score(trainer.model)
+                history.append(row)
+                if row[data.chosen_by] == max(old[data.chosen_by] for old in history):
+                    trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
+                save_last(run, config, data, trainer, history)
+                for name, value in row.items():
+                    writer.add_scalar(name, value, trainer.step)
+                writer.add_scalar("lr", trainer.scheduler.get_last_lr()[0], trainer.step)
+                writer.flush()
+                bar.write(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+            us.wait()
+    return True
+
+
+def batches(config: Config, data: TrainingData, us: Team, epoch: int, skip: int) -> DataLoader:
+    """This process's part of the batches of one epoch from number `skip` on."""
+    sampler = EpochBatches(
+        len(data.train), config.train.batch_size, config.seed, epoch, skip, us.rank, us.ranks
+    )
+    workers = config.train.workers
+    workers = max(1, (os.cpu_count() or 1) // us.ranks) if workers is None else workers
+    return DataLoader(
+        data.train,
+        batch_sampler=sampler,
+        num_workers=workers,
+        worker_init_fn=ignore_interrupt,
+        pin_memory=us.device.type == "cuda",
+    )
+
+
+def save_last(
+    run: Path, config: Config, data: TrainingData, trainer: Trainer, history: list[dict]
+) -> None:
+    if trainer.team.leads:
+        trainer.save(run / "last.pt", config, data.metres_per_pixel, history=history)
+
+
+def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Event]:
+    """An event that Ctrl-C sets, so that a step is never left half done."""
+    interrupted = Event()
+    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def ignore_interrupt(worker: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+
+
+def save_results(config: Config, run: Path, data: TrainingData, history: list[dict]) -> None:
+    """The best network alone, its scores, and pictures of how it came about and what it does."""
+    if not history:  # stopped within the first epoch
+        return
+    best = load_graspnet(run / "best.pt")
+    scores = best.extra["history"][-1]
+    save_graspnet(
+        run / "graspnet.pt", best.model, best.metres_per_pixel, best.config, scores=scores
+    )
+    results = {"schema": 1, "commit": git_state().commit, "best": scores, "history": history}
+    write_json_atomic(run / "results.json", results)
+    draw_curves(run / "curves.png", history)
+    draw_predictions(run / "predictions.png", best.model, data.validation)
+    print(
+        f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}; "
+        f"weights in {run / 'graspnet.pt'}"
+    )
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,157 @@
+"""Simulated grasp data on disk: HDF5 shards of labelled RGB-D frames, and the data set over them.
+
+A data set is a folder with `config.yaml` and the folders `train` and `validation` of numbered
+shards. A shard is written whole or not at all, so whatever is there is good and an interrupted
+generation goes on with what is missing. This module knows no simulator and no network.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from utils.augmentation import LabelledImage
+from utils.errors import UserError
+from utils.files import write_atomic
+from utils.grasp_labels import GraspLabels
+from utils.label_trials import Trial
+from utils.transforms import RGBDFrame
+
+FORMAT_VERSION = 1
+_DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
+_WIDTH_UNIT = 0.08 / 255  # metres; the Panda hand opens 0.08 m
+_QUALITY_UNIT = 1 / 255
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """One frame with its dense labels. scene: "pile random_urdfs 17" (layout, objects, seed)."""
+
+    frame: RGBDFrame
+    labels: GraspLabels
+    scene: str
+
+
+def shard_path(folder: Path, split: str, number: int) -> Path:
+    return Path(folder) / split / f"{number:05d}.h5"
+
+
+def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Trial]) -> None:
+    """Write labelled frames, and the label trials made on them, as one HDF5 file.
+
+    Depth, quality and width are stored as whole numbers of their attribute `unit`.
+    """
+    stacked = {
+        "rgb": np.stack([f.frame.rgb for f in frames]),
+        "depth": _whole([f.frame.depth for f in frames], _DEPTH_UNIT, np.uint16),
+        "quality": _whole([f.labels.quality for f in frames], _QUALITY_UNIT, np.uint8),
+        "width": _whole([f.labels.width for f in frames], _WIDTH_UNIT, np.uint8),
+        "valid": np.stack([f.labels.valid for f in frames]),
+    }
+    units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": _WIDTH_UNIT}
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file.attrs["format_version"] = FORMAT_VERSION
+        for name, values in stacked.items():
+            # One chunk a frame: frames are read singly and at random.
+            data = file.create_dataset(
+                name, data=values, chunks=(1, *values.shape[1:]), compression="lzf", shuffle=True
+            )
+            if name in units:
+                data.attrs["unit"] = units[name]
+        file["K"] = np.stack([f.frame.K for f in frames])
+        file["T_WC"] = np.stack([f.frame.T_WC for f in frames])
+        file["scene"] = [f.scene for f in frames]
+        file["trials"] = np.array([(t.quality, t.weight, t.success) for t in trials]).reshape(-1, 3)
+    write_atomic(path, buffer.getvalue())
+
+
+def _whole(values: Sequence[np.ndarray], unit: float, kind: type) -> np.ndarray:
+    scaled = np.rint(np.stack(values) / unit)
+    return np.clip(scaled, 0, np.iinfo(kind).max).astype(kind)
+
+
+def read_trials(folder: Path, split: str = "train") -> list[Trial]:
+    """All label trials of a data set."""
+    trials = []
+    for path in sorted((Path(folder) / split).glob("*.h5")):
+        with _open(path) as file:
+            trials += [Trial(float(q), float(w), bool(s)) for q, w, s in file["trials"][:]]
+    return trials
+
+
+class SimulatedDataset(Dataset):
+    """The labelled frames of one split as `LabelledImage`s, read one at a time.
+
+    frames: at most as many; None for all. cameras: K (3, 3) and T_WC (4, 4) of each frame; scenes:
+    what each shows, e.g. "pile random_urdfs 17": layout, object set and scene seed.
+    Raises UserError if there are none, or a shard is damaged or of another format.
+    """
+
+    def __init__(self, folder: Path, split: str, frames: int | None = None):
+        self.folder = Path(folder) / split
+        self.paths = sorted(self.folder.glob("*.h5"))
+        if not self.paths:
+            raise UserError(f"{self.folder}: no .h5 shards; generate the data first")
+        self._place: list[tuple[int, int]] = []  # (shard, frame) of every index
+        self.cameras: list[tuple[np.ndarray, np.ndarray]] = []
+        self.scenes: list[str] = []
+        for shard, path in enumerate(self.paths):
+            with _open(path) as file:
+                self._place += [(shard, i) for i in range(len(file["depth"]))]
+                self.cameras += zip(file["K"][:], file["T_WC"][:])
+                self.scenes += list(file["scene"].asstr()[:])
+        self._length = min(len(self._place), frames or len(self._place))
+        self._files: dict[int, h5py.File] = {}
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        file, i = self._at(index)
+        return LabelledImage(
+            rgb=torch.from_numpy(np.moveaxis(file["rgb"][i], -1, 0).copy()),
+            depth=torch.from_numpy(file["depth"][i].astype(np.float32) * np.float32(_DEPTH_UNIT)),
+            quality=torch.from_numpy(file["quality"][i] * np.float32(_QUALITY_UNIT)),
+            width=torch.from_numpy(file["width"][i] * np.float32(_WIDTH_UNIT)),
+            mask=torch.from_numpy(file["valid"][i]),
+        )
+
+    def table_distance(self, index: int) -> float:
+        """From the camera to the table (z = 0) along the optical axis, metres."""
+        _, T_WC = self.cameras[index]
+        return float(-T_WC[2, 3] / T_WC[2, 2])
+
+    def _at(self, index: int) -> tuple[h5py.File, int]:
+        shard, i = self._place[index]
+        if shard not in self._files:  # opened by the process that reads, never inherited
+            self._files[shard] = _open(self.paths[shard])
+        return self._files[shard], i
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_files": {}}
+
+
+def _open(path: Path) -> h5py.File:
+    try:
+        file = h5py.File(path, "r")
+        version = file.attrs["format_version"]
+    except (OSError, KeyError) as error:
+        raise UserError(
+            f"{path}: not a readable data shard ({error}); delete it, and it is made again"
+        ) from error
+    if version != FORMAT_VERSION:
+        raise UserError(
+            f"{path}: data format version {version}, this program reads {FORMAT_VERSION}; "
+            "delete the data set's folder, and it is made again"
+        )
+    return file
