@@ -34,9 +34,9 @@ from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
-from models.planners import PLANNERS, make_planner
+from models.planners import make_planner
 from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
-from utils.errors import UserError, unknown_choice
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import draw_grasp
 from utils.report import GalleryItem, write_report
@@ -51,7 +51,7 @@ from utils.results import (
     write_csv,
     write_results,
 )
-from utils.runs import git_state, new_run_folder
+from utils.runs import check_writable, git_state, new_run_folder
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_policies(config)
     check_resume(config, options.resume)
-    check_results_path(options.results)
+    check_writable("--results", options.results)
     Cell(config).close()  # an impossible robot or cache is named here, not by a dying worker
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
@@ -90,10 +90,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_policies(config: Config) -> None:
-    """Raise UserError for a policy that does not exist."""
+    """Raise UserError for a policy that does not exist or a network that cannot be loaded."""
     for name in config.evaluate.policies:
-        if name not in PLANNERS:
-            raise unknown_choice("evaluate.policies", name, PLANNERS)
+        make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+
+
+def workspace_of(config: Config) -> Workspace:
+    return Workspace(tuple(config.workspace.center), config.workspace.size)
 
 
 def check_resume(config: Config, run: Path | None) -> None:
@@ -116,12 +119,6 @@ def check_resume(config: Config, run: Path | None) -> None:
             f"--resume {run}: only evaluate.{', evaluate.'.join(sorted(free))} may differ from the "
             "run that is resumed; start a new run for anything else"
         )
-
-
-def check_results_path(results: Path | None) -> None:
-    """Raise UserError if --results could not be written at the end."""
-    if results is not None and (results.is_dir() or not results.parent.is_dir()):
-        raise UserError(f"--results {results}: not a file in an existing folder; choose another")
 
 
 def check_objects(config: Config) -> None:
@@ -284,7 +281,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     scene = make_scene(
         task.scenario, load_objects(task.objects, config), task.seed, config, cell.client
     )
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = workspace_of(config)
     rounds, pictures, films = [], [], []
     for policy in task.policies:
         planner = make_planner(policy, GripperGeometry(), workspace, task.seed)
@@ -303,7 +300,8 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
             )
         )  # fmt: skip
         if film is not None:
-            name = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}"
+            who = policy.replace(os.sep, "_")  # a checkpoint's path
+            name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
             path = task.film_folder / f"{name}.{config.evaluate.film_format}"
             film.write(path)
             films.append((path, f"{policy} on {task.scenario}"))

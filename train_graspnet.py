@@ -12,6 +12,7 @@ runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it w
 
 from __future__ import annotations
 
+import argparse
 import math
 import os
 import signal
@@ -41,14 +42,15 @@ from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.label_trials import label_truth
 from utils.results import write_json_atomic
-from utils.runs import git_state, new_run_folder
+from utils.runs import check_writable, git_state, new_run_folder
 
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
 FREE_TO_CHANGE = (("train", "name"), ("train", "device"), ("train", "workers"), ("data", "workers"))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    config, options = parse_args(argv, "Train GraspNet.")
+    config, options = parse_args(argv, "Train GraspNet.", _add_options)
+    check_writable("--weights", options.weights)
     check_resume(config, options.resume)
     with team(config.train.device, dict(os.environ)) as us:
         data = make_data(config, us)
@@ -61,10 +63,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         finished = train(config, run, data, trainer, history)
 
         if us.leads:
-            save_results(config, run, data, history)
+            save_results(run, data, history, options.weights)
             if not finished:
                 print(f"stopped after {trainer.step} steps; go on with --resume {run}")
     return 0 if finished else 130
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="also write graspnet.pt here")
 
 
 def check_resume(config: Config, run: Path | None) -> None:
@@ -216,23 +222,22 @@ def ignore_interrupt(worker: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
 
 
-def save_results(config: Config, run: Path, data: TrainingData, history: list[dict]) -> None:
+def save_results(
+    run: Path, data: TrainingData, history: list[dict], weights: Path | None
+) -> None:
     """The best network alone, its scores, and pictures of how it came about and what it does."""
     if not history:  # stopped within the first epoch
         return
     best = load_graspnet(run / "best.pt")
     scores = best.extra["history"][-1]
-    save_graspnet(
-        run / "graspnet.pt", best.model, best.metres_per_pixel, best.config, scores=scores
-    )
+    for path in filter(None, [run / "graspnet.pt", weights]):
+        save_graspnet(path, best.model, best.metres_per_pixel, best.config, scores=scores)
     results = {"schema": 1, "commit": git_state().commit, "best": scores, "history": history}
     write_json_atomic(run / "results.json", results)
     draw_curves(run / "curves.png", history)
     draw_predictions(run / "predictions.png", best.model, data.validation)
-    print(
-        f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}; "
-        f"weights in {run / 'graspnet.pt'}"
-    )
+    print(f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}")
+    print(f"score it: python evaluate.py evaluate.policies=heuristic,{run / 'graspnet.pt'}")
 
 
 if __name__ == "__main__":

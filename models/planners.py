@@ -1,7 +1,8 @@
 """Planners: anything that turns an RGB-D frame into ranked grasps.
 
 A planner is a callable `plan(frame) -> list[Grasp]`, best first; an empty list means that there is
-nothing to grasp. `random` and `heuristic` see only the depth image, `oracle` the true geometry.
+nothing to grasp. `random` and `heuristic` see only the depth image, `graspnet` also the colours,
+`oracle` the true geometry.
 Heuristic and oracle share one search over a height map (`models.antipodal`); the oracle judges the
 best ones by exact contacts (`models.exact_contacts`), also with the pose perturbed. This module
 knows no simulator.
@@ -10,12 +11,14 @@ knows no simulator.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from models.antipodal import SearchSettings, search
 from models.exact_contacts import buried_share, exact_quality
+from models.graspnet_planner import GraspNetPlanner
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
@@ -132,15 +135,19 @@ class OraclePlanner:
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "random": RandomPlanner,
     "heuristic": HeuristicPlanner,
+    "graspnet": GraspNetPlanner,
     "oracle": OraclePlanner,
 }
 
 
 def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
-    """The planner of that name; `seed` starts its own random generator.
+    """The planner of that name, or the network in a checkpoint file (NAME.pt); `seed` starts its
+    own random generator.
 
-    Raises UserError for a name that is not in PLANNERS.
+    Raises UserError for a name that is neither, or a file that holds no network.
     """
-    if name not in PLANNERS:
-        raise unknown_choice("evaluate.policies", name, PLANNERS)
-    return PLANNERS[name](gripper, workspace, seed)
+    if name in PLANNERS:
+        return PLANNERS[name](gripper, workspace, seed)
+    if Path(name).suffix == ".pt":
+        return GraspNetPlanner(gripper, workspace, seed, Path(name))
+    raise unknown_choice("evaluate.policies", name, [*PLANNERS, "a GraspNet checkpoint FILE.pt"])

@@ -20,7 +20,14 @@ from utils.errors import UserError
 from utils.files import write_atomic
 from utils.results import write_json_atomic
 
-__all__ = ["GitState", "environment", "git_state", "new_run_folder", "write_json_atomic"]
+__all__ = [
+    "GitState",
+    "check_writable",
+    "environment",
+    "git_state",
+    "new_run_folder",
+    "write_json_atomic",
+]
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("numpy", "scipy", "torch", "torchvision", "pybullet", "gymnasium", "pydantic")
@@ -51,6 +58,12 @@ def new_run_folder(
     write_atomic(folder / "config.yaml", dump_config(config))
     write_json_atomic(folder / "environment.json", environment())
     return folder
+
+
+def check_writable(option: str, path: Path | None) -> None:
+    """Raise UserError if a file that an option names could not be written at the end."""
+    if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        raise UserError(f"{option} {path}: not a file in an existing folder; choose another")
 
 
 def _make_new(parent: Path, stem: str) -> Path:
