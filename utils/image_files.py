@@ -161,7 +161,8 @@ def _pose_numbers(path: Path) -> np.ndarray:
         raise UserError(f"{path}: no such file") from None
     except UserError:
         raise
-    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:  # ValueError: also JSON, UTF-8
+    # A ValueError is also what JSON and UTF-8 raise.
+    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
         raise UserError(f"{path}: cannot be read as a 4x4 camera pose ({error})") from error
 
 

@@ -1,0 +1,147 @@
+"""GraspNet on any camera's image: the scale it was trained at, and everything mapped back.
+
+Convolutions know sizes in pixels only. So the image is resampled, with square pixels, until one of
+its pixels spans as many metres at the median depth as in training; grasps and maps then return to
+the original's pixels. This module knows no simulator and no files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from models.graspnet import (
+    INPUT_CHANNELS,
+    LABELS,
+    PANDA_HAND,
+    GraspNet,
+    Peaks,
+    PeakSettings,
+    check_rgbd,
+    fill_holes,
+    find_peaks,
+    surface_grasps,
+    to_input,
+)
+from utils.errors import UserError
+from utils.geometry import GripperGeometry
+from utils.grasp_labels import LabelSettings, grasp_below_surface
+from utils.pixel_scaling import PixelScaling
+from utils.transforms import Grasp, ImageGrasp, RGBDFrame, deproject
+
+SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
+MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
+CANDIDATES = 1000  # peaks that are looked at for some that stand on the table
+PEAKS = PeakSettings()
+
+
+@dataclass(frozen=True)
+class PredictedGrasp:
+    """on_image: on the visible surface, in pixels of the original image. in_world: where the
+    fingertips close, in W."""
+
+    on_image: ImageGrasp
+    in_world: Grasp
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """grasps: best first. quality, angle, width: (H, W) float32 at the original image's pixels:
+    in [0, 1], image angles in [0, pi), metres."""
+
+    grasps: list[PredictedGrasp]
+    quality: np.ndarray
+    angle: np.ndarray
+    width: np.ndarray
+
+
+def predict(
+    model: GraspNet,
+    metres_per_pixel: float,
+    frame: RGBDFrame,
+    table_height: float,
+    count: int = PEAKS.count,
+    gripper: GripperGeometry = PANDA_HAND,
+    labels: LabelSettings = LABELS,
+    peaks: PeakSettings = PEAKS,
+) -> Prediction:
+    """The `count` best grasps of a frame, whatever its size, aspect ratio and focal lengths.
+
+    metres_per_pixel: of the images that the model was trained on. table_height: z of the table
+    in W. peaks: in pixels at the training's scale. A grasp needs a surface that the fingertips
+    can go beside, as in the labels; peaks on the table are none. Raises UserError for images that
+    cannot be meant.
+    """
+    if model.input_channels != INPUT_CHANNELS:
+        raise UserError(
+            f"the network takes {model.input_channels} channels; an RGB-D image has "
+            f"{INPUT_CHANNELS}"
+        )
+    check_rgbd(frame.rgb, frame.depth)
+    scaling = training_scale(frame, metres_per_pixel)
+    quality, angle, width = run_network(model, frame, scaling)
+    found = find_peaks(quality, angle, width, replace(peaks, count=CANDIDATES))
+    rows, columns = frame.depth.shape
+    original = Peaks(
+        np.clip(scaling.original_pixels(found.pixel), 0, (columns - 1, rows - 1)),
+        scaling.original_angles(found.angle),
+        found.width,
+        found.quality,
+    )
+    # As far around in metres as one pixel at the training's scale.
+    radius = max(1, round(1 / min(scaling.u, scaling.v)))
+    grasps = [
+        PredictedGrasp(
+            grasp,
+            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
+        )
+        for grasp in surface_grasps(original, frame.depth, gripper, radius)
+        if deproject(grasp.pixel, grasp.depth, frame.K, frame.T_WC)[2] - table_height
+        > labels.table_clearance + labels.min_engagement
+    ]
+    bins = angle[0].argmax(dim=0).numpy() * (np.pi / model.num_angle_bins)
+    shape = (rows, columns)
+    # Lines at 0 and 180 degrees are the same: doubled angles are interpolated as vectors.
+    cosine, sine = (
+        scaling.original_map(part(2 * bins).astype(np.float32), shape) for part in (np.cos, np.sin)
+    )
+    return Prediction(
+        grasps[:count],
+        scaling.original_map(quality[0, 0].numpy(), shape),
+        scaling.original_angles(np.arctan2(sine, cosine) / 2).astype(np.float32),
+        scaling.original_map(width[0, 0].numpy(), shape),
+    )
+
+
+def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
+    """The scaling after which a pixel spans `metres_per_pixel` at the median known depth.
+
+    Raises UserError where the view would be far too small or too wide.
+    """
+    distance = float(np.median(frame.depth[frame.depth > 0]))
+    scaling = PixelScaling.to_focal_length(frame.K, distance / metres_per_pixel)
+    height, width = frame.depth.shape
+    rows, columns = height * scaling.v, width * scaling.u
+    if min(rows, columns) < SMALLEST_SIDE or rows * columns > MOST_PIXELS:
+        raise UserError(
+            f"at the median depth of {distance:.3g} m the image would span "
+            f"{columns * metres_per_pixel:.3g} m x {rows * metres_per_pixel:.3g} m, too "
+            f"{'little' if min(rows, columns) < SMALLEST_SIDE else 'much'} for a hand's grasps; "
+            "check the unit of the depth and the focal length"
+        )
+    return scaling
+
+
+@torch.no_grad()
+def run_network(
+    model: GraspNet, frame: RGBDFrame, scaling: PixelScaling
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """GraspNet's three maps of the scaled image, on the CPU."""
+    depth = scaling.image(fill_holes(frame.depth))
+    image = to_input(scaling.image(frame.rgb), depth)
+    device = next(model.parameters()).device
+    model.eval()
+    quality, angle, width = model(image[None].to(device))
+    return quality.float().cpu(), angle.float().cpu(), width.float().cpu()

@@ -1,0 +1,213 @@
+"""Ranked grasps for your own RGB-D image.
+
+    python predict.py --rgb rgb.png --depth depth.png --intrinsics 615 615 320 240
+    python predict.py ... --camera-pose T_WC.txt --table-height 0.02    # grasps in your world, too
+    python predict.py --export graspnet.onnx                            # the network for ONNX
+
+--depth is a PNG, TIFF or NPY of the colour image's size: whole numbers are millimetres, floats
+metres; --depth-scale says otherwise. --intrinsics are fx fy cx cy in pixels, with integers at
+pixel centres. --camera-pose is T_WC, 4x4, .npy, .txt, .json or .yaml: it takes a point in the
+camera's optical frame (x right, y down, z forward) to the world, whose z is up.
+
+Without --table-height the table is the dominant plane of the depth image; without --camera-pose
+the gripper descends along that plane's normal. Prints JSON and writes it to OUT/grasps.json,
+with a picture in OUT/grasps.png. Of each grasp: `pixel` (u, v) and `image_angle` (from right
+towards down) on the image; `width` between the fingertips; and in `camera` and `world` the pose of
+the point between the closed fingertips: z along the approach, y along the closing line. Metres and
+radians; quaternions are x, y, z, w. Nothing to grasp is an empty list; a bad input ends with
+one sentence and status 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from models.graspnet import check_rgbd
+from models.graspnet_io import SavedGraspNet, load_graspnet
+from models.prediction import PredictedGrasp, Prediction, predict, training_scale
+from utils.config import run_script
+from utils.errors import UserError
+from utils.files import write_atomic
+from utils.image_files import intrinsics_matrix, read_depth, read_pose, read_rgb
+from utils.prediction_panel import is_prediction_panel, prediction_panel
+from utils.table_plane import Table, find_table, table_at_height
+from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
+
+CHECKPOINT = Path("checkpoints/graspnet.pt")
+FORMAT = "robot-grasping grasps"  # tells our grasps.json from others
+VERSION = 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = parse_options(argv)
+    saved = load_graspnet(options.checkpoint)
+    if options.export is not None:
+        from models.graspnet_export import export_onnx  # nothing else needs ONNX
+
+        export_onnx(saved, options.export)
+        print(f"wrote {options.export}", file=sys.stderr)
+        return 0
+
+    out = options.out or Path("runs/predict") / options.rgb.stem
+    check_output(out)
+    seen = read_image(options)
+    training_scale(seen, saved.metres_per_pixel)  # tells wrong units before a table is looked for
+    table = locate_table(seen, options)
+    print(f"table: {table.describe()}", file=sys.stderr)
+    frame = replace(seen, T_WC=table.T_WC)
+    found = predict(saved.model, saved.metres_per_pixel, frame, table.height, options.count)
+
+    text = json.dumps(as_plain(found, frame, table, options), indent=2, allow_nan=False)
+    write(out / "grasps.png", picture(found, frame, saved))
+    write(out / "grasps.json", text + "\n")
+    print(text)
+    print(f"wrote {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
+    return 0
+
+
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    summary, _, details = __doc__.partition("\n\n")
+    parser = argparse.ArgumentParser(
+        description=summary, epilog=details, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image, PNG or JPEG")
+    parser.add_argument("--depth", type=Path, metavar="FILE", help="depth, PNG, TIFF or NPY")
+    parser.add_argument("--depth-scale", type=float, metavar="S", help="metres for 1 in the file")
+    parser.add_argument("--intrinsics", type=float, nargs="+", metavar="F", help="fx fy cx cy")
+    parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
+    parser.add_argument("--table-height", type=float, metavar="Z", help="m in the world")
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", default=CHECKPOINT)
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
+    )
+    parser.add_argument("--count", type=int, metavar="N", default=20, help="most grasps told")
+    parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")
+    options = parser.parse_args(argv)
+    image = [options.rgb, options.depth, options.intrinsics]
+    if options.export is not None and any(part is not None for part in image):
+        raise UserError("--export writes the network and takes no image; run them one by one")
+    if options.export is None and any(part is None for part in image):
+        raise UserError("--rgb, --depth and --intrinsics are needed (or --export FILE.onnx)")
+    if options.count < 1:
+        raise UserError(f"--count: got {options.count}, expected at least 1")
+    if options.table_height is not None:
+        if options.camera_pose is None:
+            raise UserError("--table-height is a height in the world: it needs --camera-pose")
+        if not np.isfinite(options.table_height):
+            raise UserError(f"--table-height: got {options.table_height}, expected metres")
+    return options
+
+
+def check_output(folder: Path) -> None:
+    """Raise UserError where the results would overwrite what this program did not write."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"--out {folder}: exists and is no folder")
+    for path, ours in (
+        (folder / "grasps.json", is_our_json),
+        (folder / "grasps.png", is_prediction_panel),
+    ):
+        if path.exists() and not ours(path):
+            raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
+
+
+def write(path: Path, content: str | bytes) -> None:
+    try:
+        write_atomic(path, content)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def is_our_json(path: Path) -> bool:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def read_image(options: argparse.Namespace) -> RGBDFrame:
+    """The image, with the camera as the world for the time being."""
+    rgb, depth = read_rgb(options.rgb), read_depth(options.depth, options.depth_scale)
+    check_rgbd(rgb, depth)
+    K = intrinsics_matrix(options.intrinsics, rgb.shape[1], rgb.shape[0])
+    return RGBDFrame(rgb, depth, K, np.eye(4))
+
+
+def locate_table(seen: RGBDFrame, options: argparse.Namespace) -> Table:
+    """The table, and the camera above it.
+
+    Without a pose the world is the table's own, see `utils.table_plane.Plane.camera_pose`.
+    """
+    T_WC = None if options.camera_pose is None else read_pose(options.camera_pose)
+    if options.table_height is None:
+        return find_table(seen.points(), T_WC)
+    return table_at_height(options.table_height, seen.points(), T_WC)
+
+
+def as_plain(
+    found: Prediction, frame: RGBDFrame, table: Table, options: argparse.Namespace
+) -> dict[str, Any]:
+    """What grasps.json holds."""
+    T_CW, posed = inverse_pose(frame.T_WC), options.camera_pose is not None
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "rgb": str(options.rgb),
+        "depth": str(options.depth),
+        "checkpoint": str(options.checkpoint),
+        "K": frame.K.tolist(),
+        "T_WC": frame.T_WC.tolist() if posed else None,
+        "table": {
+            "estimated": table.share is not None,
+            "normal_camera": T_CW[:3, 2].tolist(),
+            "camera_height": float(frame.T_WC[2, 3] - table.height),
+            "height_world": table.height if posed else None,
+        },
+        "grasps": [grasp_as_plain(grasp, T_CW, posed) for grasp in found.grasps],
+    }
+
+
+def grasp_as_plain(grasp: PredictedGrasp, T_CW: np.ndarray, posed: bool) -> dict[str, Any]:
+    plain = {
+        "quality": grasp.in_world.quality,
+        "pixel": grasp.on_image.pixel.tolist(),
+        "image_angle": grasp.on_image.angle,
+        "width": grasp.in_world.width,
+        "camera": pose_as_plain(T_CW @ grasp.in_world.pose),
+    }
+    if posed:
+        plain["world"] = {**pose_as_plain(grasp.in_world.pose), "angle": grasp.in_world.angle}
+    return plain
+
+
+def pose_as_plain(T: np.ndarray) -> dict[str, Any]:
+    position, quaternion = position_quaternion(T)
+    return {
+        "position": position.tolist(),
+        "rotation": T[:3, :3].tolist(),
+        "quaternion": quaternion.tolist(),
+    }
+
+
+def picture(found: Prediction, frame: RGBDFrame, saved: SavedGraspNet) -> bytes:
+    return prediction_panel(
+        frame.rgb,
+        frame.K,
+        [grasp.on_image for grasp in found.grasps],
+        found.quality,
+        found.angle,
+        found.width,
+        saved.model.max_width,
+    )
+
+
+if __name__ == "__main__":
+    run_script(main)
