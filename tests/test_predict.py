@@ -332,7 +332,6 @@ def test_frames_of_the_output_agree(files, capsys):
 
 
 def test_without_a_pose_the_gripper_descends_along_the_tables_normal(files, capsys):
-    eye = look_at((0.1, 0.1, 0.7), (0.5, 0.0, 0.0))  # from the side, as nobody trained it
     posed = files.run(capsys)
     bare = files.run(capsys, camera_pose=None)
     assert bare["T_WC"] is None and bare["table"]["height_world"] is None
@@ -346,8 +345,15 @@ def test_without_a_pose_the_gripper_descends_along_the_tables_normal(files, caps
         np.testing.assert_allclose(np.abs(turned.sum(axis=0)), 1, atol=0.001)
         approach = np.array(other["camera"]["rotation"])[:, 2]
         np.testing.assert_allclose(approach, -np.array(bare["table"]["normal_camera"]), atol=1e-9)
-    plane = dominant_plane(cloud(eye, 0.0, 0.2))
-    np.testing.assert_allclose(plane.normal, eye[:3, :3].T @ (0, 0, 1), atol=1e-3)
+
+
+def test_an_oblique_camera_finds_the_tables_normal(tmp_path, cell, checkpoint, capsys):
+    T_WC = look_at((0.5, 0.5, 0.6), (0.5, 0.0, 0.0))
+    files = UserFiles(tmp_path, cell.look(Intrinsics(320, 240, 35), T_WC), checkpoint)
+    found = files.run(capsys, camera_pose=None)
+    up = T_WC[:3, :3].T @ (0, 0, 1)
+    assert np.rad2deg(np.arccos(up @ found["table"]["normal_camera"])) < 0.3
+    assert found["table"]["camera_height"] == pytest.approx(0.6, abs=0.003)
 
 
 def test_depth_files_of_every_kind_say_the_same(files, capsys):

@@ -38,8 +38,8 @@ def prediction_panel(
     """A PNG file's bytes.
 
     rgb: (H, W, 3) uint8. K: (3, 3). grasps: best first, in pixels of rgb; the first ten are
-    numbered in that order, the best is green. quality, angle, width: (H, W), image angles in radians, metres.
-    max_width: metres at the top of the width's scale.
+    numbered in that order, the best is green. quality, angle, width: (H, W); image angles in
+    radians, widths in metres. max_width: metres at the top of the width's scale.
     """
     scaling = _to_picture(K, rgb.shape[:2])
     picture = _with_grasps(scaling, rgb, K, grasps)
