@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from models.graspnet_io import SavedGraspNet, load_graspnet
-from models.prediction import predict
+from models.prediction import predict_grasps
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame
 
@@ -43,10 +43,10 @@ class GraspNetPlanner:
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel = self.network.model, self.network.metres_per_pixel
         table_height = self.workspace.table_height
-        found = predict(model, metres_per_pixel, frame, table_height, gripper=self.gripper)
+        found = predict_grasps(model, metres_per_pixel, frame, table_height, gripper=self.gripper)
         reach = self.workspace.size / 2 + _MARGIN
         return [
             grasp.in_world
-            for grasp in found.grasps
+            for grasp in found
             if np.abs(grasp.in_world.position[:2] - self.workspace.centre).max() < reach
         ]

@@ -7,7 +7,7 @@ the original's pixels. This module knows no simulator and no files.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from utils.transforms import Grasp, ImageGrasp, RGBDFrame, deproject
 
 SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
 MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
+PEAKS = PeakSettings()
 CANDIDATES = 1000  # peaks that are looked at for some that stand on the table
 PEAKS = PeakSettings()
 
@@ -62,7 +63,7 @@ def predict(
     metres_per_pixel: float,
     frame: RGBDFrame,
     table_height: float,
-    count: int = PEAKS.count,
+    count: int = 20,
     gripper: GripperGeometry = PANDA_HAND,
     labels: LabelSettings = LABELS,
     peaks: PeakSettings = PEAKS,
@@ -74,35 +75,11 @@ def predict(
     can go beside, as in the labels; peaks on the table are none. Raises UserError for images that
     cannot be meant.
     """
-    if model.input_channels != INPUT_CHANNELS:
-        raise UserError(
-            f"the network takes {model.input_channels} channels; an RGB-D image has "
-            f"{INPUT_CHANNELS}"
-        )
-    check_rgbd(frame.rgb, frame.depth)
-    scaling = training_scale(frame, metres_per_pixel)
-    quality, angle, width = run_network(model, frame, scaling)
-    found = find_peaks(quality, angle, width, replace(peaks, count=CANDIDATES))
-    rows, columns = frame.depth.shape
-    original = Peaks(
-        np.clip(scaling.original_pixels(found.pixel), 0, (columns - 1, rows - 1)),
-        scaling.original_angles(found.angle),
-        found.width,
-        found.quality,
-    )
-    # As far around in metres as one pixel at the training's scale.
-    radius = max(1, round(1 / min(scaling.u, scaling.v)))
-    grasps = [
-        PredictedGrasp(
-            grasp,
-            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
-        )
-        for grasp in surface_grasps(original, frame.depth, gripper, radius)
-        if deproject(grasp.pixel, grasp.depth, frame.K, frame.T_WC)[2] - table_height
-        > labels.table_clearance + labels.min_engagement
-    ]
+    scaling, maps = scaled_maps(model, metres_per_pixel, frame)
+    grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)
+    quality, angle, width = maps
+    shape = frame.depth.shape
     bins = angle[0].argmax(dim=0).numpy() * (np.pi / model.num_angle_bins)
-    shape = (rows, columns)
     # Lines at 0 and 180 degrees are the same: doubled angles are interpolated as vectors.
     cosine, sine = (
         scaling.original_map(part(2 * bins).astype(np.float32), shape) for part in (np.cos, np.sin)
@@ -113,6 +90,64 @@ def predict(
         scaling.original_angles(np.arctan2(sine, cosine) / 2).astype(np.float32),
         scaling.original_map(width[0, 0].numpy(), shape),
     )
+
+
+def predict_grasps(
+    model: GraspNet,
+    metres_per_pixel: float,
+    frame: RGBDFrame,
+    table_height: float,
+    count: int = 20,
+    gripper: GripperGeometry = PANDA_HAND,
+    labels: LabelSettings = LABELS,
+    peaks: PeakSettings = PEAKS,
+) -> list[PredictedGrasp]:
+    """The grasps of `predict` without its maps, which cost time that a robot has not."""
+    scaling, maps = scaled_maps(model, metres_per_pixel, frame)
+    return grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)[:count]
+
+
+def scaled_maps(model: GraspNet, metres_per_pixel: float, frame: RGBDFrame) -> tuple:
+    """The scaling to the training's pixels, and the network's three maps there."""
+    if model.input_channels != INPUT_CHANNELS:
+        raise UserError(
+            f"the network takes {model.input_channels} channels; an RGB-D image has "
+            f"{INPUT_CHANNELS}"
+        )
+    check_rgbd(frame.rgb, frame.depth)
+    scaling = training_scale(frame, metres_per_pixel)
+    return scaling, run_network(model, frame, scaling)
+
+
+def grasps_in_maps(
+    maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    scaling: PixelScaling,
+    frame: RGBDFrame,
+    table_height: float,
+    gripper: GripperGeometry,
+    labels: LabelSettings,
+    peaks: PeakSettings,
+) -> list[PredictedGrasp]:
+    """Grasps on whatever rises from the table, best first, at the original's pixels."""
+    found = find_peaks(*maps, PeakSettings(peaks.threshold, CANDIDATES, peaks.radius, peaks.blur))
+    rows, columns = frame.depth.shape
+    original = Peaks(
+        np.clip(scaling.original_pixels(found.pixel), 0, (columns - 1, rows - 1)),
+        scaling.original_angles(found.angle),
+        found.width,
+        found.quality,
+    )
+    # As far around in metres as one pixel at the training's scale.
+    radius = max(1, round(1 / min(scaling.u, scaling.v)))
+    return [
+        PredictedGrasp(
+            grasp,
+            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
+        )
+        for grasp in surface_grasps(original, frame.depth, gripper, radius)
+        if deproject(grasp.pixel, grasp.depth, frame.K, frame.T_WC)[2] - table_height
+        > labels.table_clearance + labels.min_engagement
+    ]
 
 
 def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
