@@ -6,6 +6,7 @@ build and observe the world; what to do in it is for others to say.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
 from envs.scenes import Scene, settle
-from envs.world import add_bin, add_table, on_table, set_up_physics
+from envs.world import SOLVER_RESIDUAL, add_bin, add_table, on_table, set_up_physics
 from utils.config import CameraConfig, Config
 from utils.depth_noise import KinectNoise
 from utils.errors import UserError
@@ -27,6 +28,9 @@ from utils.transforms import RGBDFrame, look_at, pose_matrix
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the game.
 _REACH = 0.63
+# As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
+_CALM_RESIDUAL = 1e-6
+_CALM_LOOKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
 # Keeps the depth noise of a seed apart from the scene of the same seed.
 _DEPTH_NOISE_STREAM = 1
 
@@ -93,6 +97,31 @@ class Cell:
             if on_step is not None:
                 on_step(self)
 
+    def calm(self) -> bool:
+        """Spare the solver until the robot touches something; whether the objects are at rest,
+        without which nothing is done. `wake` has to be called at the first touch.
+
+        The objects sleep, which is to lie still at no cost until something hits them; and the
+        solver stops a little earlier, which a free arm does not show.
+        """
+        if not settle(self.client, self.bodies, self.config, looks=_CALM_LOOKS):
+            return False
+        sleep = pybullet.ACTIVATION_STATE_ENABLE_SLEEPING | pybullet.ACTIVATION_STATE_SLEEP
+        self._set_activation(sleep, _CALM_RESIDUAL)
+        return True
+
+    def wake(self) -> None:
+        """Undo `calm`: an object at rest in the hand must not fall asleep and hang in the air."""
+        awake = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING | pybullet.ACTIVATION_STATE_WAKE_UP
+        self._set_activation(awake, SOLVER_RESIDUAL)
+
+    def _set_activation(self, state: int, residual: float) -> None:
+        for body in self.bodies:
+            pybullet.changeDynamics(body, -1, activationState=state, physicsClientId=self.client)
+        pybullet.setPhysicsEngineParameter(
+            solverResidualThreshold=residual, physicsClientId=self.client
+        )
+
     @property
     def seconds(self) -> float:
         """Simulated seconds since the scene was loaded."""
@@ -116,7 +145,7 @@ class Cell:
         position, _ = pybullet.getBasePositionAndOrientation(
             self.bodies[index], physicsClientId=self.client
         )
-        if not np.isfinite(position).all():
+        if not all(map(math.isfinite, position)):
             raise PhysicsError(f"object {index} has a non-finite position: {position}")
         return np.array(position)
 

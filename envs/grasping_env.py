@@ -6,6 +6,7 @@ A policy moves the Panda a little at a time and is rewarded for lifting an objec
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from pathlib import Path
@@ -42,8 +43,11 @@ _SHORTEST_LIFT = 0.05  # m, for the reward of objects that rest near the lift he
 _MARGIN = 0.08  # m that E may leave the workspace sideways
 # How far the arm's answer to a command may lie from it before the command is refused.
 _FOLLOW_POSITION, _FOLLOW_ROTATION = 0.01, 0.06  # m, rad
-# Share of the joint speeds that is commanded: inertia and contacts throw a joint a little over what
-# its motor asks for (3 % in free motion).
+# The quicker joints of the wrist go no faster than the others: Bullet can hold a body's joints to
+# one limit only, and what is held to the lowest is legal for all.
+_FASTEST = float(JOINT_VELOCITY.min())  # rad/s
+# Share of that speed that is commanded: inertia and contacts throw a joint a little over what its
+# motor asks for (3 % in free motion).
 _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
@@ -63,8 +67,8 @@ class RobotGraspingEnv(gymnasium.Env):
     workspace and the joint limits, and are scaled down as a whole where a joint would have to
     exceed its velocity limit. The command stays where it is when the arm cannot reach the new
     one, or is held up by something on its way.
-    Legal joint speeds are commanded; in physics a joint was measured at up to 1.2 times its limit
-    for single steps of 1/240 s (2 of 4,000); the torque limits alone bound its acceleration.
+    No joint is faster than the Panda's lowest joint speed limit, 2.175 rad/s, at any physics step;
+    the torque limits alone bound its acceleration.
 
     Reward (`dense`): 1 at success, plus the change of a progress measure, r = [success] + Phi(s')
     - Phi(s), with the stages of ManiSkill's PickCube. An episode's sum telescopes to [success] +
@@ -140,9 +144,9 @@ class RobotGraspingEnv(gymnasium.Env):
         x, y = self.config.workspace.center
         self._lowest = np.array([x - reach, y - reach, _LOWEST_TIP])
         self._highest = np.array([x + reach, y + reach, _HIGHEST_TIP])
-        self._speed = _SPEED_HEADROOM * self.config.robot.velocity_scale
+        self._speed = _FASTEST * _SPEED_HEADROOM * self.config.robot.velocity_scale
         seconds = self.settings.substeps / self.config.sim.frequency
-        self._max_joint_change = JOINT_VELOCITY * self._speed * seconds
+        self._max_joint_change = self._speed * seconds
 
     def _observation_spaces(self) -> dict[str, spaces.Space]:
         side = self.settings.resolution
@@ -170,6 +174,8 @@ class RobotGraspingEnv(gymnasium.Env):
             self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
         )
         self.cell.load(scene)
+        self.cell.robot.limit_speed(_FASTEST)
+        self._calm = self.cell.calm()  # until the robot first touches something, see `_look`
         self._servo = ServoStep(self.cell.home.copy())  # at the commanded joint positions
         self._T_command = self._servo.reached
         self._reachable = True
@@ -294,8 +300,8 @@ class RobotGraspingEnv(gymnasium.Env):
             if share < 1.0:
                 wanted = moved(self._T_command, share * pose_error(self._T_command, target))
             servo = ServoStep(goal)
-            error = abs(pose_error(servo.reached, wanted))
-            if error[:3].max() < _FOLLOW_POSITION and error[3:].max() < _FOLLOW_ROTATION:
+            error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
+            if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
                 self._reachable = not self._blocked(goal)
                 if self._reachable:
                     self._servo, self._T_command = servo, wanted
@@ -321,21 +327,27 @@ class RobotGraspingEnv(gymnasium.Env):
     def _look(self) -> None:
         """Read the robot and the nearest object. Raises PhysicsError on a non-finite number."""
         cell = self.cell
-        q, velocity, opening = cell.robot.joint_state()
-        self._state = np.array([*q, *velocity, opening], dtype=np.float32)
+        state = np.empty(15, np.float32)
+        state[:7], state[7:14], state[14] = cell.robot.joint_state()
+        self._state = state
         if not np.isfinite(self._state).all():
             raise PhysicsError("the robot's state is not finite")
         self._tip = cell.robot.tip_position()
         positions = [cell.object_position(i) for i in range(len(cell.bodies))]
-        distances = [float(np.linalg.norm(p - self._tip)) for p in positions]
-        nearest = min(range(len(positions)), key=distances.__getitem__)
+        distances = [math.dist(position, self._tip) for position in positions]
+        self._distance = min(distances)
+        nearest = distances.index(self._distance)
         self._object_positions, self._object_position = positions, positions[nearest]
-        self._nearest, self._distance = nearest, distances[nearest]
-        self._grasped = cell.robot.holds(cell.bodies[nearest])
+        self._nearest = nearest
+        touches = cell.robot.touches()
+        if touches and self._calm:
+            cell.wake()
+            self._calm = False
+        self._grasped = touches and cell.robot.holds(cell.bodies[nearest])
 
     def _progress(self) -> float:
         """The potential Phi in [0, 1]; see the class."""
-        reach = 1.0 - np.tanh(5.0 * self._distance)
+        reach = 1.0 - math.tanh(5.0 * self._distance)
         if not self._grasped:
             return float(reach / 4)
         rest = self._resting_heights[self._nearest]
@@ -352,7 +364,9 @@ class RobotGraspingEnv(gymnasium.Env):
             cell = self.cell
             image = render(cell.client, self._intrinsics, cell.camera_pose(), cell.renderer)
             observation = {"rgb": image.rgb, "depth": image.depth[..., None]}
-        observation["state"] = np.clip(self._state, self._state_low, self._state_high)
+        observation["state"] = np.minimum(
+            np.maximum(self._state, self._state_low), self._state_high
+        )
         return {name: observation[name] for name in self.settings.observations}
 
     def _blown_up(self) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.linalg.lapack import dposv
 from scipy.spatial.transform import Rotation
 
 from utils.errors import UserError
@@ -28,25 +29,14 @@ _ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 
 _D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
 
 
-def _link_terms() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(7, 4, 4) each: link i's transform is constant + cosine * cos(q_i) + sine * sin(q_i)."""
-    constant, cosine, sine = np.zeros((3, 7, 4, 4))
-    for i, (a, alpha, d) in enumerate(zip(_A, _ALPHA, _D)):
-        twist = np.eye(4)
-        twist[:3, :3] = Rotation.from_euler("x", alpha).as_matrix()
-        twist[:3, 3] = a, -np.sin(alpha) * d, np.cos(alpha) * d
-        constant[i] = twist @ np.diag([0.0, 0.0, 1.0, 1.0])
-        cosine[i] = twist @ np.diag([1.0, 1.0, 0.0, 0.0])
-        sine[i, :, 0], sine[i, :, 1] = twist[:, 1], -twist[:, 0]
-    return constant, cosine, sine
-
-
-_LINK_CONSTANT, _LINK_COSINE, _LINK_SINE = _link_terms()
 TOOL_LENGTH = 0.107 + 0.105  # m from joint 7's frame to E
 # Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
-_TOOL = np.eye(4)
-_TOOL[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
-_TOOL[:3, 3] = 0.0, 0.0, TOOL_LENGTH
+_TOOL_TURN = -np.pi / 4
+# Each joint's a, cos alpha, sin alpha and d; the tool as one more link that does not turn.
+_LINKS = [
+    (a, float(np.round(np.cos(alpha))), float(np.round(np.sin(alpha))), d)
+    for a, alpha, d in zip((*_A, 0.0), (*_ALPHA, 0.0), (*_D, TOOL_LENGTH))
+]
 
 
 class UnreachableError(UserError):
@@ -59,24 +49,34 @@ def forward_kinematics(q: np.ndarray) -> np.ndarray:
 
 
 def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
-    cosines, sines = np.cos(q)[:, None, None], np.sin(q)[:, None, None]
-    links = _LINK_CONSTANT + cosines * _LINK_COSINE + sines * _LINK_SINE
-    T = links[0]
-    poses = [T]
-    for link in links[1:]:
-        T = T @ link
-        poses.append(T)
-    T = T @ _TOOL
-    frames = np.array(poses)
-    axes = frames[:, :3, 2]
-    arm = T[:3, 3] - frames[:, :3, 3]
-    jacobian = np.empty((6, 7))
-    jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
-    jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
-    jacobian[2] = axes[:, 0] * arm[:, 1] - axes[:, 1] * arm[:, 0]
-    jacobian[3:] = axes.T
-    return T, jacobian
+    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first.
+
+    In plain numbers, which for matrices this small is twice as fast as numpy.
+    """
+    angles = [*q.tolist(), _TOOL_TURN]
+    links = [(*link, math.cos(angle), math.sin(angle)) for link, angle in zip(_LINKS, angles)]
+    rows, axes, origins = [], [], []
+    for x, y, z in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
+        p, axis, origin = 0.0, [], []  # (x, y, z, p) is a row of the pose so far
+        for a, cos_alpha, sin_alpha, d, cosine, sine in links:
+            p += a * x
+            y, z = cos_alpha * y + sin_alpha * z, cos_alpha * z - sin_alpha * y
+            p += d * z
+            x, y = cosine * x + sine * y, cosine * y - sine * x
+            axis.append(z)
+            origin.append(p)
+        rows.append((x, y, z, p))
+        axes.append(axis[:-1])
+        origins.append([p - start for start in origin[:-1]])
+    T = np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
+    axis_x, axis_y, axis_z = axes
+    arm_x, arm_y, arm_z = origins
+    linear = [
+        [b * w - c * v for b, c, v, w in zip(axis_y, axis_z, arm_y, arm_z)],
+        [c * u - a * w for c, a, u, w in zip(axis_z, axis_x, arm_x, arm_z)],
+        [a * v - b * u for a, b, u, v in zip(axis_x, axis_y, arm_x, arm_y)],
+    ]
+    return T, np.array([*linear, *axes])
 
 
 def geometric_jacobian(q: np.ndarray) -> np.ndarray:
@@ -124,7 +124,7 @@ def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
-    result = np.eye(4)
+    result = T.copy()
     result[:3, :3] = rotation_matrix(motion[3:]) @ T[:3, :3]
     result[:3, 3] = T[:3, 3] + motion[:3]
     return result
@@ -166,13 +166,13 @@ def inverse_kinematics(
 def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: float = 0.3):
     """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
     square = jacobian @ jacobian.T
-    square.flat[::7] += damping**2
+    square.flat[::7] += damping**2  # positive definite, so that Cholesky's method serves
     if rest is None:
-        step = jacobian.T @ np.linalg.solve(square, error)
+        step = jacobian.T @ dposv(square, error)[1]
     else:
         # The pull fades near the goal, where the damping would let it leak into the task.
         pull = 0.1 * min(1.0, abs(error).max() / 0.05) * (rest - q)
-        step = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
+        step = pull + jacobian.T @ dposv(square, error - jacobian @ pull)[1]
     largest = abs(step).max()
     return step * (max_step / largest) if largest > max_step else step
 

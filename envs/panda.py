@@ -64,11 +64,15 @@ class Panda:
                 self.body, joint, jointLowerLimit=lower, jointUpperLimit=upper,
                 physicsClientId=client,
             )  # fmt: skip
-        # The motors' own limit holds back the motors only: a quick shoulder throws the light wrist.
-        # Bullet has one such limit for all joints of a body.
-        pybullet.changeDynamics(
-            self.body, -1, maxJointVelocity=JOINT_VELOCITY.max(), physicsClientId=client
-        )
+        self.limit_speed(JOINT_VELOCITY.max())
+
+    def limit_speed(self, speed: float) -> None:
+        """No joint gets faster than `speed` rad/s, whatever moves it.
+
+        The motors' own limit holds back the motors only: a quick shoulder throws the light wrist.
+        Bullet has one such limit for all joints of a body.
+        """
+        pybullet.changeDynamics(self.body, -1, maxJointVelocity=speed, physicsClientId=self.client)
 
     def place(self, q: np.ndarray, opening: float = MAX_OPENING) -> None:
         """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""
@@ -86,14 +90,15 @@ class Panda:
             physicsClientId=self.client,
         )  # fmt: skip
 
-    def drive_arm_to(self, q: np.ndarray, velocity_scale: float = 1.0) -> None:
-        """Motor targets for several periods: the motors go to q (7,) no faster than the limits."""
-        for joint in ARM:
+    def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
+        """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
+        nor than `speed` rad/s."""
+        speeds = np.minimum(JOINT_VELOCITY, speed).tolist()
+        for joint, position, torque, limit in zip(ARM, q.tolist(), _TORQUES, speeds):
             pybullet.setJointMotorControl2(
                 self.body, joint, pybullet.POSITION_CONTROL,
-                targetPosition=q[joint], targetVelocity=0.0, force=JOINT_TORQUE[joint],
-                positionGain=_DRIVE_GAIN, velocityGain=1.0,
-                maxVelocity=JOINT_VELOCITY[joint] * velocity_scale,
+                targetPosition=position, targetVelocity=0.0, force=torque,
+                positionGain=_DRIVE_GAIN, velocityGain=1.0, maxVelocity=limit,
                 physicsClientId=self.client,
             )  # fmt: skip
 
@@ -209,6 +214,10 @@ class Panda:
         """Whether both fingers grip the body with at least `min_force` newtons each."""
         return min(self.grip_forces(body)) >= min_force
 
+    def touches(self) -> bool:
+        """Whether anything touches the robot, or is so near that Bullet already looks at it."""
+        return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
+
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the whole robot."""
         contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
@@ -219,6 +228,7 @@ _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
 _POSITION_GAINS = [0.3] * 7
 _VELOCITY_GAINS = [1.0] * 7
 _DRIVE_GAIN = 0.1
+_TORQUES = JOINT_TORQUE.tolist()
 _GRIP_COSINE = np.cos(np.radians(70))
 _STATE_JOINTS = [*ARM, *FINGERS]
 _WAYPOINT_SPACING = 0.01  # m

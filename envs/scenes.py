@@ -94,12 +94,19 @@ def make_scene(
     )
 
 
-def settle(client: int, bodies: list[int], config: Config) -> bool:
-    """Step until the bodies rest; False if they still move after scene.settle_seconds."""
+def settle(client: int, bodies: list[int], config: Config, looks: int = 1) -> bool:
+    """Step until the bodies rest; False if they still move after scene.settle_seconds.
+
+    looks: how many times in a row, 12 steps apart, they must be found at rest. One look cannot tell
+    a body that rests from one that begins to topple or turns round at the top of a bounce.
+    """
+    found = 0
     for step in range(int(config.scene.settle_seconds * config.sim.frequency)):
         pybullet.stepSimulation(physicsClientId=client)
-        if step % 12 == 11 and all(_resting(client, body) for body in bodies):
-            return True
+        if step % 12 == 11:
+            found = found + 1 if all(_resting(client, body) for body in bodies) else 0
+            if found == looks:
+                return True
     return False
 
 

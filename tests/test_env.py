@@ -19,6 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from envs.cell import PhysicsError
 from envs.grasping_env import RobotGraspingEnv, scripted_action
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
+from envs.scenes import settle
 from utils.config import ConfigError
 from utils.errors import UserError
 
@@ -212,6 +213,126 @@ def test_scene_seed_asks_for_one_scene(make):
     assert other["scene_seed"] != info["scene_seed"]
 
 
+# --- Sparing the solver until the first touch ---------------------------------------------------
+
+
+@pytest.fixture
+def make_awake(make, monkeypatch):
+    """Makes environments whose objects never sleep and whose solver never spares itself."""
+
+    def make_env(**settings) -> RobotGraspingEnv:
+        env = make(**settings)
+        monkeypatch.setattr(env.cell, "calm", lambda: settle_only(env.cell))
+        return env
+
+    return make_env
+
+
+def settle_only(cell) -> bool:
+    """What `Cell.calm` does before it decides."""
+    settle(cell.client, cell.bodies, cell.config, looks=5)
+    return False
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_a_free_arm_moves_as_with_full_precision(make, make_awake, control):
+    """Up to 0.5 mrad, 5 mrad/s and 0.2 mm of the gripper's opening, all in full motion. Against
+    3,000 iterations the solver at full precision is off by as much, the gripper's 0.05 mm apart."""
+    states = []
+    for env in (make(control=control), make_awake(control=control)):
+        env.reset(seed=0)
+        rng = np.random.default_rng(0)
+        for _ in range(25):
+            action = rng.uniform(-1, 1, env.action_space.shape)
+            action[2] = action[2] if control == "joint" else abs(action[2])
+            observation, *_, info = env.step(action)
+            states.append(observation["state"])
+        assert not env.cell.robot.touches()
+    spared, full = np.reshape(states, (2, 25, 15))
+    np.testing.assert_allclose(spared[:, :7], full[:, :7], atol=5e-4)
+    np.testing.assert_allclose(spared[:, 7:14], full[:, 7:14], atol=5e-3)
+    np.testing.assert_allclose(spared[:, 14], full[:, 14], atol=2e-4)
+
+
+@pytest.mark.parametrize("scenario", ["isolated", "pile"])
+def test_untouched_objects_lie_still(make, scenario):
+    env = make(objects="primitives", scenario=scenario)
+    _, info = env.reset(seed=2)
+    *_, begun = env.step(np.array([0, 0, 1, 0, 0, 0, 1.0]))
+    np.testing.assert_allclose(begun["object_position"], info["object_position"], atol=1e-5)
+    before = [env.cell.object_pose(i) for i in range(len(env.cell.bodies))]
+    for _ in range(40):
+        env.step(np.array([0, 0, 1, 0, 0, 0, 1.0]))
+    for i, pose in enumerate(before):
+        np.testing.assert_array_equal(env.cell.object_pose(i), pose)
+
+
+def test_a_sleeping_object_is_pushed_like_one_awake(make, make_awake):
+    ends = []
+    for env in (make(control="ee_planar"), make_awake(control="ee_planar")):
+        _, info = env.reset(seed=0)
+        start = info["object_position"]
+        # Down beside the cube with closed fingers, then through it.
+        for goal in (start + [0.0, 0.09, 0.1], start + [0.0, 0.09, 0.0], start - [0.0, 0.04, 0.0]):
+            for _ in range(12):
+                offset = np.clip((goal - info["end_effector_position"]) / 0.05, -0.4, 0.4)
+                *_, info = env.step(np.array([*offset, 0.0, -1.0]))
+        ends.append(info["object_position"] - start)
+    assert ends[1][1] < -0.03, "the cube has not been pushed"
+    np.testing.assert_allclose(ends[0], ends[1], atol=2e-3)
+
+
+def test_what_is_let_go_falls_however_long_it_was_held(picked):
+    env, _ = picked
+    for _ in range(40):  # 3.3 s: Bullet lets sleep what has lain still for 2 s
+        *_, info = env.step(np.array([0, 0, 0, 0, -1.0]))
+    assert info["grasped"] and info["object_position"][2] > env.settings.lift_height
+    for _ in range(8):
+        *_, info = env.step(np.array([0, 0, 0, 0, 1.0]))
+    assert not info["grasped"] and info["object_position"][2] < 0.05
+
+
+def test_objects_on_the_move_are_not_put_to_sleep(make, monkeypatch):
+    env = make()
+    load = env.cell.load
+
+    def load_and_spin(scene):
+        load(scene)
+        for body in env.cell.bodies:  # a top, on a table without friction
+            pybullet.changeDynamics(body, -1, lateralFriction=0, angularDamping=0,
+                                    physicsClientId=env.cell.client)  # fmt: skip
+            pybullet.resetBaseVelocity(
+                body, [0, 0, 0], [0, 0, 3.0], physicsClientId=env.cell.client
+            )
+
+    monkeypatch.setattr(env.cell, "load", load_and_spin)
+    env.reset(seed=0)
+    before = env.cell.object_pose(0)
+    env.step(np.zeros(7))
+    turn = env.cell.object_pose(0)[:3, :3] @ before[:3, :3].T
+    assert np.arctan2(turn[1, 0], turn[0, 0]) == pytest.approx(3.0 * 20 / 240, rel=0.1)
+
+
+def scripted_episode(env) -> Iterator[tuple]:
+    """What a scripted pick gives back, step by step."""
+    _, info = env.reset(seed=1)
+    done = False
+    while not done:
+        result = env.step(scripted_action(env, info))
+        *_, terminated, truncated, info = result
+        done = terminated or truncated
+        yield result
+
+
+def test_picks_are_deterministic_interleaved_or_not(make):
+    settings = {"control": "ee_planar"}
+    alone = list(scripted_episode(make(**settings)))
+    assert alone[-1][-1]["is_success"]
+    other = run(make(objects="primitives", scenario="pile"), 3, len(alone) - 1)
+    together = list(zip(scripted_episode(make(**settings)), other, strict=True))
+    assert_identical(alone, [pair[0] for pair in together])
+
+
 # --- How episodes end -------------------------------------------------------------------------
 
 
@@ -402,10 +523,7 @@ def test_joint_and_velocity_limits_hold_at_every_physics_step(make, control, man
     # A joint is stopped in the physics step after the one that took it over its limit.
     assert (np.min(positions, axis=0) >= JOINT_LOWER - 5e-3).all()
     assert (np.max(positions, axis=0) <= JOINT_UPPER + 5e-3).all()
-    # Known gap: a joint may be thrown over its speed for a physics step or two. Measured: 2 of
-    # 4,000 steps in "ee-random again", by 16 %, none in the other eight cases.
-    speed = (np.abs(velocities) / JOINT_VELOCITY).max(axis=1)
-    assert np.mean(speed > 1 + 1e-6) <= 1e-3 and speed.max() < 1.2
+    assert (np.abs(velocities) <= JOINT_VELOCITY + 1e-6).all()
 
 
 def test_the_command_does_not_wind_up_at_the_workspace_wall(make):
