@@ -69,14 +69,10 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     """
     folder = data_folder(config)
     _claim(folder, config)
-    missing = [
-        (split, number)
-        for split in SPLITS
-        for number in range(shard_count(config, split))
-        if not shard_path(folder, split, number).exists()
-    ][rank::ranks]
+    missing = missing_shards(config, folder, rank, ranks)
     if not missing:
         return folder
+    object_sets(config)  # what is wrong with them is told here, not by a worker that dies of it
     workers = min(config.data.workers or os.cpu_count() or 1, len(missing))
     pool = ProcessPoolExecutor(
         workers,
@@ -108,6 +104,15 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     return folder
 
 
+def missing_shards(config: Config, folder: Path, rank: int, ranks: int) -> list[tuple[str, int]]:
+    """(split, number) of this process's shards that are not there. Whose a shard is does not depend
+    on what is there, because another process may be writing at this moment."""
+    everything = [
+        (split, number) for split in SPLITS for number in range(shard_count(config, split))
+    ]
+    return [job for job in everything[rank::ranks] if not shard_path(folder, *job).exists()]
+
+
 def shard_count(config: Config, split: str) -> int:
     """Shards that hold at least the configured number of frames."""
     frames = config.data.frames if split == "train" else config.data.validation_frames
@@ -117,6 +122,9 @@ def shard_count(config: Config, split: str) -> int:
 def _claim(folder: Path, config: Config) -> None:
     """Make the folder, or raise UserError if it holds something else."""
     content, mark = _content(config), folder / "content.yaml"
+    # The mark comes first, so a folder that another process claims at this moment is empty or has
+    # one by the time it is looked for.
+    occupied = any(folder.glob("[!.]*"))
     if mark.exists():
         if mark.read_text(encoding="utf-8") != content:
             raise UserError(
@@ -124,10 +132,10 @@ def _claim(folder: Path, config: Config) -> None:
                 "another folder, or leave data.root out"
             )
         return
-    if folder.exists() and any(folder.iterdir()):
+    if occupied:
         raise UserError(f"data.root {folder}: not empty and no data set; choose another folder")
-    write_atomic(folder / "config.yaml", dump_config(config))
     write_atomic(mark, content)
+    write_atomic(folder / "config.yaml", dump_config(config))
 
 
 # --- In a worker process --------------------------------------------------------------------
@@ -165,6 +173,11 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
     settings = config.objects.model_dump() | {"split": "train"}
     for name in config.data.object_sets:
         whole = load_object_set(name, cache_dir=config.cache_folder, **settings)
+        if len(whole) < 2:
+            raise UserError(
+                f"data.object_sets: {name} holds {len(whole)} object, but some have to be kept for "
+                "validation; give sets of two objects or more"
+            )
         held_out = set(range(0, len(whole), HELD_OUT))
         parts[name, "validation"] = ObjectPart(whole, sorted(held_out))
         parts[name, "train"] = ObjectPart(whole, sorted(set(range(len(whole))) - held_out))
