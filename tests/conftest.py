@@ -19,3 +19,18 @@ def box_set(config: Config):
     from envs.objects import load_object_set
 
     return load_object_set("box", cache_dir=config.cache_folder)
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory):
+    """32 training and 32 validation images of 64 pixels, and the overrides that made them."""
+    from envs.data_generation import generate
+
+    folder = tmp_path_factory.mktemp("tiny_data")
+    overrides = [
+        "sim.renderer=tiny", "camera.width=64", "camera.height=64", f"data.root={folder}",
+        "data.frames=32", "data.validation_frames=32", "data.object_sets=primitives",
+        "data.max_objects=2", "data.executed_share=0.01", "data.workers=1",
+    ]  # fmt: skip
+    generate(load_config(None, overrides))
+    return folder, overrides
