@@ -287,7 +287,7 @@ class RobotGraspingEnv(gymnasium.Env):
         position = T[:3, 3] + settings.position_step * action[:3]
         T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
-        if turn.any():
+        if any(turn.tolist()):
             T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
         return T
 

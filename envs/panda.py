@@ -129,8 +129,8 @@ class Panda:
         """(3,) origin of E in W, read from the physics."""
         state = pybullet.getLinkState(self.body, ARM[-1], physicsClientId=self.client)
         x, y, z, w = state[5]
-        approach = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
-        return np.array(state[4]) + TOOL_LENGTH * approach
+        approach = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+        return np.array([p + TOOL_LENGTH * a for p, a in zip(state[4], approach)])
 
     @property
     def q(self) -> np.ndarray:

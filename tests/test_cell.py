@@ -103,6 +103,28 @@ def test_good_grasp_succeeds_and_the_cube_ends_in_the_bin(cell, box_set):
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
+@pytest.mark.parametrize("count", [2, 12, 20, 31])  # 31: rounding would lose a step
+def test_steps_in_one_call_are_the_same_steps(config, box_set, count):
+    """A cube falls on the table and the hand presses on it: bit-identical to single steps."""
+    ends = []
+    for on_step in (None, lambda cell: None):  # with a hook every step is a call of its own
+        with Cell(config) as cell:
+            cell.build(cube_scene(box_set, position=(0.5, 0.0, 0.06)))
+            cell.on_step = on_step
+            pressing = inverse_kinematics(
+                top_down_pose([0.5, 0.0, 0.05], 0.0), cell.home, cell.home
+            )
+            cell.robot.drive_arm_to(pressing)
+            touched = False
+            for _ in range(480 // count):
+                cell.step(count)
+                touched |= cell.robot.contact_force() > 1.0
+            assert touched and cell.steps == 480 // count * count
+            state = [*cell.robot.joint_state(), cell.robot.contact_force()]
+            ends.append(np.concatenate([np.ravel(x) for x in (*state, cell.object_pose(0))]))
+    np.testing.assert_array_equal(*ends)
+
+
 @pytest.mark.parametrize(
     ("grasp", "reason"),
     [
