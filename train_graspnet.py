@@ -4,10 +4,16 @@
     python train_graspnet.py --config configs/quick.yaml
     python train_graspnet.py train.backbone=ggcnn data.frames=2000
     torchrun --nproc_per_node=2 train_graspnet.py
+    python train_graspnet.py data.kind=cornell data.root=path/to/cornell
 
 Leaves best.pt (chosen on held-out training objects), last.pt, graspnet.pt (the best one's weights
 alone), results.json, curves.png, predictions.png and TensorBoard events in
 runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it was, bit for bit.
+
+On real data (data.kind cornell or jacquard) it cross-validates: every fold of the images is tested
+by a network that is trained on the other folds for a fixed schedule. The last weights count, so no
+test image chooses anything. Each fold has its folder in the run's; results.json holds every
+prediction.
 """
 
 from __future__ import annotations
@@ -35,6 +41,15 @@ from models.graspnet import create_model
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_pictures import draw_curves, draw_predictions
 from models.graspnet_training import Team, Trainer, team
+from models.real_training_data import (
+    Fold,
+    cross_validation_results,
+    describe_fold,
+    describe_folds,
+    real_folds,
+)
+from models.rectangle_pictures import draw_rectangles
+from models.rectangle_scores import Judged
 from models.training_data import TrainingData, simulated_data
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
@@ -53,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_writable("--weights", options.weights)
     check_resume(config, options.resume)
     with team(config.train.device, dict(os.environ)) as us:
+        if config.data.kind != "simulated":
+            return cross_validate(config, options.resume, options.weights, us)
         data = make_data(config, us)
         run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
         trainer = make_trainer(config, data, us)
@@ -77,7 +94,7 @@ def check_resume(config: Config, run: Path | None) -> None:
     """Raise UserError if a run cannot be gone on with, or not with this config."""
     if run is None:
         return
-    if not (run / "last.pt").is_file():
+    if not (run / "last.pt").is_file() and not any(run.glob("fold*/last.pt")):
         raise UserError(f"--resume {run}: no last.pt in there; start a new run")
     before, now = (c.model_dump() for c in (load_config(run / "config.yaml"), config))
     for section, key in FREE_TO_CHANGE:
@@ -114,7 +131,8 @@ def open_run(config: Config) -> str:
 def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
     """A new network, or one that starts from train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
-    model = create_model(name=config.train.backbone, max_width=config.train.max_width)
+    max_width = config.train.max_width or data.max_width
+    model = create_model(name=config.train.backbone, max_width=max_width)
     if config.train.initial is not None:
         load_weights(model, load_checkpoint(config.train.initial, KIND), config.train.initial)
     total_steps = steps_per_epoch(config, data) * config.train.epochs
@@ -168,7 +186,9 @@ def train(
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
                 row |= data.score(trainer.model)
                 history.append(row)
-                if row[data.chosen_by] == max(old[data.chosen_by] for old in history):
+                if data.chosen_by and row[data.chosen_by] == max(
+                    old[data.chosen_by] for old in history
+                ):
                     trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
                 save_last(run, config, data, trainer, history)
                 for name, value in row.items():
@@ -238,6 +258,59 @@ def save_results(
     draw_predictions(run / "predictions.png", best.model, data.validation)
     print(f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}")
     print(f"score it: python evaluate.py evaluate.policies=heuristic,{run / 'graspnet.pt'}")
+
+
+# --- Real data: cross-validation ------------------------------------------------------------
+
+
+def cross_validate(config: Config, resume: Path | None, weights: Path | None, us: Team) -> int:
+    """Train and test a network for every fold; results so far are saved after each."""
+    if weights is not None and config.data.fold is None:
+        raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
+    folds = real_folds(config)
+    run = resume or Path(us.broadcast(us.leads and open_run(config)))
+    judged: dict[int, list[Judged]] = {}
+    for fold in folds:
+        folder = run / f"fold{fold.number}"
+        trainer = make_trainer(config, fold.data, us)
+        last = folder / "last.pt"
+        history = trainer.load(last)["history"] if last.is_file() else []
+        if us.leads:
+            folder.mkdir(exist_ok=True)
+            announce(config, folder, fold.data, trainer)
+        us.wait()
+        if not train(config, folder, fold.data, trainer, history):
+            if us.leads:
+                print(f"stopped in fold {fold.number}; go on with --resume {run}")
+            return 130
+        if us.leads:
+            judged[fold.number] = fold.judge(trainer.model)
+            save_fold(config, folder, fold, judged[fold.number], trainer, history, weights)
+            print(describe_fold(fold, judged[fold.number]), flush=True)
+            results = cross_validation_results(folds, judged)
+            write_json_atomic(
+                run / "results.json", {"schema": 1, "commit": git_state().commit, **results}
+            )
+        us.wait()
+    if us.leads:
+        print(describe_folds(config, judged))
+        print(f"every prediction: {run / 'results.json'} and {run / 'fold*' / 'predictions.png'}")
+    return 0
+
+
+def save_fold(
+    config: Config, folder: Path, fold: Fold, judged: Sequence[Judged], trainer: Trainer,
+    history: Sequence[dict], weights: Path | None,
+) -> None:  # fmt: skip
+    """A fold's network alone, its curves, and pictures of all its test images."""
+    right = sum(one.correct for one in judged)
+    for path in filter(None, [folder / "graspnet.pt", weights]):
+        save_graspnet(
+            path, trainer.model, fold.data.metres_per_pixel, config.model_dump(mode="json"),
+            scores={"correct": right, "images": len(judged)},
+        )  # fmt: skip
+    draw_curves(folder / "curves.png", history)
+    draw_rectangles(folder / "predictions.png", fold.test_samples, judged)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.utils.data import Dataset
 
 from models.grasp_examples import AtPixelSize, GraspExamples, LabelledImages
-from models.graspnet import GraspNet
+from models.graspnet import PANDA_HAND, GraspNet
 from models.graspnet_scores import score_labels
 from utils.augmentation import Augmentation
 from utils.config import Config
@@ -27,15 +28,17 @@ CROP = 160  # pixels, side of a training example: all context that the network u
 @dataclass(frozen=True)
 class TrainingData:
     """train, validation: what to learn from and what to choose the checkpoint by. score: of a
-    network on the validation images, by name. chosen_by: the score of which higher is better.
-    metres_per_pixel: the scale of all images.
+    network on the validation images, by name. chosen_by: the score of which higher is better; None:
+    nothing is chosen, the last checkpoint counts. metres_per_pixel: the scale of all images.
+    max_width: metres, the widest opening that a network needs to tell unless the config says.
     """
 
-    train: GraspExamples
+    train: Dataset
     validation: LabelledImages
     score: Callable[[GraspNet], dict[str, float]]
-    chosen_by: str
+    chosen_by: str | None
     metres_per_pixel: float
+    max_width: float
 
 
 def simulated_data(config: Config, folder: Path, focal: float, distance: float) -> TrainingData:
@@ -63,6 +66,7 @@ def simulated_data(config: Config, folder: Path, focal: float, distance: float) 
         lambda model: score_labels(model, validation)._asdict(),
         "label_quality",
         metres_per_pixel,
+        PANDA_HAND.max_opening,
     )
 
 

@@ -143,6 +143,10 @@ class EvaluateConfig(Section):
 class DataConfig(Section):
     kind: Literal["simulated", "cornell", "jacquard"]
     root: Annotated[Path, Field(strict=False)] | None
+    split: Literal["object", "image"]
+    folds: Annotated[int, Field(ge=2)]
+    fold: Annotated[int, Field(ge=0)] | None
+    repeats: Count
     frames: Count
     validation_frames: Count
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
@@ -155,12 +159,14 @@ class DataConfig(Section):
     def _real_data_have_a_root(self) -> DataConfig:
         if self.kind != "simulated" and self.root is None:
             raise ValueError(f"kind {self.kind} needs root, the folder that holds the data set")
+        if self.fold is not None and self.fold >= self.folds:
+            raise ValueError(f"fold {self.fold} is not below folds ({self.folds})")
         return self
 
 
 class TrainConfig(Section):
     backbone: Name
-    max_width: Positive
+    max_width: Positive | None
     initial: Annotated[Path, Field(strict=False)] | None
     epochs: Count
     batch_size: Count

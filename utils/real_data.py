@@ -404,6 +404,29 @@ def block_folds(object_ids: Sequence[str], folds: int, seed: int | None = None) 
     return [_split(len(object_ids), np.concatenate(blocks[a:b])) for a, b in zip(cuts, cuts[1:])]
 
 
+def object_folds(object_ids: Sequence[str], folds: int, seed: int | None = None) -> list[Split]:
+    """k folds for cross-validation by object: those of a test image are in no training image.
+
+    As `block_folds`, but with all images of an object in one block, wherever they stand in the data
+    set; objects come in the order in which they first appear.
+    """
+    first: dict[str, int] = {}
+    for index, name in enumerate(object_ids):
+        first.setdefault(name, index)
+    order = sorted(range(len(object_ids)), key=lambda i: first[object_ids[i]])
+    splits = block_folds([object_ids[i] for i in order], folds, seed)
+    return [_split(len(order), [order[i] for i in split.test]) for split in splits]
+
+
+def image_folds(count: int, folds: int, seed: int) -> list[Split]:
+    """k folds for cross-validation by image, drawn at random: a test image's object may be known
+    from training images. Fold sizes differ by at most one."""
+    if not 2 <= folds <= count:
+        raise UserError(f"folds: got {folds}, expected 2 to {count} (the number of images)")
+    order = np.random.default_rng(seed).permutation(count)
+    return [_split(count, test) for test in np.array_split(order, folds)]
+
+
 def _test_size(count: int, fraction: float) -> int:
     """At least one on either side."""
     if count < 2 or not 0 < fraction < 1:

@@ -1,0 +1,140 @@
+"""From real images with labelled rectangles to what GraspNet sees and learns.
+
+Rectangles are moved with the image and drawn as dense targets last, so turned labels are exact and
+an example costs as much as its crop. Every example is a pure function of (seed, epoch, index), as
+in `models.grasp_examples`. This module knows no file format and no network's weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from models.grasp_examples import Example
+from models.graspnet import GraspTargets, targets_from_labels, to_input
+from utils.augmentation import Augmentation, LabelledImage
+from utils.real_data import RealSample
+from utils.rectangles import GraspRectangle, rasterise
+
+
+@dataclass(frozen=True)
+class View:
+    """How the images of a camera become the network's: a central square, resampled.
+
+    side: pixels of the image that the square measures; it never depends on the labels. size: pixels
+    that it measures for the network. metres_per_pixel: what one of these spans at the image's
+    typical depth, which turns widths from pixels to metres and back.
+    """
+
+    side: int
+    size: int
+    metres_per_pixel: float
+
+    def matrix(self, shape: tuple[int, int]) -> np.ndarray:
+        """(3, 3) that takes a pixel (u, v, 1) of an image of shape (H, W) to its place in here."""
+        zoom = self.size / self.side
+        height, width = shape
+        matrix = np.diag([zoom, zoom, 1.0])
+        matrix[:2, 2] = (self.size - 1) / 2 - zoom * np.array([width - 1, height - 1]) / 2
+        return matrix
+
+    def warp(
+        self, sample: RealSample, change: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, list[GraspRectangle]]:
+        """rgb (size, size, 3) uint8, depth (size, size) metres and the labelled rectangles in here,
+        after a `change` (3, 3) of the view's pixels. Beside the image its border goes on."""
+        matrix = self.matrix(sample.depth.shape)
+        matrix = matrix if change is None else change @ matrix
+        rgb, depth = (
+            cv2.warpAffine(
+                image, matrix[:2], (self.size, self.size), flags=method,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+            for image, method in ((sample.rgb, cv2.INTER_LINEAR), (sample.depth, cv2.INTER_NEAREST))
+        )  # fmt: skip
+        return rgb, depth, [rectangle.transformed(matrix) for rectangle in sample.positives]
+
+
+class RectangleImages:
+    """Real samples as `LabelledImage`s seen through a view; their widths are pixels of the view."""
+
+    def __init__(self, samples: Sequence[RealSample], view: View):
+        self.samples, self.view = samples, view
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        rgb, depth, rectangles = self.view.warp(self.samples[index])
+        quality, width = map(torch.from_numpy, rasterise(rectangles, depth.shape))
+        return LabelledImage(
+            torch.from_numpy(np.moveaxis(rgb, -1, 0).copy()), torch.from_numpy(depth), quality,
+            width, torch.ones(depth.shape, dtype=torch.bool), width_in_pixels=True,
+        )  # fmt: skip
+
+
+class RectangleExamples(Dataset):
+    """Training examples of real samples, each changed at random and cropped around a label.
+
+    repeats: how often each sample comes in an epoch. crop: side of an example, pixels of the view.
+    max_width: metres; wider labels count as this. Indices are pairs (epoch, index).
+    """
+
+    def __init__(
+        self, samples: Sequence[RealSample], view: View, augmentation: Augmentation, *,
+        seed: int, repeats: int, crop: int, max_width: float, graspable_from: float,
+    ):  # fmt: skip
+        self.samples, self.view, self.augmentation = samples, view, augmentation
+        self.seed, self.repeats, self.crop = seed, repeats, min(crop, view.size)
+        self.max_width, self.graspable_from = max_width, graspable_from
+
+    def __len__(self) -> int:
+        return self.repeats * len(self.samples)
+
+    def __getitem__(self, place: tuple[int, int]) -> Example:
+        epoch, index = place
+        rng = np.random.default_rng([self.seed, epoch, index])
+        change = self.augmentation.draw(rng, (self.view.size, self.view.size))
+        rgb, depth, rectangles = self.view.warp(
+            self.samples[index % len(self.samples)], change.matrix((self.view.size, self.view.size))
+        )
+        rgb, depth = self._disturb(rgb, depth, rng)
+        row, column = self._corner(rectangles, rng)
+        # The whole view is normalised, then cut: at test time the median is the whole view's too.
+        x = to_input(rgb, depth)[:, row : row + self.crop, column : column + self.crop]
+        cut = np.array([[1.0, 0.0, -column], [0.0, 1.0, -row], [0.0, 0.0, 1.0]])
+        return Example(x, self._targets([rectangle.transformed(cut) for rectangle in rectangles]))
+
+    def _disturb(
+        self, rgb: np.ndarray, depth: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.augmentation.colour is not None:
+            changed = self.augmentation.colour(torch.from_numpy(np.moveaxis(rgb, -1, 0)), rng)
+            rgb = np.ascontiguousarray(changed.permute(1, 2, 0).numpy())
+        if self.augmentation.depth_noise is not None:
+            depth = self.augmentation.depth_noise(torch.from_numpy(depth), rng).numpy()
+        return rgb, depth
+
+    def _corner(
+        self, rectangles: Sequence[GraspRectangle], rng: np.random.Generator
+    ) -> tuple[int, int]:
+        """Row and column at which a crop starts that holds a random label, wherever in it."""
+        u, v = rectangles[rng.integers(len(rectangles))].centre
+        shift = rng.uniform(-0.4, 0.4, size=2) * self.crop
+        corner = np.rint(np.array([v, u]) + shift - self.crop / 2).astype(int)
+        row, column = np.clip(corner, 0, self.view.size - self.crop)
+        return int(row), int(column)
+
+    def _targets(self, rectangles: Sequence[GraspRectangle]) -> GraspTargets:
+        """Targets (C, crop, crop) of rectangles in the crop's pixels."""
+        quality, width = map(torch.from_numpy, rasterise(rectangles, (self.crop, self.crop)))
+        metres = (width * self.view.metres_per_pixel).clamp(max=self.max_width)
+        targets = targets_from_labels(
+            quality[None], metres[None], graspable_from=self.graspable_from
+        )
+        return GraspTargets(*(target[0] for target in targets))
