@@ -13,6 +13,7 @@ import yaml
 
 from utils.config import load_config
 from utils.errors import UserError
+from utils.files import write_json_atomic
 from utils.overlay import FAILURE_COLOR, SUCCESS_COLOR, draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
@@ -27,7 +28,7 @@ from utils.results import (
     write_csv,
     write_results,
 )
-from utils.runs import environment, git_state, new_run_folder, write_json_atomic
+from utils.runs import environment, git_state, new_run_folder
 from utils.transforms import ImageGrasp
 
 

@@ -11,14 +11,14 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
 
 from utils.config import Config
 from utils.errors import UserError
-from utils.files import write_atomic
+from utils.files import write_atomic, write_json_atomic
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
 from utils.transforms import ImageGrasp
 
@@ -283,12 +283,6 @@ def write_results(
         "rows": [asdict(row) for row in rows],
     }
     write_json_atomic(path, content)
-
-
-def write_json_atomic(path: Path, content: Mapping) -> None:
-    """Indented strict JSON; raises ValueError on NaN or infinity before touching the file."""
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
-    write_atomic(path, text + "\n")
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 from utils.config import Config, dump_config
 from utils.errors import UserError
-from utils.files import write_atomic
-from utils.results import write_json_atomic
+from utils.files import write_atomic, write_json_atomic
 
 __all__ = [
     "GitState",
@@ -26,7 +25,6 @@ __all__ = [
     "environment",
     "git_state",
     "new_run_folder",
-    "write_json_atomic",
 ]
 
 REPOSITORY = Path(__file__).resolve().parent.parent
