@@ -115,7 +115,7 @@ class Cell:
         without which nothing is done. `wake` has to be called at the first touch.
 
         The objects sleep, which is to lie still at no cost until something hits them; and the
-        solver stops a little earlier, which a free arm does not show.
+        solver stops a little earlier, which moves a free arm's joints by less than 0.5 mrad.
         """
         if not settle(self.client, self.bodies, self.config, looks=_CALM_LOOKS):
             return False
