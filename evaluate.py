@@ -4,7 +4,7 @@
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
 
-Prints a table and leaves results.json, results.csv, rounds.jsonl and report.html in
+Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
 runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
 """
 
@@ -19,6 +19,7 @@ import functools
 import multiprocessing
 import platform
 import signal
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -26,6 +27,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import imageio.v3 as iio
 from tqdm import tqdm
 
 from envs.cell import Cell
@@ -37,8 +39,9 @@ from envs.studio import Film
 from models.planners import make_planner
 from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
 from utils.errors import UserError
+from utils.files import write_atomic
 from utils.geometry import GripperGeometry, Workspace
-from utils.overlay import draw_grasp
+from utils.overlay import contact_sheet, draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
     RoundRecord,
@@ -53,6 +56,8 @@ from utils.results import (
 )
 from utils.runs import check_writable, git_state, new_run_folder
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+
+MOST_FAILURES = 24  # on failures.png
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -74,9 +79,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, config, git_state().commit, device, complete)
     write_csv(run / "results.csv", rows)
-    write_report(
-        run / "report.html", rows, outcome.rounds, config, outcome.gallery, outcome.films, device
-    )
+    gallery = _balanced(outcome.gallery, config.evaluate.gallery)
+    write_report(run / "report.html", rows, outcome.rounds, config, gallery, outcome.films, device)
+    write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
     if not complete:
         print(f"{interruption(len(outcome.rounds), config)}; go on with --resume {run}")
@@ -231,7 +236,6 @@ def evaluate(config: Config, run: Path) -> Outcome:
         progress.close()
     outcome.rounds.sort(key=lambda r: _rank(r, config))
     outcome.gallery.sort(key=lambda item: item.caption)  # not in the order of the workers' speed
-    outcome.gallery = _balanced(outcome.gallery, config.evaluate.gallery)
     outcome.films.sort()
     return outcome
 
@@ -247,6 +251,14 @@ def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progre
         progress.update(len(rounds))
 
 
+def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
+    """One picture of failed grasps, of each policy in turn; none if nothing failed."""
+    failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
+    if failures:
+        sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
+        write_atomic(path, iio.imwrite("<bytes>", sheet, extension=".png"))
+
+
 def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     plan = config.evaluate
     return (
@@ -259,10 +271,20 @@ def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
 
 def _balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
     """`count` pictures, half of them failures where there are enough: those teach the most."""
-    failures = [p for p in pictures if not p.success]
-    successes = [p for p in pictures if p.success]
+    failures = _in_turns([p for p in pictures if not p.success])
+    successes = _in_turns([p for p in pictures if p.success])
     take = min(len(failures), max(count // 2, count - len(successes)))
     return failures[:take] + successes[: count - take]
+
+
+def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
+    """One of each policy, then another of each: the worst policy fails most and would fill all."""
+    number_of: Counter[str] = Counter()
+    turns = []
+    for position, item in enumerate(pictures):
+        turns.append((number_of[item.policy], position))
+        number_of[item.policy] += 1
+    return [pictures[position] for _, position in sorted(turns)]
 
 
 _worker_config: Config
@@ -288,8 +310,8 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
         privileged = getattr(planner, "needs_truth", False)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
-            if task.keep_pictures:
-                pictures.append(picture(frame, grasp, outcome, f"{policy}, {task.scenario}"))
+            if task.keep_pictures or not outcome.success:
+                pictures.append(picture(frame, grasp, outcome, policy, task.scenario))
 
         film = Film(cell) if task.film_folder is not None else None
         rounds.append(
@@ -308,11 +330,13 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     return rounds, pictures, films
 
 
-def picture(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, caption: str) -> GalleryItem:
+def picture(
+    frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy: str, scenario: str
+) -> GalleryItem:
     """The frame with the grasp drawn in, and how it went."""
     on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
     image = draw_grasp(frame.rgb, on_image, frame.K, success=outcome.success)
-    return GalleryItem(image, f"{caption}: {outcome.reason}", outcome.success)
+    return GalleryItem(image, f"{policy}, {scenario}: {outcome.reason}", outcome.success, policy)
 
 
 if __name__ == "__main__":

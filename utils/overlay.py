@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -11,6 +13,7 @@ SUCCESS_COLOR = (52, 211, 123)  # RGB
 FAILURE_COLOR = (248, 92, 92)
 PLATE_LENGTH = 0.02  # m, width of a Panda fingertip across the closing line
 OUTLINE = (20, 20, 20)
+TITLE_HEIGHT = 20  # pixels, of a caption
 _SHIFT = 4  # OpenCV's fixed-point bits: ends of lines at 1/16 pixel
 
 
@@ -49,6 +52,28 @@ def draw_grasp(
         for start, end, thickness in lines:
             _line(drawn, start, end, shade, thickness + extra)
     return drawn
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 6
+) -> np.ndarray:
+    """Images (H, W, 3) uint8 of one size in rows of `columns`, each with its caption above."""
+    height, width = images[0].shape[:2]
+    tiles = []
+    for image, caption in zip(images, captions):
+        title = np.full((TITLE_HEIGHT, width, 3), 255, np.uint8)
+        scale = min(0.42, 0.42 * width / max(_text_width(caption), 1))
+        cv2.putText(
+            title, caption, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, scale, OUTLINE, 1, cv2.LINE_AA
+        )
+        tiles.append(np.vstack([title, image]))
+    columns = min(columns, len(tiles))
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+def _text_width(text: str) -> int:
+    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]
 
 
 def _line(image: np.ndarray, start, end, color, thickness: int) -> None:

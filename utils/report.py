@@ -46,6 +46,7 @@ class GalleryItem:
     image: np.ndarray
     caption: str
     success: bool
+    policy: str = ""
 
 
 def write_report(
