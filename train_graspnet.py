@@ -71,13 +71,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if config.data.kind != "simulated":
             return cross_validate(config, options.resume, options.weights, us)
         data = make_data(config, us)
-        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
         trainer = make_trainer(config, data, us)
-        history = trainer.load(run / "last.pt")["history"] if options.resume else []
+        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
+        history, losses = load_progress(trainer, run / "last.pt")
         if us.leads:
             announce(config, run, data, trainer)
 
-        finished = train(config, run, data, trainer, history)
+        finished = train(config, run, data, trainer, history, losses)
 
         if us.leads:
             save_results(run, data, history, options.weights)
@@ -157,30 +157,37 @@ def announce(config: Config, run: Path, data: TrainingData, trainer: Trainer) ->
     )
 
 
+def load_progress(trainer: Trainer, last: Path) -> tuple[list[dict], list[dict]]:
+    """History and losses (see `train`) of a checkpoint that the trainer goes on from, if there is
+    one."""
+    saved = trainer.load(last) if last.is_file() else {}
+    return saved.get("history", []), saved.get("losses", [])
+
+
 def train(
-    config: Config, run: Path, data: TrainingData, trainer: Trainer, history: list[dict]
-) -> bool:
+    config: Config, run: Path, data: TrainingData, trainer: Trainer,
+    history: list[dict], losses: list[dict],
+) -> bool:  # fmt: skip
     """Train to the end of the schedule, or until Ctrl-C; whether the end was reached.
 
-    history gets a row an epoch: mean losses and the scores on the validation images.
+    history gets a row an epoch: mean losses and the scores on the validation images. losses: of
+    the steps already taken in the epoch that history lacks.
     """
     us, steps = trainer.team, steps_per_epoch(config, data)
     writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if us.leads else None
     bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not us.leads)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:
-        while trainer.step < trainer.total_steps:
-            epoch, skip = divmod(trainer.step, steps)
-            losses = []
-            for batch in batches(config, data, trainer.team, epoch, skip):
+        for epoch in range(len(history), config.train.epochs):
+            for batch in batches(config, data, us, epoch, skip=trainer.step - epoch * steps):
                 losses.append(trainer.train_step(batch))
                 bar.update()
                 bar.set_postfix(loss=f"{losses[-1]['loss']:.3f}", epoch=epoch + 1)
                 if us.any(interrupted.is_set()):
-                    save_last(run, config, data, trainer, history)
+                    save_last(run, config, data, trainer, history, losses)
                     return False
                 if time.monotonic() - last_save > SAVE_SECONDS:
-                    save_last(run, config, data, trainer, history)
+                    save_last(run, config, data, trainer, history, losses)
                     last_save = time.monotonic()
             if us.leads:
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
@@ -190,12 +197,13 @@ def train(
                     old[data.chosen_by] for old in history
                 ):
                     trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
-                save_last(run, config, data, trainer, history)
+                save_last(run, config, data, trainer, history, losses=[])
                 for name, value in row.items():
                     writer.add_scalar(name, value, trainer.step)
                 writer.add_scalar("lr", trainer.scheduler.get_last_lr()[0], trainer.step)
                 writer.flush()
                 bar.write(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+            losses = []
             us.wait()
     return True
 
@@ -217,10 +225,12 @@ def batches(config: Config, data: TrainingData, us: Team, epoch: int, skip: int)
 
 
 def save_last(
-    run: Path, config: Config, data: TrainingData, trainer: Trainer, history: list[dict]
-) -> None:
+    run: Path, config: Config, data: TrainingData, trainer: Trainer,
+    history: list[dict], losses: list[dict],
+) -> None:  # fmt: skip
     if trainer.team.leads:
-        trainer.save(run / "last.pt", config, data.metres_per_pixel, history=history)
+        progress = {"history": history, "losses": losses}
+        trainer.save(run / "last.pt", config, data.metres_per_pixel, **progress)
 
 
 def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
@@ -273,13 +283,12 @@ def cross_validate(config: Config, resume: Path | None, weights: Path | None, us
     for fold in folds:
         folder = run / f"fold{fold.number}"
         trainer = make_trainer(config, fold.data, us)
-        last = folder / "last.pt"
-        history = trainer.load(last)["history"] if last.is_file() else []
+        history, losses = load_progress(trainer, folder / "last.pt")
         if us.leads:
             folder.mkdir(exist_ok=True)
             announce(config, folder, fold.data, trainer)
         us.wait()
-        if not train(config, folder, fold.data, trainer, history):
+        if not train(config, folder, fold.data, trainer, history, losses):
             if us.leads:
                 print(f"stopped in fold {fold.number}; go on with --resume {run}")
             return 130

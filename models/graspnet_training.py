@@ -83,7 +83,9 @@ def choose_device(name: str, local_rank: int = 0) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UserError(f"train.device: {name!r} is no device; use auto, cpu or cuda") from None
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise UserError(f"train.device: got {name!r}, expected auto, cpu, cuda or cuda:N")
     if device.type == "cuda":
         count = torch.cuda.device_count()
         index = local_rank if device.index is None else device.index
@@ -124,6 +126,11 @@ class Trainer:
     """
 
     def __init__(self, model: GraspNet, settings: TrainConfig, total_steps: int, team: Team):
+        if settings.batch_size % team.ranks:
+            raise UserError(
+                f"train.batch_size is {settings.batch_size}, but {team.ranks} processes have to "
+                "share it equally; make it a multiple"
+            )
         self.settings, self.team, self.total_steps, self.step = settings, team, total_steps, 0
         self.precision = choose_precision(settings.precision, team.device)
         model = model.to(team.device, memory_format=torch.channels_last)
