@@ -18,9 +18,13 @@ prediction.
 
 from __future__ import annotations
 
+import os
+
+# The processes that load images need the cores while a thread waits for another one.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import argparse
 import math
-import os
 import signal
 import time
 from collections.abc import Iterator, Sequence

@@ -230,14 +230,16 @@ def targets_from_labels(
 
     quality, width: (B, K, H, W), in [0, 1] and metres. valid: (B, 1, H, W) weights or None for 1.
     At each pixel the quality is the best bin's, the width the best bin's, and the angle's target
-    gives every bin its share of the summed quality: where several angles are good, all of them
-    are right (one hard angle makes the head collapse, see notes/grasping.md). Pixels that reach
-    `graspable_from` teach angle and width.
+    gives every bin its share of the summed cubes of quality: where several angles are good, all of
+    them are right (one hard angle makes the head collapse, see notes/grasping.md), and the cube,
+    which is the labels' plain product of factors, keeps the barely feasible ones small. Pixels that
+    reach `graspable_from` teach angle and width.
     """
     best, bin_ = quality.max(dim=1, keepdim=True)
-    total = quality.sum(dim=1, keepdim=True)
+    share = quality**3
+    total = share.sum(dim=1, keepdim=True)
     bins = quality.shape[1]
-    angle = torch.where(total > 0, quality / total.clamp(min=1e-12), 1 / bins)
+    angle = torch.where(total > 0, share / total.clamp(min=1e-12), 1 / bins)
     of_best = width.gather(1, bin_).nan_to_num(0.0)
     valid = torch.ones_like(best) if valid is None else valid.to(best.dtype)
     return GraspTargets(best, angle, of_best, valid, valid * (best >= graspable_from))

@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 from models.grasp_examples import AtPixelSize, GraspExamples, LabelledImages
 from models.graspnet import PANDA_HAND, GraspNet
 from models.graspnet_scores import score_labels
-from utils.augmentation import Augmentation
+from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
 from utils.depth_noise import KinectNoise
 from utils.grasp_data import SimulatedDataset
@@ -54,6 +54,7 @@ def simulated_data(config: Config, folder: Path, focal: float, distance: float) 
     )
     augmentation = Augmentation(
         turn_step=np.pi / ANGLE_BINS,  # whole bins are quick; the cameras' own turns fill the gaps
+        colour=ColourJitter(hue=0.0),  # the scenes have every hue
         max_shift=0.0,  # the crop shifts
         scale=(0.97, 1.03),
         depth_noise=NoisyShare(config.train.depth_noise_share, KinectNoise(image_focal=focal)),

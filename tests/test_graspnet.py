@@ -169,8 +169,8 @@ def test_targets_of_a_pixel_with_two_good_angles() -> None:
     width[0, 0, 0, 0], width[0, 9, 0, 0] = 0.02, 0.05
     targets = targets_from_labels(quality, width)
     assert targets.quality[0, 0, 0, 0] == pytest.approx(0.9)
-    assert targets.angle[0, 0, 0, 0] == pytest.approx(0.6)
-    assert targets.angle[0, 9, 0, 0] == pytest.approx(0.4)
+    assert targets.angle[0, 0, 0, 0] == pytest.approx(27 / 35)  # 0.9^3 to 0.6^3 as 27 to 8
+    assert targets.angle[0, 9, 0, 0] == pytest.approx(8 / 35)
     assert targets.width[0, 0, 0, 0] == pytest.approx(0.02)
     assert targets.graspable.flatten().tolist() == [1, 0]
     # The pixel without a grasp: nothing undefined, and a distribution all the same.

@@ -96,22 +96,27 @@ def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
     Turning is exact for a camera that rolls about its axis with fx = fy and a central principal
     point.
     """
-    bins = image.quality.shape[0]
-    labels = torch.cat(
-        [image.quality, image.width, image.mask.float().reshape(-1, *image.depth.shape)]
-    )
-    rgb, nearest = image.rgb, torch.cat([image.depth[None], labels])
+    rgb, size = image.rgb, image.depth.shape
+    # Where each new pixel comes from, as the changed image of pixel numbers counted from 1.
+    source = torch.arange(1, image.depth.numel() + 1, dtype=torch.float32).reshape(1, *size)
     if change.mirror:
-        rgb, nearest = F.horizontal_flip(rgb), F.horizontal_flip(nearest)
+        rgb, source = F.horizontal_flip(rgb), F.horizontal_flip(source)
     rgb = _affine(tv_tensors.Image(rgb), change)
-    nearest = _affine(tv_tensors.Mask(nearest), change)
-    depth, quality, width, mask = nearest.split([1, bins, bins, len(nearest) - 1 - 2 * bins])
-    mask = mask.bool()
+    source = _affine(tv_tensors.Mask(source), change).long().flatten() - 1
+    outside = source < 0
+    source.clamp_(min=0)
+
+    def moved(values: torch.Tensor) -> torch.Tensor:
+        flat = values.flatten(-2).index_select(-1, source)
+        return flat.masked_fill_(outside, 0).unflatten(-1, size)
+
+    depth, quality, width = moved(image.depth), moved(image.quality), moved(image.width)
+    mask = moved(image.mask.reshape(-1, *size))
     quality, width, mask = turn_bins(quality, width, mask, change.turn, change.mirror)
     if image.width_in_pixels:
         width = width * change.scale
     return replace(
-        image, rgb=rgb, depth=depth[0], quality=quality, width=width,
+        image, rgb=rgb, depth=depth, quality=quality, width=width,
         mask=mask[0] if image.mask.ndim == 2 else mask,
     )  # fmt: skip
 
