@@ -46,8 +46,10 @@ from utils.report import GalleryItem, write_report
 from utils.results import (
     RoundRecord,
     append_round,
+    compare,
     interruption,
     planned_rounds,
+    print_comparisons,
     print_table,
     read_rounds,
     summarise,
@@ -75,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     rows = summarise(outcome.rounds, config.seed)
     print_table(rows)
+    print_comparisons(compare(outcome.rounds, config.seed))
     complete = interruption(len(outcome.rounds), config) is None
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, config, git_state().commit, device, complete)

@@ -23,6 +23,7 @@ from utils.results import (
     format_table,
     interruption,
     planned_rounds,
+    print_comparisons,
     print_table,
     summarise,
     write_csv,
@@ -118,6 +119,19 @@ def test_comparison_pairs_rounds_by_seed():
     assert partial.cleared.rounds == 1
     (none,) = compare([ROUNDS[1], ROUNDS[2]], seed=0)
     assert none.success is None and none.cleared is None
+
+
+def test_comparison_adds_all_of_clutter(capsys):
+    packed = [replace(r, scenario="packed") for r in (ROUNDS[0], ROUNDS[2])]  # seed 0 of each
+    isolated = [replace(r, scenario="isolated") for r in ROUNDS]
+    *single, together = compare([*ROUNDS, *packed, *isolated], seed=0)
+    assert [pair.scenario for pair in single] == ["pile", "packed", "isolated"]
+    assert (together.scenario, together.objects) == ("pile + packed", "box")
+    assert together.cleared.rounds == 3  # both seeds of pile and one of packed
+    first, second = ROUNDS[0].objects_cleared, ROUNDS[1].objects_cleared
+    assert together.cleared.value == pytest.approx(0 / 15 - (2 * first + second) / 15)
+    print_comparisons([together])
+    assert f"{-100 * (2 * first + second) / 15:+.1f} [" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

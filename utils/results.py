@@ -180,12 +180,24 @@ class Comparison:
     cleared: Difference | None
 
 
+CLUTTER = ("packed", "pile")
+
+
 def compare(rounds: Iterable[RoundRecord], seed: int) -> list[Comparison]:
-    """Every pair of policies, the later one first, on each scenario and object set they share."""
-    cells: dict[tuple[str, str], dict[str, dict[int, RoundRecord]]] = {}
+    """Every pair of policies, the later one first, on each scenario and object set they share, and
+    at last on all their rounds in clutter together, where these are of several kinds."""
+    cells: dict[tuple[str, str], dict[str, dict[tuple, RoundRecord]]] = {}
+    clutter: dict[str, dict[tuple, RoundRecord]] = {}
     for record in rounds:
+        scene = (record.scenario, record.objects, record.seed)
         policies = cells.setdefault((record.scenario, record.objects), {})
-        policies.setdefault(record.policy, {})[record.seed] = record
+        policies.setdefault(record.policy, {})[scene] = record
+        if record.scenario in CLUTTER:
+            clutter.setdefault(record.policy, {})[scene] = record
+    kinds = [kind for kind in cells if kind[0] in CLUTTER]
+    if len(kinds) > 1:
+        scenarios, sets = (list(dict.fromkeys(names)) for names in zip(*kinds))
+        cells[" + ".join(scenarios), " + ".join(sets)] = clutter
     comparisons = []
     for (scenario, objects), policies in cells.items():
         names = list(policies)
@@ -316,12 +328,37 @@ def print_table(rows: Sequence[Row]) -> None:
 def format_table(rows: Sequence[Row]) -> str:
     """The rows as aligned plain text."""
     header = ("policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed")
-    lines = [header, *(_cells(row) for row in rows)]
+    return _aligned(header, [_cells(row) for row in rows], to_the_right=(5, 6))
+
+
+def print_comparisons(comparisons: Sequence[Comparison]) -> None:
+    """Paired differences in points as aligned text on stdout; nothing if there are none."""
+    if comparisons:
+        header = ("paired difference", "scenario", "objects", "success", "cleared", "rounds")
+        print("\n" + _aligned(header, [_difference_cells(pair) for pair in comparisons]))
+
+
+def _difference_cells(pair: Comparison) -> tuple[str, ...]:
+    def points(difference: Difference | None) -> str:
+        if difference is None:
+            return "-"
+        value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
+        return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+    names = (f"{pair.first} - {pair.second}", pair.scenario, pair.objects)
+    rounds = "-" if pair.success is None else str(pair.success.rounds)
+    return (*names, points(pair.success), points(pair.cleared), rounds)
+
+
+def _aligned(
+    header: Sequence[str], lines: Sequence[Sequence[str]], to_the_right: Sequence[int] = ()
+) -> str:
+    lines = [header, *lines]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    lines.insert(1, tuple("-" * width for width in widths))
+    lines.insert(1, ["-" * width for width in widths])
     return "\n".join(
         "  ".join(
-            cell.rjust(width) if i in (5, 6) else cell.ljust(width)
+            cell.rjust(width) if i in to_the_right else cell.ljust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in lines
