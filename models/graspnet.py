@@ -39,9 +39,11 @@ def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
     (so that the camera's distance does not matter) and cut off at +-0.3 m, which become +-3.
     Raises UserError for images that cannot be meant.
     """
-    check_rgbd(rgb, depth)
+    median = check_rgbd(rgb, depth)
     filled = fill_holes(depth)
-    centred = np.clip(filled - np.median(filled), -DEPTH_LIMIT, DEPTH_LIMIT) / DEPTH_UNIT
+    if not _known(depth).all():
+        median = float(np.median(filled))
+    centred = np.clip(filled - median, -DEPTH_LIMIT, DEPTH_LIMIT) / DEPTH_UNIT
     image = np.empty((INPUT_CHANNELS, *depth.shape), np.float32)
     image[:3] = np.moveaxis(rgb, -1, 0)
     image[:3] /= 255
@@ -50,8 +52,9 @@ def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(image)
 
 
-def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> None:
-    """Raise one UserError that says what is wrong with an RGB-D image, if anything is."""
+def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
+    """The median of the known depths; one UserError that says what is wrong with an RGB-D image, if
+    anything is."""
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise UserError(f"rgb: got an array of shape {rgb.shape}, expected (H, W, 3) channels")
     if rgb.dtype != np.uint8:
@@ -72,6 +75,7 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> None:
         raise UserError(
             f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
         )
+    return typical
 
 
 def fill_holes(depth: np.ndarray) -> np.ndarray:

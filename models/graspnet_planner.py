@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.graspnet_io import SavedGraspNet, load_graspnet
+from models.graspnet_io import SavedGraspNet, for_inference, load_graspnet
 from models.prediction import predict_grasps
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame
@@ -18,7 +18,8 @@ _MARGIN = 0.05  # m around the workspace; objects that rolled a little way out a
 
 @functools.cache
 def _loaded(path: Path, changed: float) -> SavedGraspNet:
-    return load_graspnet(path)
+    saved = load_graspnet(path)
+    return saved._replace(model=for_inference(saved.model))
 
 
 class GraspNetPlanner:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from models.backbones import BACKBONES
 from models.graspnet import GraspNet
-from models.graspnet_io import KIND, load_graspnet, save_graspnet
+from models.graspnet_io import KIND, for_inference, load_graspnet, save_graspnet
 from utils.checkpoint import save_checkpoint
 from utils.errors import UserError
 
@@ -108,3 +109,29 @@ def test_a_pixel_size_of_zero_is_a_bug(tmp_path, model):
     with pytest.raises(ValueError, match="metres_per_pixel"):
         save_graspnet(tmp_path / "net.pt", model, 0.0)
     assert not (tmp_path / "net.pt").exists()
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_faster_copy_gives_the_same_maps(backbone):
+    torch.manual_seed(0)
+    model = GraspNet(max_width=0.08, backbone=backbone)
+    for module in model.modules():  # as after a training, not the identity
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0, 0.2)
+            module.running_var.uniform_(0.5, 2)
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, 0, 0.2)
+    model.eval()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    fast = for_inference(model)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in fast.modules())
+    assert not any(p.requires_grad for p in fast.parameters())
+    x = torch.randn(1, 4, 48, 60)
+    with torch.inference_mode():
+        exact, ours = model(x, logits=True), fast(x, logits=True)
+    assert exact[0].std() > 1e-3
+    for a, b in zip(ours, exact):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    after = model.state_dict()  # the given network can still be trained and saved
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
