@@ -256,9 +256,7 @@ def ignore_interrupt(worker: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
 
 
-def save_results(
-    run: Path, data: TrainingData, history: list[dict], weights: Path | None
-) -> None:
+def save_results(run: Path, data: TrainingData, history: list[dict], weights: Path | None) -> None:
     """The best network alone, its scores, and pictures of how it came about and what it does."""
     if not history:  # stopped within the first epoch
         return
