@@ -71,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train GraspNet.", _add_options)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume)
+    check_network(config)
     with team(config.train.device, dict(os.environ)) as us:
         if config.data.kind != "simulated":
             return cross_validate(config, options.resume, options.weights, us)
@@ -109,6 +110,13 @@ def check_resume(config: Config, run: Path | None) -> None:
             f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
             "for anything else, from its weights with train.initial"
         )
+
+
+def check_network(config: Config) -> None:
+    """Raise UserError for a network that cannot be made, before work is put into its data."""
+    create_model(name=config.train.backbone)
+    if config.train.initial is not None:
+        load_checkpoint(config.train.initial, KIND)
 
 
 def make_data(config: Config, us: Team) -> TrainingData:

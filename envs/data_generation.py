@@ -73,7 +73,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     if not missing:
         return folder
     object_sets(config)  # what is wrong with them is told here, not by a worker that dies of it
-    workers = min(config.data.workers or os.cpu_count() or 1, len(missing))
+    workers = config.data.workers or max(1, (os.cpu_count() or 1) // ranks)
+    workers = min(workers, len(missing))
     pool = ProcessPoolExecutor(
         workers,
         mp_context=multiprocessing.get_context("spawn"),

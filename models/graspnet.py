@@ -441,13 +441,14 @@ def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
 def _angles(probability: np.ndarray) -> np.ndarray:
     """(N,) angles in [0, pi) of distributions (N, K) over bins that wrap around.
 
-    The bins are smoothed around the circle by (1, 4, 6, 4, 1) / 16, which finds the middle of a
-    range of equally good ones, and a parabola through the logarithms of the highest and its
-    neighbours tells the place between bins; exact for Gaussian-shaped distributions.
+    The cube root gives back the bins' qualities up to a factor (see `targets_from_labels`). They
+    are smoothed around the circle by (1, 4, 6, 4, 1) / 16, which finds the middle of a range of
+    equally good ones, and a parabola through the logarithms of the highest and its neighbours tells
+    the place between bins; exact for Gaussian-shaped distributions.
     """
-    bins = probability.shape[1]
+    bins, quality = probability.shape[1], np.cbrt(probability)
     smooth = sum(
-        share / 16 * np.roll(probability, shift, axis=1)
+        share / 16 * np.roll(quality, shift, axis=1)
         for shift, share in zip(range(-2, 3), (1, 4, 6, 4, 1))
     )
     best = smooth.argmax(axis=1)
