@@ -7,6 +7,7 @@ has to know. This module knows no simulator and no network.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -159,11 +160,10 @@ def _splat(
     return height
 
 
-def _rays(frame: RGBDFrame, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _rays(K: np.ndarray, T_WC: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """(..., 3) directions in W of pixels' rays, scaled to unit depth."""
-    K = frame.K
     ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    return ray @ frame.T_WC[:3, :3].T
+    return ray @ T_WC[:3, :3].T
 
 
 def _surface_points(frame: RGBDFrame, split: int = 2) -> np.ndarray:
@@ -172,12 +172,24 @@ def _surface_points(frame: RGBDFrame, split: int = 2) -> np.ndarray:
     A pixel covers about 2 mm of the table: single points would leave gaps in a 2 mm grid.
     """
     depth = frame.depth.astype(float)
-    sub = (np.arange(split) + 0.5) / split - 0.5
-    v, u, dv, du = np.meshgrid(
-        np.arange(depth.shape[0]), np.arange(depth.shape[1]), sub, sub, indexing="ij"
+    rays = _split_rays(
+        np.asarray(frame.K, float).tobytes(),
+        np.asarray(frame.T_WC, float).tobytes(),
+        depth.shape,
+        split,
     )
-    points = _rays(frame, u + du, v + dv) * depth[:, :, None, None, None] + frame.T_WC[:3, 3]
+    points = rays * depth[:, :, None, None, None] + frame.T_WC[:3, 3]
     return points[depth > 0].reshape(-1, 3)
+
+
+@lru_cache(maxsize=8)
+def _split_rays(K: bytes, T_WC: bytes, shape: tuple[int, int], split: int) -> np.ndarray:
+    """(H, W, split, split, 3) rays of a camera that usually stands still."""
+    sub = (np.arange(split) + 0.5) / split - 0.5
+    v, u, dv, du = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), sub, sub, indexing="ij")
+    rays = _rays(np.frombuffer(K).reshape(3, 3), np.frombuffer(T_WC).reshape(4, 4), u + du, v + dv)
+    rays.flags.writeable = False
+    return rays
 
 
 def _grazing_points(frame: RGBDFrame, cell: float, jump: float = 0.006) -> np.ndarray:
