@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from models.graspnet import check_rgbd
-from models.graspnet_io import SavedGraspNet, load_graspnet
+from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
 from models.prediction import PredictedGrasp, Prediction, predict, training_scale
 from utils.config import run_script
 from utils.errors import UserError
@@ -41,7 +41,6 @@ from utils.prediction_panel import is_prediction_panel, prediction_panel
 from utils.table_plane import Table, find_table, table_at_height
 from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
 
-CHECKPOINT = Path("checkpoints/graspnet.pt")
 FORMAT = "robot-grasping grasps"  # tells our grasps.json from others
 VERSION = 1
 
@@ -84,7 +83,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--intrinsics", type=float, nargs="+", metavar="F", help="fx fy cx cy")
     parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
     parser.add_argument("--table-height", type=float, metavar="Z", help="m in the world")
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE", default=CHECKPOINT)
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", default=SHIPPED)
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
     )

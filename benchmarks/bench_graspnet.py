@@ -31,8 +31,7 @@ from models.graspnet import (
     find_peaks,
     to_input,
 )
-from models.graspnet_io import for_inference, load_graspnet, metres_per_pixel
-from models.graspnet_planner import SHIPPED
+from models.graspnet_io import SHIPPED, for_inference, load_graspnet, metres_per_pixel
 from models.prediction import predict_grasps
 from utils.config import load_config, run_script
 from utils.transforms import RGBDFrame

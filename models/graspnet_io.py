@@ -19,6 +19,7 @@ from models.graspnet import GraspNet
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.errors import UserError
 
+SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
 KIND = "graspnet"  # also of training checkpoints, which hold an optimiser besides
 PIXEL_SIZE = "metres_per_pixel"  # its entry in a checkpoint's `extra`
 

@@ -12,13 +12,12 @@ import numpy as np
 
 from models.grasp_refinement import refine
 from models.graspnet import PeakSettings
-from models.graspnet_io import SavedGraspNet, for_inference, load_graspnet
+from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.prediction import predict_grasps
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame
 from utils.transforms import Grasp, RGBDFrame
 
-SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
 # Many and doubtful ones too: what fits the depth image is then ranked anew. The wide blur prefers
 # the middle of a good region, as fingers do.
 PEAKS = PeakSettings(threshold=0.1, count=60, blur=2.0)
