@@ -32,7 +32,7 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
 
 
 class GraspNetPlanner:
-    """The network of a checkpoint. Raises UserError if that cannot be loaded."""
+    """The network of a checkpoint, unless one is given. UserError if it cannot be loaded."""
 
     needs_truth = False
 
@@ -42,9 +42,10 @@ class GraspNetPlanner:
         workspace: Workspace,
         seed: int = 0,
         checkpoint: Path = SHIPPED,
+        network: SavedGraspNet | None = None,
     ):
         changed = checkpoint.stat().st_mtime if checkpoint.exists() else 0.0
-        self.network = _loaded(checkpoint, changed)
+        self.network = network or _loaded(checkpoint, changed)
         self.gripper, self.workspace = gripper, workspace
 
     def reset(self, seed: int) -> None:
