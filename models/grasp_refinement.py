@@ -2,7 +2,8 @@
 
 A network names places well to a few millimetres; a finger needs better than that beside an object.
 So each grasp is posed on the height map of the same image: centred between the faces, turned onto
-them, opened as far as nothing is in the way, or dropped where fingers or palm would hit something.
+them, put lower where that holds better, opened as far as nothing is in the way, or dropped where
+fingers or palm would hit something.
 This module knows neither the network nor the simulator.
 """
 
@@ -24,12 +25,14 @@ from utils.transforms import Grasp
 class RefinementSettings:
     """search: margins, as in the antipodal search. geometry: the exponent of the measured contacts'
     score in the ranking, next to the network's quality; 0 ranks by the network alone. turns: how
-    often a grasp is turned onto its faces. distance, angle: metres and radians, grasps closer than
+    often a grasp is turned onto its faces. deeper: metres further down that are tried as well, as
+    far as the table leaves room. distance, angle: metres and radians, grasps closer than
     both are one."""
 
     search: SearchSettings = SearchSettings()
     geometry: float = 0.5
     turns: int = 2
+    deeper: tuple[float, ...] = (0.0, 0.008, 0.016)
     distance: float = 0.01
     angle: float = np.deg2rad(20)
 
@@ -43,13 +46,17 @@ def refine(
     """The grasps that fit the height map, exact and ranked anew; empty if none does."""
     if not grasps:
         return []
+    lowest = heights.table_height + settings.search.table_clearance
     widest = gripper.max_opening - 2 * settings.search.rooms[0]  # leaves room beside the faces
-    quality = np.array([grasp.quality for grasp in grasps])
+    repeated = [grasp for grasp in grasps for _ in settings.deeper]
+    tip = np.array([grasp.position[2] for grasp in repeated]) - gripper.tip_below_centre
+    deeper = np.tile(settings.deeper, len(grasps))
+    quality = np.array([grasp.quality for grasp in repeated])
     found = Candidates.rough(
-        xy=np.array([grasp.position[:2] for grasp in grasps]),
-        angle=np.array([grasp.angle for grasp in grasps]),
-        tip=np.array([grasp.position[2] for grasp in grasps]) - gripper.tip_below_centre,
-        width=np.minimum([grasp.width for grasp in grasps], widest),
+        xy=np.array([grasp.position[:2] for grasp in repeated]),
+        angle=np.array([grasp.angle for grasp in repeated]),
+        tip=np.maximum(tip - deeper, np.minimum(tip, lowest)),
+        width=np.minimum([grasp.width for grasp in repeated], widest),
         score=quality,
     )
     found = measure(found, heights, gripper, settings.search)

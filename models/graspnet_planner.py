@@ -20,7 +20,7 @@ from utils.transforms import Grasp, RGBDFrame
 
 # Many and doubtful ones too: what fits the depth image is then ranked anew. The wide blur prefers
 # the middle of a good region, as fingers do.
-PEAKS = PeakSettings(threshold=0.1, count=60, blur=2.0)
+PEAKS = PeakSettings(threshold=0.05, count=60, blur=2.0)
 RETURNED = 20
 _MARGIN = 0.05  # m around the workspace; objects that rolled a little way out are still in the game
 
