@@ -1,5 +1,8 @@
 """Convex solids, gripper outline and height maps against closed forms."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +16,7 @@ from utils.geometry import (
     Workspace,
     intersect_lines,
 )
-from utils.height_map import height_map_from_frame, height_map_from_scene
+from utils.height_map import height_map_from_frame, height_map_from_scene, near_side
 from utils.transforms import RGBDFrame, look_at, pose_matrix
 
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -158,3 +161,31 @@ def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None
     assert len(x) and x.min() > 0.579 and x.max() < 0.631
     centre_row = heights.index(np.array([0.6, 0.0]))[0]
     assert x[rows == centre_row].min() > 0.618 and x[rows == centre_row].max() > 0.624
+
+
+def test_holes_count_as_the_near_surface_beside_them() -> None:
+    depth = np.full((20, 20), 0.8, np.float32)
+    depth[:, 10:] = 0.7
+    depth[5:8, 8:12] = 0.0  # over the edge
+    depth[15, 2] = np.nan  # within the table
+    filled = near_side(depth)
+    assert (filled[5:8, 8:12] == np.float32(0.7)).all()
+    assert filled[15, 2] == np.float32(0.8)
+    known = depth > 0
+    np.testing.assert_array_equal(filled[known], depth[known])
+    assert (near_side(np.zeros((20, 20), np.float32)) == 0).all()
+    clean = np.full((4, 4), 0.5, np.float32)
+    assert near_side(clean) is clean
+
+
+def test_a_hole_at_an_edge_does_not_lower_the_map() -> None:
+    """A box 5 cm high, the pixels around its outline lost as a depth camera loses them."""
+    frame = boxes_frame([((0.04, 0.06, 0.05), 0.0, (0.5, 0.0))])
+    on_box = frame.depth < frame.depth.max() - 0.02
+    edge = cv2.dilate(on_box.astype(np.uint8), np.ones((5, 5))) > cv2.erode(
+        on_box.astype(np.uint8), np.ones((5, 5))
+    )
+    lossy = replace(frame, depth=np.where(edge, 0, frame.depth).astype(np.float32))
+    whole, holed = (height_map_from_frame(f, Workspace()).height for f in (frame, lossy))
+    assert edge.sum() > 200
+    assert (holed >= whole - 1e-3).all()

@@ -6,7 +6,7 @@ has to know. This module knows no simulator and no network.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -60,9 +60,11 @@ def height_map_from_frame(
 ) -> HeightMap:
     """Height map of what a depth image shows; uses nothing of the frame but depth, K and T_WC.
 
-    Labels are the pieces between height discontinuities; their centres are volume centroids of the
-    columns between the table and the visible surface.
+    Unknown pixels count as the nearest surface beside them (`near_side`). Labels are the pieces
+    between height discontinuities; their centres are volume centroids of the columns between the
+    table and the visible surface.
     """
+    frame = replace(frame, depth=near_side(frame.depth))
     grid, origin = grid_points(workspace, margin, cell)
     seen = _splat(_surface_points(frame), grid.shape[:2], origin, cell)
     hidden = ~np.isfinite(seen)
@@ -78,6 +80,21 @@ def height_map_from_frame(
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
     return HeightMap(height, ceiling, label, centres, origin, cell, table)
+
+
+def near_side(depth: np.ndarray, window: int = 9) -> np.ndarray:
+    """(H, W) depth whose unknown pixels take the nearest surface in the `window` pixels around.
+
+    Depth cameras lose pixels at the edges of whatever stands up; a finger that took such a hole for
+    table would come down on the edge. Holes without any known pixel in reach stay 0.
+    """
+    unknown = ~(depth > 0)
+    if not unknown.any():
+        return depth
+    far = np.float32(np.finfo(np.float32).max)
+    known = np.where(unknown, far, depth).astype(np.float32)
+    nearest = cv2.erode(known, np.ones((window, window), np.uint8))
+    return np.where(unknown, np.where(nearest < far, nearest, 0), depth).astype(np.float32)
 
 
 def height_map_from_scene(
