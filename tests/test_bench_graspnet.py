@@ -31,7 +31,14 @@ def test_quick_benchmark_writes_every_metric(tmp_path):
     heads = 20 * 33
     assert content["ggcnn_parameters"]["value"] == 62_420 - 4 * 129 + heads + 3 * 32 * 81
     targets = {name: metric["target"] for name, metric in content.items() if metric["target"]}
-    assert targets == {"post_processing_ms": "<= 4", "frame_to_grasps_ms": "<= 25"}
+    assert targets == {
+        "post_processing_ms": "<= 4",
+        "frame_to_grasps_ms": "<= 25",
+        "planner_ms": "<= 25",
+        "planner_post_processing_ms": "<= 4",
+        "angle_error_deg": "<= 10",
+    }
+    assert 1 <= content["labelled_test_images"]["value"] <= 6
     assert 1 <= content["grasps_post_processed"]["value"] <= 20
     assert content["frame_to_grasps_vs_network"]["value"] > 0.5
     peak, imports = (content[f"peak_memory{part}_mib"]["value"] for part in ("", "_of_imports"))

@@ -39,7 +39,7 @@ def test_defaults():
     config = load_config(None)
     assert config.seed == 0
     assert config.camera.position == (0.5, 0.0, 0.8)
-    assert config.evaluate.policies == ("random", "heuristic", "oracle")
+    assert config.evaluate.policies == ("random", "heuristic", "graspnet", "oracle")
     assert config.env.control == "ee"
     assert config.evaluate.workers is None
 
