@@ -6,16 +6,15 @@ has to know. This module knows no simulator and no network.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
-from utils.transforms import RGBDFrame
+from utils.transforms import RGBDFrame, deproject
 
 
 @dataclass(frozen=True)
@@ -66,17 +65,16 @@ def height_map_from_frame(
     """
     frame = replace(frame, depth=near_side(frame.depth))
     grid, origin = grid_points(workspace, margin, cell)
-    seen = _splat(_surface_points(frame), grid.shape[:2], origin, cell)
+    seen = _highest(_surface_points(frame), grid.shape[:2], origin, cell)
     hidden = ~np.isfinite(seen)
-    table = workspace.table_height
+    table = float(workspace.table_height)
     # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
-    # OpenCV pads with the largest double, which a cell far outside the view would inherit.
+    # OpenCV pads with the largest float, which a cell far outside the view would inherit.
     lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
     height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, table), seen), table)
     # The rays that graze an edge bound what may stand in its shadow.
-    ceiling = _splat(_grazing_points(frame, cell), grid.shape[:2], origin, cell)
+    ceiling = _highest(_grazing_points(frame, cell), grid.shape[:2], origin, cell)
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
-    height, ceiling = height.astype(np.float32), ceiling.astype(np.float32)
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
     return HeightMap(height, ceiling, label, centres, origin, cell, table)
@@ -132,20 +130,29 @@ def label_pieces(
     Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece.
     """
     above = height > table + floor
-    flat = np.arange(height.size).reshape(height.shape)
-    links = []
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        joined = above[a] & above[b] & (np.abs(height[a] - height[b]) < step)
-        links.append(np.stack([flat[a][joined], flat[b][joined]]))
-    i, j = np.concatenate(links, axis=1)
-    graph = coo_matrix((np.ones(len(i), bool), (i, j)), shape=(height.size,) * 2)
-    raw = connected_components(graph, directed=False)[1].reshape(height.shape)
-    size = np.bincount(raw[above], minlength=raw.max() + 1)
-    large = above & (size[raw] * cell**2 > 0.6e-4)
     label = np.full(height.shape, -1)
+    x, y, columns, rows = cv2.boundingRect(above.astype(np.uint8))
+    if rows:
+        box = np.s_[y : y + rows, x : x + columns]
+        label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2)
+    return label
+
+
+def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float) -> np.ndarray:
+    """Labels (R, C) as in `label_pieces`, of pieces of more than `smallest` cells."""
+    rows, columns = height.shape
+    # Every second pixel is a cell; the pixel between two is set where they belong together.
+    linked = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+    linked[::2, ::2] = above
+    linked[::2, 1::2] = above[:, :-1] & above[:, 1:] & (np.abs(np.diff(height, axis=1)) < step)
+    linked[1::2, ::2] = above[:-1] & above[1:] & (np.abs(np.diff(height, axis=0)) < step)
+    raw = cv2.connectedComponents(linked, connectivity=4)[1][::2, ::2]
+    kept = np.bincount(raw.ravel()) > smallest
+    kept[0] = False
+    large = kept[raw]
     if not large.any():
-        return label
-    label[large] = np.unique(raw[large], return_inverse=True)[1]
+        return np.full(height.shape, -1)
+    label = (np.cumsum(kept) - 1)[raw]
     _, nearest = cv2.distanceTransformWithLabels(
         (~large).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -160,21 +167,25 @@ def _column_centroids(
     """(M, 3) centroids of the columns under each labelled piece."""
     count = label.max() + 1
     on = label >= 0
-    weight = np.bincount(label[on], rise[on], count)
-    x, y = (np.bincount(label[on], rise[on] * grid[on][:, k], count) / weight for k in (0, 1))
-    z = np.bincount(label[on], rise[on] ** 2, count) / (2 * weight)
+    label, rise, place = label[on], rise[on], grid[on].T
+    weight = np.bincount(label, rise, count)
+    x, y = (np.bincount(label, rise * along, count) / weight for along in place)
+    z = np.bincount(label, rise**2, count) / (2 * weight)
     return np.column_stack([x, y, table + z])
 
 
-def _splat(
-    points: np.ndarray, shape: tuple[int, int], origin: np.ndarray, cell: float
+def _highest(
+    parts: Iterable[np.ndarray], shape: tuple[int, int], origin: np.ndarray, cell: float
 ) -> np.ndarray:
-    """(R, C) highest z of the points (N, 3) in each cell; -inf where there is none."""
-    col, row = np.rint((points[:, :2] - origin) / cell).astype(int).T
-    inside = (row >= 0) & (row < shape[0]) & (col >= 0) & (col < shape[1])
-    height = np.full(shape, -np.inf)
-    np.maximum.at(height.reshape(-1), row[inside] * shape[1] + col[inside], points[inside, 2])
-    return height
+    """(R, C) float32 highest z of points (3, ...) in each cell; -inf where there is none."""
+    rows, cols = shape
+    height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for what lies outside
+    for x, y, z in parts:
+        col = np.rint(np.clip((x - origin[0]) / cell, -1, cols)) + 1
+        row = np.rint(np.clip((y - origin[1]) / cell, -1, rows)) + 1
+        index = (row * (cols + 2) + col).astype(np.intp)
+        np.maximum.at(height.reshape(-1), index.ravel(), z.ravel().astype(np.float32))
+    return height[1:-1, 1:-1]
 
 
 def _rays(K: np.ndarray, T_WC: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -183,42 +194,47 @@ def _rays(K: np.ndarray, T_WC: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.n
     return ray @ T_WC[:3, :3].T
 
 
-def _surface_points(frame: RGBDFrame, split: int = 2) -> np.ndarray:
-    """(N, 3) points in W: each pixel with a depth stands for split x split points of its square.
-
-    A pixel covers about 2 mm of the table: single points would leave gaps in a 2 mm grid.
+def _surface_points(frame: RGBDFrame, split: int = 2) -> Iterator[np.ndarray]:
+    """(3, H, W) points in W, split x split times: each pixel stands for that many points of its
+    square, because it covers about 2 mm of the table and single points would leave gaps in a 2 mm
+    grid. Without a depth, z is -inf.
     """
     depth = frame.depth.astype(float)
-    rays = _split_rays(
-        np.asarray(frame.K, float).tobytes(),
-        np.asarray(frame.T_WC, float).tobytes(),
-        depth.shape,
-        split,
-    )
-    points = rays * depth[:, :, None, None, None] + frame.T_WC[:3, 3]
-    return points[depth > 0].reshape(-1, 3)
+    unknown = ~((depth > 0) & np.isfinite(depth))
+    depth[unknown] = 0
+    K, T_WC = (np.asarray(matrix, float) for matrix in (frame.K, frame.T_WC))
+    for rays in _split_rays(K.tobytes(), T_WC.tobytes(), depth.shape, split):
+        points = rays * depth + T_WC[:3, 3, None, None]
+        points[2][unknown] = -np.inf
+        yield points
 
 
 @lru_cache(maxsize=8)
 def _split_rays(K: bytes, T_WC: bytes, shape: tuple[int, int], split: int) -> np.ndarray:
-    """(H, W, split, split, 3) rays of a camera that usually stands still."""
+    """(split * split, 3, H, W) rays of a camera that usually stands still."""
     sub = (np.arange(split) + 0.5) / split - 0.5
-    v, u, dv, du = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), sub, sub, indexing="ij")
+    dv, du, v, u = np.meshgrid(sub, sub, np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     rays = _rays(np.frombuffer(K).reshape(3, 3), np.frombuffer(T_WC).reshape(4, 4), u + du, v + dv)
+    rays = np.ascontiguousarray(np.moveaxis(rays.reshape(-1, *shape, 3), -1, 1))
     rays.flags.writeable = False
     return rays
 
 
-def _grazing_points(frame: RGBDFrame, cell: float, jump: float = 0.006) -> np.ndarray:
-    """(N, 3) points in W on the rays between neighbouring pixels whose depths differ by a jump."""
-    points = frame.points()
-    found = [np.empty((0, 3))]
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        edge = np.abs(frame.depth[a] - frame.depth[b]) > jump
-        edge &= (frame.depth[a] > 0) & (frame.depth[b] > 0)
-        near, far = points[a][edge], points[b][edge]
-        if len(near):
-            span = np.linalg.norm((far - near)[:, :2], axis=1).max()
-            share = np.linspace(0, 1, int(np.clip(2 * span / cell, 2, 60)))[:, None, None]
-            found.append((near + share * (far - near)).reshape(-1, 3))
-    return np.concatenate(found)
+def _grazing_points(frame: RGBDFrame, cell: float, jump: float = 0.006) -> list[np.ndarray]:
+    """Points (3, S, N) in W on the rays between neighbouring pixels whose depths differ by a jump:
+    beside each other, and one below the other."""
+    found = []
+    for step in ((1, 0), (0, 1)):
+        here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
+        there = frame.depth[step[1] :, step[0] :]
+        edge = (np.abs(here - there) > jump) & (here > 0) & (there > 0)
+        pixel = np.argwhere(edge)[:, ::-1]
+        near, far = (
+            deproject(at, depth[edge], frame.K, frame.T_WC).T
+            for at, depth in ((pixel, here), (pixel + step, there))
+        )
+        if len(pixel):
+            span = np.linalg.norm((far - near)[:2], axis=0).max()
+            share = np.linspace(0, 1, int(np.clip(2 * span / cell, 2, 60)))[:, None]
+            found.append(near[:, None] + share * (far - near)[:, None])
+    return found
