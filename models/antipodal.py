@@ -68,10 +68,7 @@ def _search_once(
     if len(found) == 0:
         return found
     found = measure(found, heights, gripper, settings).best(settings.finalists)
-    for _ in range(2):
-        turned = replace(found, angle=np.mod(found.angle + found.turn, np.pi))
-        found = found.better(measure(turned, heights, gripper, settings))
-    return found.best(len(found))
+    return turn_onto_faces(found, heights, gripper, settings).best(len(found))
 
 
 def dense_candidates(
@@ -172,6 +169,25 @@ def _runs(
     return tuple(np.concatenate(column) for column in zip(*found))
 
 
+def turn_onto_faces(
+    found: Candidates,
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+    times: int = 2,
+) -> Candidates:
+    """Measured candidates, each turned and measured again as long as that makes it better."""
+    better = np.arange(len(found))
+    for _ in range(times):
+        before = found.take(better)
+        turned = replace(before, angle=np.mod(before.angle + before.turn, np.pi))
+        turned = measure(turned, heights, gripper, settings)
+        wins = turned.score > before.score
+        better = better[wins]
+        found = found.replaced(better, turned.take(wins))
+    return found
+
+
 def measure(
     candidates: Candidates, heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings
 ) -> Candidates:
@@ -180,29 +196,27 @@ def measure(
     The pads are flat: a pad stops where the first of the lines across it meets matter. Slopes of
     the meeting points across the pad give the angle to the face, their shift with height its tilt.
     """
-    cell, N = heights.cell, len(candidates)
+    N, tip = len(candidates), candidates.tip
     along, across = candidates.axes()
     reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + 0.004
-    u = np.arange(-np.ceil(reach / cell), np.ceil(reach / cell) + 1) * cell
+    most = np.ceil(reach / heights.cell)
+    u = np.arange(-most, most + 1) * heights.cell
     v = np.linspace(-1, 1, 9) * gripper.finger_half_width
-    grid = (
-        candidates.xy[:, None, None]
-        + u[:, None, None] * along[:, None, None]
-        + v[:, None] * across[:, None, None]
-    )
-    where = heights.index(grid)  # (N, U, V)
-    H = heights.height[where]
-    tip = candidates.tip
+    where = _cells(candidates.xy, along, across, u, v, heights)  # (N, V, U)
+    height = heights.height.take(where)
+    highest = height.max(axis=1)  # across the pads
 
     # Contacts, searched a little beyond the width that the candidate claims.
     window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
-    top = np.where(window[..., None], H, -np.inf).max(axis=(1, 2))
+    top = np.where(window, highest, -np.inf).max(axis=1)
     engagement = top - tip
     upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
-    low_left, low_right = _first_contacts(H, window, tip + 0.001, u, cell)
-    high_left, high_right = _first_contacts(H, window, upper, u, cell)
+    low = (height > tip[:, None, None] + 0.001) & window[:, None]
+    low_left, low_right = _first_contacts(low, u, heights.cell)
+    high = (highest > upper[:, None]) & window
+    high_left, high_right = _first_contacts(high, u, heights.cell)
     left, right = low_left.min(axis=1), low_right.max(axis=1)
-    touched = np.isfinite(left) & np.isfinite(high_left.min(axis=1))
+    touched = np.isfinite(left) & np.isfinite(high_left)
     left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
     width, shift = right - left, (right + left) / 2
     slope_left, cover_left = _face(low_left - left[:, None], v)
@@ -210,38 +224,12 @@ def measure(
     yaw_left, yaw_right = np.arctan(slope_left), -np.arctan(slope_right)
     turn, wedge = -(yaw_left + yaw_right) / 2, np.abs(yaw_left - yaw_right) / 2
     rise = upper - tip - 0.001
-    with np.errstate(invalid="ignore"):
-        tilt_left = np.arctan2(np.maximum(high_left.min(axis=1) - left, 0), rise)
-        tilt_right = np.arctan2(np.maximum(right - high_right.max(axis=1), 0), rise)
+    tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
+    tilt_right = np.arctan2(np.maximum(right - high_right, 0), rise)
     tilt = np.where(touched, (tilt_left + tilt_right) / 2, np.pi / 2)
 
-    # Clearance of fingers and palm on a straight descent, at the widest opening that is free.
-    xy = candidates.xy + shift[:, None] * along
-    free, opening, room = np.zeros(N, bool), np.zeros(N), np.zeros(N)
-    near = np.abs(u - shift[:, None])
-    obstacles = cv2.dilate(heights.height, np.ones((3, 3)))[where].max(axis=2)
-    for candidate_room in settings.rooms:
-        half = np.minimum(width / 2 + candidate_room, gripper.max_opening / 2)
-        outward = near - half[:, None]
-        # Between contact and finger only the closing pads pass, over anything below the tips.
-        sill = np.where(
-            near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
-        )
-        below_finger = gripper.finger_underside(np.maximum(outward, 0))
-        under = np.where(outward < -settings.inner_margin, sill, below_finger)
-        fits = (obstacles - under).max(axis=1) <= tip - settings.clearance
-        fits &= half >= width / 2 + settings.rooms[0] - 1e-9
-        free |= fits
-        opening, room = np.where(fits, 2 * half, opening), np.where(fits, half - width / 2, room)
-    under = gripper.finger_underside(near - opening[:, None] / 2)[..., None]
-    blind = ((heights.ceiling[where] - under > tip[:, None, None]) & (under < np.inf)).mean(
-        axis=(1, 2)
-    )
-    left_over = np.nonzero(free & touched)[0]
-    gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
-    free[left_over] = gap >= settings.clearance - tip[left_over]
-
     # What is held, and how far from its centre of mass.
+    xy = candidates.xy + shift[:, None] * along
     inner = np.minimum(0.003, width / 3)
     ends = [
         heights.label[heights.index(candidates.xy + (end[:, None] * along))]
@@ -253,32 +241,79 @@ def measure(
     arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
     arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
 
+    # Clearance of fingers and palm on a straight descent, where all else is in order.
+    left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
+    near, opening, blind = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
+    opening[left_over] = _widest_opening(
+        heights.highest_around(1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
+        near[left_over], tip[left_over], width[left_over], gripper, settings,
+    )  # fmt: skip
+    left_over = left_over[opening[left_over] > 0]
+    gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
+    left_over = left_over[gap >= settings.clearance - tip[left_over]]
+    under = gripper.finger_underside(near[left_over] - opening[left_over, None] / 2)
+    over = heights.ceiling.take(where[left_over]) - under[:, None]
+    blind[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
+
     score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
     score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
     score *= 0.4 + 0.6 * np.minimum(cover_left, cover_right)
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
-    score *= np.interp(room, (0.003, 0.008), (0.4, 1.0))
+    score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
     score *= np.exp(-4 * blind)
     score *= np.where(ends[0] == ends[1], 1.0, 0.5)
     score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
-    feasible = (
-        touched & free & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
-    )
-    feasible &= (label >= 0) & (width > 0)
+    feasible = np.isin(np.arange(N), left_over)
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
     return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
 
 
-def _first_contacts(H, window, level, u, cell) -> tuple[np.ndarray, np.ndarray]:
-    """(N, V) where lines across the pads first meet matter over `level`, from either side.
+def _cells(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
+    """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
+    xy, along, across = (part.T[..., None, None] for part in (xy, along, across))
+    row, col = heights.index(np.moveaxis(xy + u * along + v[:, None] * across, 0, -1))
+    return row * heights.height.shape[1] + col
+
+
+def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
+    """(...) where lines (..., U) first meet matter, from the left and from the right.
 
     Lines that meet nothing hold +inf (left) and -inf (right).
     """
-    matter = (level[:, None, None] < H) & window[..., None]
-    hit = matter.any(axis=1)
-    left = u[matter.argmax(axis=1)] - cell / 2
-    right = u[len(u) - 1 - matter[:, ::-1].argmax(axis=1)] + cell / 2
+    hit = matter.any(axis=-1)
+    left = u[matter.argmax(axis=-1)] - cell / 2
+    right = u[len(u) - 1 - matter[..., ::-1].argmax(axis=-1)] + cell / 2
     return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
+
+
+def _widest_opening(
+    obstacles: np.ndarray,
+    near: np.ndarray,
+    tip: np.ndarray,
+    width: np.ndarray,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> np.ndarray:
+    """(N,) widest opening of the fingers that is free on a straight descent; 0 if none is.
+
+    obstacles, near: (N, U) heights along the closing line and their distances from the middle.
+    """
+    # Between contact and finger only the closing pads pass, over anything below the tips.
+    sill = np.where(
+        near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
+    )
+    opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
+    for room in reversed(settings.rooms):
+        half = np.minimum(width[open_yet] / 2 + room, gripper.max_opening / 2)
+        outward = near[open_yet] - half[:, None]
+        below_finger = gripper.finger_underside(np.maximum(outward, 0))
+        under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
+        fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
+        fits &= half >= width[open_yet] / 2 + settings.rooms[0] - 1e-9
+        opening[open_yet[fits]] = 2 * half[fits]
+        open_yet = open_yet[~fits]
+    return opening
 
 
 def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.0025):
@@ -300,13 +335,8 @@ def _palm_gap(
     # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
     # more cell for rounding to the grid.
     radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    scene = cv2.dilate(heights.height, disc)
+    scene = heights.highest_around(radius, cv2.MORPH_ELLIPSE)
     ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
     u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
-    grid = (
-        xy[:, None, None]
-        + u[:, None, None] * along[:, None, None]
-        + v[:, None] * across[:, None, None]
-    )
-    return (gripper.palm_underside(v) - scene[heights.index(grid)]).min(axis=(1, 2))
+    nearby = scene.take(_cells(xy, along, across, u, v, heights)).max(axis=2)
+    return (gripper.palm_underside(v) - nearby).min(axis=1)

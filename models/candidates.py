@@ -50,13 +50,12 @@ class Candidates:
         order = np.argsort(-self.score, kind="stable")[:count]
         return self.take(order[self.score[order] > 0])
 
-    def better(self, other: Candidates) -> Candidates:
-        """Of each pair of candidates the one with the higher score."""
-        wins = other.score > self.score
-        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return Candidates(
-            *(np.where(wins[:, None] if a.ndim == 2 else wins, b, a) for a, b in pairs)
-        )
+    def replaced(self, index: np.ndarray, others: Candidates) -> Candidates:
+        """All of them, but `others` in the places `index`."""
+        result = self.take(np.arange(len(self)))
+        for field in fields(self):
+            getattr(result, field.name)[index] = getattr(others, field.name)
+        return result
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) unit vectors along the closing line and across it."""

@@ -10,11 +10,11 @@ This module knows neither the network nor the simulator.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from models.antipodal import SearchSettings, measure
+from models.antipodal import SearchSettings, measure, turn_onto_faces
 from models.candidates import Candidates
 from utils.geometry import GripperGeometry
 from utils.height_map import HeightMap
@@ -60,9 +60,7 @@ def refine(
         score=quality,
     )
     found = measure(found, heights, gripper, settings.search)
-    for _ in range(settings.turns):
-        turned = replace(found, angle=np.mod(found.angle + found.turn, np.pi))
-        found = found.better(measure(turned, heights, gripper, settings.search))
+    found = turn_onto_faces(found, heights, gripper, settings.search, settings.turns)
     fits = found.score > 0
     found.score = np.where(fits, quality * np.minimum(found.score, 1) ** settings.geometry, 0.0)
     ranked = found.best(len(found)).distinct(len(found), settings.distance, settings.angle)

@@ -7,7 +7,7 @@ has to know. This module knows no simulator and no network.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import cv2
@@ -36,12 +36,24 @@ class HeightMap:
     origin: np.ndarray
     cell: float
     table_height: float
+    _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row and column (...) of the cells of points (..., 2); the nearest cell if outside."""
-        col, row = np.moveaxis(np.rint((xy - self.origin) / self.cell).astype(np.intp), -1, 0)
         rows, cols = self.height.shape
-        return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+        col, row = (
+            np.clip(np.rint((xy[..., k] - self.origin[k]) / self.cell), 0, count - 1)
+            for k, count in enumerate((cols, rows))
+        )
+        return row.astype(np.intp), col.astype(np.intp)
+
+    def highest_around(self, radius: int, shape: int) -> np.ndarray:
+        """(R, C) highest surface within `radius` cells of each one, in a window of one of OpenCV's
+        `shape`s. Worked out once."""
+        if (radius, shape) not in self._highest:
+            window = cv2.getStructuringElement(shape, (2 * radius + 1, 2 * radius + 1))
+            self._highest[radius, shape] = cv2.dilate(self.height, window)
+        return self._highest[radius, shape]
 
 
 def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.ndarray, np.ndarray]:
