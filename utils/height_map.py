@@ -6,9 +6,9 @@ has to know. This module knows no simulator and no network.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -77,7 +77,7 @@ def height_map_from_frame(
     """
     frame = replace(frame, depth=near_side(frame.depth))
     grid, origin = grid_points(workspace, margin, cell)
-    seen = _highest(_surface_points(frame), grid.shape[:2], origin, cell)
+    seen = _highest(_surface_points(frame, origin, cell), grid.shape[:2])
     hidden = ~np.isfinite(seen)
     table = float(workspace.table_height)
     # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
@@ -85,7 +85,7 @@ def height_map_from_frame(
     lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
     height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, table), seen), table)
     # The rays that graze an edge bound what may stand in its shadow.
-    ceiling = _highest(_grazing_points(frame, cell), grid.shape[:2], origin, cell)
+    ceiling = _highest(_grazing_points(frame, origin, cell), grid.shape[:2])
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
@@ -178,75 +178,71 @@ def _column_centroids(
 ) -> np.ndarray:
     """(M, 3) centroids of the columns under each labelled piece."""
     count = label.max() + 1
-    on = label >= 0
-    label, rise, place = label[on], rise[on], grid[on].T
+    on = np.flatnonzero(label >= 0)
+    label, rise, place = label.take(on), rise.take(on), grid.reshape(-1, 2)[on].T
     weight = np.bincount(label, rise, count)
     x, y = (np.bincount(label, rise * along, count) / weight for along in place)
     z = np.bincount(label, rise**2, count) / (2 * weight)
     return np.column_stack([x, y, table + z])
 
 
-def _highest(
-    parts: Iterable[np.ndarray], shape: tuple[int, int], origin: np.ndarray, cell: float
-) -> np.ndarray:
-    """(R, C) float32 highest z of points (3, ...) in each cell; -inf where there is none."""
+def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
+    """(R, C) float32 highest z of the points in each cell; -inf where there is none.
+
+    Each part holds columns and rows, in cells, and z (metres) of points, (3, ...).
+    """
     rows, cols = shape
     height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for what lies outside
-    for x, y, z in parts:
-        col = np.rint(np.clip((x - origin[0]) / cell, -1, cols)) + 1
-        row = np.rint(np.clip((y - origin[1]) / cell, -1, rows)) + 1
-        index = (row * (cols + 2) + col).astype(np.intp)
+    for col, row, z in parts:
+        col, row = np.rint(np.clip(col, -1, cols)), np.rint(np.clip(row, -1, rows))
+        index = ((row + 1) * (cols + 2) + (col + 1)).astype(np.intp)
         np.maximum.at(height.reshape(-1), index.ravel(), z.ravel().astype(np.float32))
     return height[1:-1, 1:-1]
 
 
-def _rays(K: np.ndarray, T_WC: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(..., 3) directions in W of pixels' rays, scaled to unit depth."""
-    ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    return ray @ T_WC[:3, :3].T
-
-
-def _surface_points(frame: RGBDFrame, split: int = 2) -> Iterator[np.ndarray]:
-    """(3, H, W) points in W, split x split times: each pixel stands for that many points of its
-    square, because it covers about 2 mm of the table and single points would leave gaps in a 2 mm
-    grid. Without a depth, z is -inf.
+def _surface_points(
+    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int = 2
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Columns, rows and z (H, W) of points, split x split times: each pixel stands for that many
+    points of its square, because it covers about 2 mm of the table and single points would leave
+    gaps in a 2 mm grid. Without a depth, z is -inf.
     """
     depth = frame.depth.astype(float)
     unknown = ~((depth > 0) & np.isfinite(depth))
     depth[unknown] = 0
-    K, T_WC = (np.asarray(matrix, float) for matrix in (frame.K, frame.T_WC))
-    for rays in _split_rays(K.tobytes(), T_WC.tobytes(), depth.shape, split):
-        points = rays * depth + T_WC[:3, 3, None, None]
-        points[2][unknown] = -np.inf
-        yield points
-
-
-@lru_cache(maxsize=8)
-def _split_rays(K: bytes, T_WC: bytes, shape: tuple[int, int], split: int) -> np.ndarray:
-    """(split * split, 3, H, W) rays of a camera that usually stands still."""
+    to_cells = np.diag([1 / cell, 1 / cell, 1.0])
+    start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
+    # A ray is the sum of what a pixel's column, its row and the optical axis give.
+    by_u, by_v, axis = (to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)).T
+    v, u = (np.arange(count, dtype=float) for count in depth.shape)
     sub = (np.arange(split) + 0.5) / split - 0.5
-    dv, du, v, u = np.meshgrid(sub, sub, np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
-    rays = _rays(np.frombuffer(K).reshape(3, 3), np.frombuffer(T_WC).reshape(4, 4), u + du, v + dv)
-    rays = np.ascontiguousarray(np.moveaxis(rays.reshape(-1, *shape, 3), -1, 1))
-    rays.flags.writeable = False
-    return rays
+    for dv, du in itertools.product(sub, sub):
+        col, row, z = (
+            depth * ((a * (u + du) + c) + (b * (v + dv))[:, None]) + d
+            for a, b, c, d in zip(by_u, by_v, axis, start)
+        )
+        z[unknown] = -np.inf
+        yield col, row, z
 
 
-def _grazing_points(frame: RGBDFrame, cell: float, jump: float = 0.006) -> list[np.ndarray]:
-    """Points (3, S, N) in W on the rays between neighbouring pixels whose depths differ by a jump:
-    beside each other, and one below the other."""
-    found = []
+def _grazing_points(
+    frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = 0.006
+) -> Iterator[np.ndarray]:
+    """Columns, rows and z (3, S, N) of points on the rays between neighbouring pixels whose depths
+    differ by a jump: beside each other, and one below the other."""
     for step in ((1, 0), (0, 1)):
         here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
         there = frame.depth[step[1] :, step[0] :]
         edge = (np.abs(here - there) > jump) & (here > 0) & (there > 0)
         pixel = np.argwhere(edge)[:, ::-1]
+        if len(pixel) == 0:
+            continue
         near, far = (
             deproject(at, depth[edge], frame.K, frame.T_WC).T
             for at, depth in ((pixel, here), (pixel + step, there))
         )
-        if len(pixel):
-            span = np.linalg.norm((far - near)[:2], axis=0).max()
-            share = np.linspace(0, 1, int(np.clip(2 * span / cell, 2, 60)))[:, None]
-            found.append(near[:, None] + share * (far - near)[:, None])
-    return found
+        for end in (near, far):
+            end[:2] = (end[:2] - origin[:, None]) / cell
+        cells = np.linalg.norm((far - near)[:2], axis=0).max()
+        share = np.linspace(0, 1, int(np.clip(2 * cells, 2, 60)))[:, None]
+        yield near[:, None] + share * (far - near)[:, None]
