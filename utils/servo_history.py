@@ -154,5 +154,10 @@ class ServoHistory:
             goal = np.linalg.inv(self.goal_pose)[:3, 3]
             axes.scatter(*goal, color="tab:red", marker="*", s=60, label="goal")
         axes.invert_zaxis()  # the camera looks along +z, so a camera above the object has z < 0
+        half = 0.25 * float(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max())
+        for axis, values in (("x", positions[:, 0]), ("y", positions[:, 1])):
+            # A straight path would make the box so thin that its labels overlap.
+            getattr(axes, f"set_{axis}lim")(min(values.min(), -half), max(values.max(), half))
+        axes.locator_params(nbins=4)
         axes.set_aspect("equal")
-        axes.legend(loc="best", fontsize="small")
+        axes.legend(loc="upper left", fontsize="small")

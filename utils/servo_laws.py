@@ -33,9 +33,11 @@ def pseudo_inverse(
     """
     try:
         U, s, Vt = np.linalg.svd(A, full_matrices=False)
+        largest, smallest = float(s[0]), float(s[-1])
     except np.linalg.LinAlgError:
-        raise SingularMatrixError(f"matrix: not finite: {A.tolist()}") from None
-    largest, smallest = float(s[0]), float(s[-1])
+        largest = np.nan
+    if not largest < np.inf:
+        raise SingularMatrixError(f"matrix: not finite: {A.tolist()}")
     condition = largest / smallest if smallest > 0.0 else np.inf
     if damping > 0.0:
         inverse = s / (s * s + damping * damping)

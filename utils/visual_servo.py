@@ -15,14 +15,13 @@ Knows no simulator. `python -m utils.visual_servo` repeats known results and dra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from math import exp, sin, sqrt
-from typing import NamedTuple
+from collections.abc import Mapping
+from math import sin, sqrt
 
 import numpy as np
 
 from utils.errors import UserError, unknown_choice
-from utils.se3 import pose_exp, rotation_log
+from utils.se3 import rotation_log
 from utils.servo_errors import (
     CameraMatrixError,
     CollinearPointsError,
@@ -35,7 +34,6 @@ from utils.servo_errors import (
 )
 from utils.servo_features import (
     DepthFromMotion,
-    ServoCamera,
     check_depths,
     check_pose,
     depths_from_image,
@@ -49,12 +47,11 @@ from utils.servo_history import ServoHistory
 from utils.servo_laws import (
     AdaptiveGain,
     TwistLimits,
-    camera_jacobian,
     joint_limit_avoidance,
-    joint_velocities,
     pseudo_inverse,
     scale_joint_velocities,
 )
+from utils.servo_loop import ServoStep, View, VisualServo
 from utils.transforms import transform_points
 
 __all__ = [
@@ -81,215 +78,9 @@ __all__ = [
 
 INTERACTIONS = ("current", "desired", "mean")
 SCHEMES = ("blend", "2.5d")
-STALLED = 1e-12  # a correction this small (m, rad) will never move a camera
 
 
-class View(NamedTuple):
-    """What a camera saw, or should see. What a law does not use may be None.
-
-    points: (n, 2) pixels. depths: (n,) or one for all, metres along the optical axis.
-    T_CO: (4, 4) pose of the object in the camera.
-    """
-
-    points: np.ndarray | None = None
-    depths: np.ndarray | float | None = None
-    T_CO: np.ndarray | None = None
-
-
-class ServoStep(NamedTuple):
-    """velocity: (6,) v_C. error: (m,) in the law's units. gain: 1/s."""
-
-    velocity: np.ndarray
-    error: np.ndarray
-    condition_number: float
-    gain: float
-
-
-class _VisualServo:
-    """What the three laws share: gain, smooth start, limits, the loop, and the arm behind it.
-
-    A law only says, in `_correct`, which displacement would null the error at once.
-    """
-
-    def __init__(
-        self,
-        camera_config: Mapping,
-        lambda_: float | AdaptiveGain = 0.5,
-        *,
-        dt: float = 0.04,
-        smooth_start: float | None = None,
-        limits: TwistLimits | None = None,
-        damping: float = 0.0,
-        truncation: float = 0.0,
-    ):
-        """camera_config: {"intrinsics": K, ...}, see `ServoCamera.from_config`.
-        lambda_: gain, 1/s, or an AdaptiveGain. dt: seconds between two steps.
-        smooth_start: mu, 1/s; the velocity grows from zero as 1 - exp(-mu t); None starts at once.
-        limits: largest speeds; None for none. damping, truncation: see `pseudo_inverse`.
-        Raises CameraMatrixError or UserError.
-        """
-        self.camera = ServoCamera.from_config(camera_config)
-        if not isinstance(lambda_, AdaptiveGain) and not 0.0 < lambda_ < np.inf:
-            raise UserError(f"lambda_: expected a positive gain in 1/s, got {lambda_}")
-        if not 0.0 < dt < np.inf:
-            raise UserError(f"dt: expected a positive time in seconds, got {dt}")
-        for name, value in (("damping", damping), ("truncation", truncation)):
-            if not 0.0 <= value < np.inf:
-                raise UserError(f"{name}: expected zero or a positive number, got {value}")
-        self.lambda_ = lambda_
-        self.dt = dt
-        self.smooth_start = smooth_start
-        self.limits = limits
-        self.damping = damping
-        self.truncation = truncation
-        self.reset()
-
-    @property
-    def K(self) -> np.ndarray:
-        """(3, 3) pinhole matrix, pixels."""
-        return self.camera.K
-
-    def reset(self) -> None:
-        """Begin anew: the next step is the first one of a smooth start."""
-        self._time = 0.0
-        self._first_correction: np.ndarray | None = None
-        self._velocity = np.zeros(6)
-
-    def step(self, view: View, goal: View) -> ServoStep:
-        """The twist that brings `view` towards `goal`. Raises a ServoError on bad input."""
-        error, correction, condition = self._correct(view, goal)
-        gain = self.lambda_
-        if isinstance(gain, AdaptiveGain):
-            gain = gain(float(np.abs(correction).max()))
-        velocity = -gain * correction
-        if self.smooth_start is not None:
-            if self._first_correction is None:
-                self._first_correction = correction
-            fading = exp(-self.smooth_start * self._time)
-            velocity = velocity + gain * fading * self._first_correction
-        if self.limits is not None:
-            velocity = self.limits.scale(velocity)
-        self._time += self.dt
-        self._velocity = velocity
-        self._stalled = correction @ correction < STALLED**2
-        return ServoStep(velocity, error, condition, gain)
-
-    def run(
-        self,
-        see: Callable[[], View],
-        move: Callable[[np.ndarray], object],
-        goal: View,
-        max_iterations: int = 3000,
-        tolerance: float = 1e-5,
-    ) -> ServoHistory:
-        """See and move until the error's norm is under `tolerance`.
-
-        see() returns the present View; move(v_C) has the camera move with v_C until the next call.
-        However it ends, the last command is zero. Bad input in the first view raises; later on, a
-        lost feature set ends the run with the reason in the history.
-        """
-        self.reset()
-        views: list[View] = []
-        steps: list[ServoStep] = []
-        converged, reason = False, f"stopped after {max_iterations} iterations"
-        try:
-            while len(steps) < max_iterations:
-                try:
-                    view = see()
-                    step = self.step(view, goal)
-                except ServoError as error:
-                    if not steps:
-                        raise
-                    reason = f"stopped by {type(error).__name__}: {error}"
-                    break
-                views.append(view)
-                steps.append(step)
-                if sqrt(step.error @ step.error) < tolerance:
-                    converged, reason = True, f"converged after {len(steps)} iterations"
-                    break
-                if self._stalled:
-                    reason = "stopped: no motion reduces what is left of the error"
-                    break
-                move(step.velocity)
-        finally:
-            move(np.zeros(6))
-        return self._history(views, steps, goal, converged, reason)
-
-    def simulate(
-        self,
-        points_O: np.ndarray,
-        T_CO: np.ndarray,
-        T_GO: np.ndarray,
-        *,
-        depth_factor: float | None = 1.0,
-        pixel_noise: float = 0.0,
-        rng: np.random.Generator | None = None,
-        max_iterations: int = 3000,
-        tolerance: float = 1e-5,
-    ) -> ServoHistory:
-        """Servo an ideal camera that moves exactly as told.
-
-        points_O: (n, 3) points of the object. T_CO, T_GO: (4, 4) the object in the camera at the
-        start and at the goal. depth_factor: the depths told are the true ones times this; None
-        tells none. pixel_noise: standard deviation of each coordinate in pixels, from `rng`; the
-        pose told is then the one fitted to the noisy points at their true depths.
-        """
-        camera = _SimulatedCamera(self, points_O, T_CO, depth_factor, pixel_noise, rng)
-        ideal = _SimulatedCamera(self, points_O, T_GO, 1.0, 0.0, None)
-        history = self.run(camera.see, camera.move, ideal.see(), max_iterations, tolerance)
-        history.poses[:] = camera.poses[: history.iterations]  # the true ones, not those told
-        return history
-
-    def compute_joint_velocities(
-        self,
-        end_effector_pose: np.ndarray,
-        velocity: np.ndarray,
-        jacobian: np.ndarray,
-        secondary: np.ndarray | None = None,
-        damping: float = 0.0,
-    ) -> np.ndarray:
-        """Joint velocities (n,) that give the camera the twist v_C relative to what it looks at.
-
-        end_effector_pose: (4, 4) T_WE. jacobian: (6, n) of E's origin in the axes of W, linear
-        first. secondary: (n,) wished joint velocities, done as far as they leave v_C alone. The
-        camera's mounting comes from camera_config. Raises SingularMatrixError in a singular
-        posture unless damped.
-        """
-        T_WE = check_pose("end_effector_pose", end_effector_pose)
-        camera = self.camera
-        J = camera_jacobian(camera.mounting, T_WE, jacobian, camera.T_EC, camera.T_WC)
-        return joint_velocities(J, velocity, secondary, damping)[0]
-
-    def pixel_to_3d(self, u: float, v: float, Z: float) -> np.ndarray:
-        """(3,) point in C, metres, seen at pixel (u, v) and depth Z."""
-        xy = self.camera.normalise_unchecked(np.array([[u, v]], dtype=float))
-        if not np.isfinite(xy).all():
-            raise PointError(f"point: not finite: {(u, v)}")
-        return points_from_depths(xy, check_depths(Z, 1))[0]
-
-    def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
-        """Error (m,), L^+ error (6,), condition number of L."""
-        raise NotImplementedError
-
-    def _history(self, views, steps, goal, converged, reason) -> ServoHistory:
-        unknown = np.full((4, 4), np.nan)
-        no_points = np.empty((0, 2))
-        return ServoHistory(
-            poses=np.array([unknown if v.T_CO is None else v.T_CO for v in views]),
-            goal_pose=unknown if goal.T_CO is None else np.asarray(goal.T_CO),
-            points=np.array([no_points if v.points is None else v.points for v in views]),
-            goal_points=no_points if goal.points is None else np.asarray(goal.points),
-            errors=np.array([s.error for s in steps]),
-            velocities=np.array([s.velocity for s in steps]),
-            condition_numbers=np.array([s.condition_number for s in steps]),
-            gains=np.array([s.gain for s in steps]),
-            dt=self.dt,
-            converged=converged,
-            reason=reason,
-        )
-
-
-class ImageBasedVisualServo(_VisualServo):
+class ImageBasedVisualServo(VisualServo):
     """v_C = -gain L^+ (s - s*), s the normalised coordinates of three or more points."""
 
     def __init__(
@@ -303,7 +94,7 @@ class ImageBasedVisualServo(_VisualServo):
     ):
         """interaction: L at the current view, at the desired one, or the mean of both.
         depth: what to use where a view has no depths: metres for all points, or an estimator; with
-        None that is a DepthError. options: see `_VisualServo`.
+        None that is a DepthError. options: see `VisualServo`.
         """
         if interaction not in INTERACTIONS:
             raise unknown_choice("interaction", interaction, INTERACTIONS)
@@ -358,7 +149,7 @@ class ImageBasedVisualServo(_VisualServo):
         return check_depths(self.depth, len(xy))
 
 
-class PositionBasedVisualServo(_VisualServo):
+class PositionBasedVisualServo(VisualServo):
     """v = -gain R^T t, w = -gain theta u with (R, t) = T_GC: the camera's origin goes straight to
     the goal while the camera turns about one axis (Chaumette and Hutchinson 2006, equation 15)."""
 
@@ -388,7 +179,7 @@ class PositionBasedVisualServo(_VisualServo):
         return error, correction, half / sin(half) if half > 1e-8 else 1.0
 
 
-class HybridVisualServo(_VisualServo):
+class HybridVisualServo(VisualServo):
     """Image and pose together, in one of two ways.
 
     blend: alpha x position-based + (1 - alpha) x image-based (the tutorial's).
@@ -412,7 +203,7 @@ class HybridVisualServo(_VisualServo):
         interaction: of the blend's image-based half. The mean one goes straight also on long turns
         (the current one makes the camera back away), but it is singular at 90 and 180
         degrees; what is truncated there is left to the position-based half.
-        options: see `_VisualServo`.
+        options: see `VisualServo`.
         """
         if scheme not in SCHEMES:
             raise unknown_choice("scheme", scheme, SCHEMES)
@@ -478,39 +269,6 @@ def relative_pose(view: View, goal: View) -> np.ndarray:
     """(4, 4) T_GC, the camera seen from its goal."""
     T_CO, T_GO = check_pose("view.T_CO", view.T_CO), check_pose("goal.T_CO", goal.T_CO)
     return T_GO @ np.linalg.inv(T_CO)
-
-
-class _SimulatedCamera:
-    """An ideal camera in front of points: sees them where they are and moves as it is told."""
-
-    def __init__(self, servo: _VisualServo, points_O, T_CO, depth_factor, pixel_noise, rng):
-        if pixel_noise and rng is None:
-            raise UserError("simulate: pixel_noise needs an rng, so that the run can be repeated")
-        self.camera, self.dt = servo.camera, servo.dt
-        self.points_O = np.asarray(points_O, dtype=float)
-        if self.points_O.ndim != 2 or self.points_O.shape[1] != 3:
-            raise FeatureCountError(f"points_O: expected (n, 3), got {self.points_O.shape}")
-        self.T_CO = check_pose("T_CO", T_CO)
-        self.depth_factor, self.pixel_noise, self.rng = depth_factor, pixel_noise, rng
-        self.poses: list[np.ndarray] = []
-
-    def see(self) -> View:
-        T_CO = self.T_CO
-        self.poses.append(T_CO)
-        points_C = self.points_O @ T_CO[:3, :3].T + T_CO[:3, 3]
-        depths = points_C[:, 2]
-        if not depths.min() > 0.0:
-            raise DepthError(f"depths: behind the camera: {depths.round(4).tolist()}")
-        pixels = self.camera.to_pixels(points_C[:, :2] / depths[:, None])
-        if self.pixel_noise:
-            pixels = pixels + self.rng.normal(0.0, self.pixel_noise, pixels.shape)
-            xy = self.camera.normalise_unchecked(pixels)
-            T_CO = pose_from_points(points_from_depths(xy, depths), self.points_O)
-        told = None if self.depth_factor is None else depths * self.depth_factor
-        return View(pixels, told, T_CO)
-
-    def move(self, velocity: np.ndarray) -> None:
-        self.T_CO = pose_exp(-self.dt * velocity) @ self.T_CO
 
 
 if __name__ == "__main__":
