@@ -35,7 +35,6 @@ SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot sho
 MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
 PEAKS = PeakSettings()
 CANDIDATES = 1000  # peaks that are looked at for some that stand on the table
-PEAKS = PeakSettings()
 
 
 @dataclass(frozen=True)
@@ -139,14 +138,17 @@ def grasps_in_maps(
     )
     # As far around in metres as one pixel at the training's scale.
     radius = max(1, round(1 / min(scaling.u, scaling.v)))
+    seen = surface_grasps(original, frame.depth, gripper, radius)
+    pixels = np.array([grasp.pixel for grasp in seen]).reshape(-1, 2)
+    surface = deproject(pixels, [grasp.depth for grasp in seen], frame.K, frame.T_WC)
+    rises = surface[:, 2] - table_height > labels.table_clearance + labels.min_engagement
     return [
         PredictedGrasp(
             grasp,
             grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
         )
-        for grasp in surface_grasps(original, frame.depth, gripper, radius)
-        if deproject(grasp.pixel, grasp.depth, frame.K, frame.T_WC)[2] - table_height
-        > labels.table_clearance + labels.min_engagement
+        for grasp, high in zip(seen, rises)
+        if high
     ]
 
 
