@@ -203,6 +203,60 @@ class EnvConfig(Section):
     joint_step: Positive
 
 
+EnvArgument = Annotated[
+    str, Field(pattern=r"^[A-Za-z_]\w*=", description="NAME=VALUE, the value as YAML")
+]
+Names = Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
+
+
+class RLConfig(Section):
+    env_id: Name
+    env_kwargs: Annotated[tuple[EnvArgument, ...], Several] | None
+    policy_observations: Names | None
+    privileged_observations: Names | None
+    envs: Count
+    parallel: bool
+    worker_timeout: Positive
+    total_steps: Count
+    rollout_steps: Count
+    epochs: Count
+    batch_size: Count
+    lr: Positive
+    anneal_lr: bool
+    gamma: Share
+    gae_lambda: Annotated[float, Field(ge=0, le=1)]
+    clip_epsilon: Annotated[float, Field(gt=0, lt=1)]
+    target_kl: Positive | None
+    value_coef: Annotated[float, Field(ge=0)]
+    entropy_coef: Annotated[float, Field(ge=0)]
+    max_gradient_norm: Positive
+    normalise_observations: bool
+    normalise_rewards: bool
+    squash: bool
+    initial_log_std: Annotated[float, Field(ge=-5, le=2)]
+    conv_channels: Annotated[tuple[Count, ...], Several]
+    image_feature_dim: Count
+    hidden_dim: Count
+    hidden_layers: Count
+    activation: Literal["tanh", "relu", "elu"]
+    initial: Annotated[Path, Field(strict=False)] | None
+    evaluate_every: Count
+    evaluation_episodes: Count
+    target_success: Share | None
+    target_return: float | None
+    device: Name
+    name: Name | None
+
+    @model_validator(mode="after")
+    def _whole_minibatches(self) -> RLConfig:
+        steps = self.envs * self.rollout_steps
+        if steps % self.batch_size:
+            raise ValueError(
+                f"batch_size ({self.batch_size}) must divide envs x rollout_steps ({steps})"
+            )
+        return self
+
+
 class Config(Section):
     """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
 
@@ -219,6 +273,7 @@ class Config(Section):
     train: TrainConfig
     evaluate: EvaluateConfig
     env: EnvConfig
+    rl: RLConfig
 
     @property
     def cache_folder(self) -> Path:

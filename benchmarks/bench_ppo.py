@@ -1,0 +1,226 @@
+"""Our PPO against Stable-Baselines3's: python -m benchmarks.bench_ppo [--json FILE]
+
+Same environments and number of them, same network and hyper-parameters, no normalising; every seed
+of both in a process of its own, one after the other and in turn. The final return is the mean over
+deterministic episodes of the last policy, from seeds that both are given.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import psutil
+from scipy.stats import t as student
+
+from benchmarks.metrics import Metric, benchmark_parser, report
+from utils.config import Config, load_config, run_script
+
+EPISODES = 100  # deterministic ones at the end
+FIRST_SEED = 900_000  # of these
+ENVS = 4
+
+
+@dataclass(frozen=True)
+class Task:
+    """An environment, the module that registers it, and settings of `rl` that suit it (Pendulum's
+    are those of RL Baselines3 Zoo without its state-dependent exploration)."""
+
+    module: str
+    steps: int
+    settings: tuple[str, ...]
+
+
+COMMON = (
+    f"rl.envs={ENVS}", "rl.hidden_dim=64", "rl.hidden_layers=2", "rl.activation=tanh",
+    "rl.initial_log_std=0", "rl.target_kl=null", "rl.anneal_lr=false", "rl.value_coef=0.5",
+    "rl.entropy_coef=0", "rl.max_gradient_norm=0.5", "rl.clip_epsilon=0.2", "rl.gae_lambda=0.95",
+    "rl.normalise_observations=false", "rl.normalise_rewards=false", "rl.device=cpu",
+)  # fmt: skip
+TASKS = {
+    "Pendulum-v1": Task(
+        "gymnasium", 100_000,
+        ("rl.lr=1e-3", "rl.gamma=0.9", "rl.epochs=10", "rl.rollout_steps=1024",
+         "rl.batch_size=64", "rl.parallel=false"),
+    ),
+    "PandaReachDense-v3": Task(
+        "panda_gym", 100_000,
+        ("rl.lr=1e-3", "rl.gamma=0.95", "rl.epochs=10", "rl.rollout_steps=512",
+         "rl.batch_size=64", "rl.parallel=true"),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one training. seconds: from the first step to the last update; megabytes: the most that
+    the process and its workers held together."""
+
+    final_return: float
+    steps: int
+    seconds: float
+    megabytes: float
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = benchmark_parser(__doc__.splitlines()[0])
+    parser.add_argument("--env", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--seeds", type=int, default=5, help="trainings of either")
+    parser.add_argument("--steps", type=int, help="env steps of each; default: the task's own")
+    parser.add_argument("--run", nargs=2, metavar=("WHO", "SEED"), help="one training, as JSON")
+    options = parser.parse_args(argv)
+    if options.run:
+        who, seed = options.run
+        print(json.dumps(vars(TRAIN[who](options.env[0], int(seed), options.steps))))
+        return
+    seeds = 2 if options.quick else options.seeds
+    metrics = []
+    for env in options.env:
+        steps = options.steps or (4096 if options.quick else TASKS[env].steps)
+        metrics += compare(env, seeds, steps)
+    report(metrics, options.json)
+
+
+def compare(env: str, seeds: int, steps: int) -> list[Metric]:
+    """The figures of one environment, and a line for every training."""
+    results: dict[str, list[Result]] = {who: [] for who in TRAIN}
+    for seed in range(seeds):
+        for who in list(TRAIN)[:: 1 if seed % 2 else -1]:  # who is first alternates
+            results[who].append(in_own_process(env, who, seed, steps))
+            print(f"{env} {who} seed {seed}: {results[who][-1]}", file=sys.stderr, flush=True)
+    returns = {who: [r.final_return for r in results[who]] for who in TRAIN}
+    rate = {who: np.array([r.steps / r.seconds for r in results[who]]) for who in TRAIN}
+    memory = {who: max(r.megabytes for r in results[who]) for who in TRAIN}
+    low, high = interval(returns["sb3"])
+    ours_low, ours_high = interval(returns["ours"])
+    return [
+        Metric(f"{env}_return", float(np.mean(returns["ours"])), "", at_least=low),
+        Metric(f"{env}_return_low", ours_low, ""),
+        Metric(f"{env}_return_high", ours_high, ""),
+        Metric(f"{env}_return_sb3", float(np.mean(returns["sb3"])), ""),
+        Metric(f"{env}_return_sb3_low", low, ""),
+        Metric(f"{env}_return_sb3_high", high, ""),
+        Metric(f"{env}_speed_vs_sb3", float(np.median(rate["ours"] / rate["sb3"])), "x",
+               at_least=1.3),
+        Metric(f"{env}_steps_per_second", float(np.median(rate["ours"])), "1/s"),
+        Metric(f"{env}_memory", memory["ours"], "MB"),
+        Metric(f"{env}_memory_vs_sb3", memory["ours"] / memory["sb3"], "x"),
+    ]  # fmt: skip
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """95 % interval of the mean by Student's t; of no width for a single value."""
+    mean, n = float(np.mean(values)), len(values)
+    if n < 2:
+        return mean, mean
+    half = float(student.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+    return mean - half, mean + half
+
+
+def in_own_process(env: str, who: str, seed: int, steps: int) -> Result:
+    """A training with one thread a process, so that memory is its own and nothing is warm."""
+    command = [sys.executable, "-m", "benchmarks.bench_ppo", "--env", env, "--steps", str(steps)]
+    done = subprocess.run(
+        [*command, "--run", who, str(seed)], stdout=subprocess.PIPE, text=True, check=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    return Result(**json.loads(done.stdout.splitlines()[-1]))
+
+
+def memory() -> float:
+    """Megabytes of this process and its children, shared pages counted once (PSS)."""
+    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    return sum(process.memory_full_info().pss for process in processes) / 2**20
+
+
+# --- The two ------------------------------------------------------------------------------------
+
+
+def config_of(env: str, seed: int) -> Config:
+    task = TASKS[env]
+    return load_config(
+        None, [*COMMON, *task.settings, f"seed={seed}", f"rl.env_id={task.module}:{env}"]
+    )
+
+
+def whole_updates(config: Config, steps: int) -> int:
+    return max(1, round(steps / (config.rl.envs * config.rl.rollout_steps)))
+
+
+def train_ours(env: str, seed: int, steps: int) -> Result:
+    from envs.vector import vector_envs
+    from models.ranks import ALONE
+    from models.rollouts import RolloutCollector, derived_seeds, evaluate_policy
+    from train_rl import make_ppo
+    from utils.stopwatch import Stopwatch
+
+    config = config_of(env, seed)
+    count, watch = whole_updates(config, steps), Stopwatch()
+    with vector_envs(config, config.rl.envs) as envs:
+        ppo = make_ppo(config, envs, ALONE)
+        collector = RolloutCollector(envs, ppo.layout, config.rl.rollout_steps, ALONE.device, watch)
+        collector.restart(derived_seeds(envs.num_envs, seed))
+        ppo.generator.manual_seed(seed)
+        start = time.perf_counter()
+        for _ in range(count):
+            ppo.update(collector.collect(ppo.network, ppo.generator))
+        seconds, megabytes = time.perf_counter() - start, memory()
+        seeds = range(FIRST_SEED, FIRST_SEED + EPISODES)
+        episodes = evaluate_policy(ppo.network, envs, ppo.layout, seeds, ALONE.device, watch)
+    final = float(np.mean([episode.total for episode in episodes]))
+    return Result(final, count * envs.num_envs * config.rl.rollout_steps, seconds, megabytes)
+
+
+def train_sb3(env: str, seed: int, steps: int) -> Result:
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    config = config_of(env, seed)
+    rl = config.rl
+    kind = SubprocVecEnv if rl.parallel else DummyVecEnv
+    envs = make_vec_env(rl.env_id, rl.envs, seed, vec_env_cls=kind)
+    widths = [rl.hidden_dim] * rl.hidden_layers
+    dict_observation = hasattr(envs.observation_space, "spaces")
+    model = PPO(
+        "MultiInputPolicy" if dict_observation else "MlpPolicy", envs, seed=seed, device="cpu",
+        learning_rate=rl.lr, n_steps=rl.rollout_steps, batch_size=rl.batch_size,
+        n_epochs=rl.epochs, gamma=rl.gamma, gae_lambda=rl.gae_lambda, clip_range=rl.clip_epsilon,
+        ent_coef=rl.entropy_coef, vf_coef=rl.value_coef, max_grad_norm=rl.max_gradient_norm,
+        policy_kwargs={"net_arch": {"pi": widths, "vf": widths}, "activation_fn": torch.nn.Tanh},
+    )  # fmt: skip
+    steps = whole_updates(config, steps) * rl.envs * rl.rollout_steps
+    start = time.perf_counter()
+    model.learn(steps)
+    seconds, megabytes = time.perf_counter() - start, memory()
+    envs.close()
+    judge, seeds = gymnasium.make(rl.env_id), range(FIRST_SEED, FIRST_SEED + EPISODES)
+    final = float(np.mean([deterministic_return(model, judge, number) for number in seeds]))
+    return Result(final, steps, seconds, megabytes)
+
+
+def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
+    """Of one episode by SB3's policy."""
+    observation, _ = env.reset(seed=seed)
+    total, done = 0.0, False
+    while not done:
+        action, _ = model.predict(observation, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, done = total + float(reward), terminated or truncated
+    return total
+
+
+TRAIN = {"ours": train_ours, "sb3": train_sb3}
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,257 @@
+"""Many copies of a Gymnasium environment, each in a worker process, that fail loudly.
+
+A worker that raises, dies or hangs ends the call with what is known about it; nothing waits for
+ever. Environments never reset on their own, so that no final observation is lost. This module knows
+no policy.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import yaml
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from utils.config import Config
+from utils.errors import UserError
+
+OWN_ENV = "RobotGrasping-v0"  # is given the whole config
+# Imported once by the process that all workers are forked from, instead of by each of them.
+PRELOADED = ["envs.vector", "envs.grasping_env", "torch", "torch.utils.tensorboard", "tqdm"]
+
+
+class WorkerError(RuntimeError):
+    """A worker process raised something, died or did not answer; the message holds its traceback,
+    as far as there is one."""
+
+
+@contextmanager
+def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
+    """`count` environments of the config's section `rl`, closed at the end.
+
+    Raises UserError for an environment that does not exist or cannot be made from its arguments.
+    """
+    envs = VectorEnvs(config, count)
+    try:
+        yield envs
+    except BaseException:
+        envs.kill()  # a worker in an unknown state would not answer a request to close
+        raise
+    envs.close()
+
+
+class VectorEnvs:
+    """See `models.rollouts.VectorEnvs` for the methods that stepping takes.
+
+    observation_space, action_space: of a single environment.
+    """
+
+    def __init__(self, config: Config, count: int):
+        self.num_envs = count
+        self._timeout = config.rl.worker_timeout
+        makers = [partial(make_env, config, index) for index in range(count)]
+        self._parallel = config.rl.parallel and count > 1
+        if self._parallel:
+            # Not forked from here: threads, GPU contexts and OpenGL do not survive that.
+            multiprocessing.set_forkserver_preload(PRELOADED)
+            with one_thread(), _told(self._died):
+                self._envs = AsyncVectorEnv(
+                    makers, context="forkserver", copy=False, autoreset_mode=AutoresetMode.DISABLED
+                )
+        else:
+            self._envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
+
+    def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
+        options = None if which is None else {"reset_mask": which}
+        with _told(self._died):
+            if not self._parallel:
+                return self._envs.reset(seed=list(seeds), options=options)[0]
+            self._envs.reset_async(seed=list(seeds), options=options)
+            return self._envs.reset_wait(self._timeout)[0]
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        with _told(self._died):
+            if not self._parallel:
+                return self._envs.step(actions)
+            self._envs.step_async(actions)
+            return self._envs.step_wait(self._timeout)
+
+    @property
+    def processes(self) -> list[multiprocessing.Process]:
+        """The workers, if there are any."""
+        return self._envs.processes if self._parallel else []
+
+    def close(self) -> None:
+        self._envs.close()
+
+    def kill(self) -> None:
+        """End the workers without asking them."""
+        for process in self.processes:
+            process.kill()
+        for process in self.processes:
+            process.join()
+        if self._parallel:
+            self._envs.closed = True
+        else:
+            self._envs.close()
+
+    def _died(self) -> str:
+        """Which workers do not live any more."""
+        if not hasattr(self, "_envs"):
+            return "a worker process died while it was started; its message stands above"
+        dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes)
+                if not p.is_alive()]  # fmt: skip
+        return f"worker process {', '.join(dead) or 'of an environment'} died (out of memory?)"
+
+
+@contextmanager
+def _told(died) -> Iterator[None]:
+    """Turns how Gymnasium reports a lost worker into a WorkerError."""
+    try:
+        yield
+    except (EOFError, BrokenPipeError, ConnectionResetError) as error:
+        raise WorkerError(died()) from error
+    except multiprocessing.TimeoutError as error:
+        raise WorkerError(
+            f"an environment hangs: {error}; rl.worker_timeout is how long it may take"
+        ) from error
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Processes started in here compute with one thread each: there are as many as cores."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> gymnasium.Env:
+    """One environment of the config's section `rl`, with all that is to be seen in its
+    observations. Raises UserError if it cannot be made."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    settings = config.rl
+    arguments = {}
+    for text in settings.env_kwargs or ():
+        name, _, value = text.partition("=")
+        arguments[name] = yaml.safe_load(value)
+    if render_mode is not None:  # panda-gym does not take None
+        arguments["render_mode"] = render_mode
+    if settings.env_id == OWN_ENV:
+        arguments["config"] = config
+    try:
+        env = gymnasium.make(settings.env_id, disable_env_checker=True, **arguments)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        raise UserError(f"rl.env_id {settings.env_id}: {error}") from error
+    except TypeError as error:
+        raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
+    wanted = [*(settings.policy_observations or ()), *(settings.privileged_observations or ())]
+    return Watched(with_info(env, wanted), index)
+
+
+def with_info(env: gymnasium.Env, wanted: Sequence[str]) -> gymnasium.Env:
+    """The environment, its observation completed by wanted entries that only its info has."""
+    space = env.observation_space
+    here = space.spaces if isinstance(space, spaces.Dict) else {}
+    missing = [name for name in wanted if name not in here]
+    if not missing or not isinstance(space, spaces.Dict):
+        return env
+    _, info = env.reset(seed=0)
+    missing = [name for name in missing if name in info]
+    return InfoInObservation(env, missing, info) if missing else env
+
+
+class InfoInObservation(gymnasium.ObservationWrapper):
+    """Adds numeric entries of info to a dict observation, as float32 vectors."""
+
+    def __init__(self, env: gymnasium.Env, names: Sequence[str], example: dict[str, Any]):
+        super().__init__(env)
+        self._names = names
+        added = {
+            name: spaces.Box(-np.inf, np.inf, self._vector(example, name).shape) for name in names
+        }
+        self.observation_space = spaces.Dict({**env.observation_space.spaces, **added})
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        observation, info = self.env.reset(**arguments)
+        return self._complete(observation, info), info
+
+    def step(self, action: np.ndarray) -> tuple:
+        observation, *middle, info = self.env.step(action)
+        return self._complete(observation, info), *middle, info
+
+    def _complete(self, observation: dict, info: dict) -> dict[str, np.ndarray]:
+        return {**observation, **{name: self._vector(info, name) for name in self._names}}
+
+    @staticmethod
+    def _vector(info: dict[str, Any], name: str) -> np.ndarray:
+        try:
+            return np.atleast_1d(np.asarray(info[name], np.float32))
+        except (TypeError, ValueError):
+            raise UserError(f"info entry {name!r} is no number or vector: {info[name]!r}") from None
+
+
+class Watched(gymnasium.Wrapper):
+    """Checks what an environment returns, and turns what it raises into one message.
+
+    The message has to be text: an error that cannot be pickled would never leave its process.
+    """
+
+    def __init__(self, env: gymnasium.Env, index: int):
+        super().__init__(env)
+        self._index = index
+        space = env.observation_space
+        self._shapes = (
+            {key: box.shape for key, box in space.items()}
+            if isinstance(space, spaces.Dict)
+            else space.shape
+        )
+
+    def reset(self, **arguments: Any) -> tuple:
+        return self._checked(lambda: self.env.reset(**arguments))
+
+    def step(self, action: np.ndarray) -> tuple:
+        return self._checked(lambda: self.env.step(action))
+
+    def _checked(self, call) -> tuple:
+        try:
+            result = call()
+        except UserError as error:
+            raise UserError(f"environment {self._index}: {error}") from None
+        except Exception:
+            raise WorkerError(
+                f"environment {self._index} raised an error:\n{traceback.format_exc()}"
+            ) from None
+        found = (
+            {key: np.shape(value) for key, value in result[0].items()}
+            if isinstance(result[0], dict)
+            else np.shape(result[0])
+        )
+        if found != self._shapes:
+            raise UserError(
+                f"environment {self._index}: the observation has shapes {found}, its "
+                f"space says {self._shapes}"
+            )
+        return result

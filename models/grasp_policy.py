@@ -1,0 +1,283 @@
+"""GraspPolicyNetwork: RGB-D image and robot state in, a distribution of actions out.
+
+The network knows nothing of environments; `policy_for` fits one to a Gymnasium env's spaces, and
+`load_policy` rebuilds it from a checkpoint. How it learns stands in `models.ppo` (GraspPPO).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+from torch import nn
+
+from models.normalisers import ObservationNormaliser
+from models.observations import ObservationLayout, Observations
+from models.ppo import KIND, GraspPPO
+from utils.checkpoint import load_checkpoint, load_weights
+from utils.config_schema import RLConfig
+from utils.errors import UserError
+
+__all__ = [
+    "ActionDistribution",
+    "GraspPPO",
+    "GraspPolicyNetwork",
+    "SavedPolicy",
+    "load_policy",
+    "policy_for",
+]
+
+ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
+LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
+POOLED = 7  # rows and columns that the last convolution is pooled to
+LOG_2PI = math.log(2 * math.pi)
+
+
+class ActionDistribution(NamedTuple):
+    """A diagonal Gaussian over latent actions; squashed: the action is the latent's tanh.
+
+    Latents, not actions, are sampled, stored and asked about: an action at the edge of tanh, or
+    clipped to the bounds of the action space, has lost which latent it came from.
+
+    mean: (B, A). log_std: (A,).
+    """
+
+    mean: torch.Tensor
+    log_std: torch.Tensor
+    squashed: bool
+
+    def sample(self, noise: torch.Tensor) -> torch.Tensor:
+        """Latents (B, A) from standard normal noise (B, A)."""
+        return self.mean + self.log_std.exp() * noise
+
+    def log_prob(self, latent: torch.Tensor) -> torch.Tensor:
+        """(B,) log density of the action that a latent (B, A) stands for; of actions in [-1, 1]
+        where squashed, by the change of variables (Haarnoja et al., "Soft actor-critic", ICML 2018,
+        appendix C)."""
+        z = (latent - self.mean) * (-self.log_std).exp()
+        constant = self.log_std.sum() + 0.5 * LOG_2PI * len(self.log_std)
+        log_density = -0.5 * z.square().sum(-1) - constant
+        return log_density - log_tanh_slope(latent).sum(-1) if self.squashed else log_density
+
+    def entropy(self, noise: torch.Tensor | None = None) -> torch.Tensor:
+        """Differential entropy in nats: one number, as it does not depend on the mean. Squashed it
+        does, and has no closed form: (B,) estimates without bias, each from one sample that is made
+        of standard normal noise (B, A)."""
+        gaussian = (0.5 + 0.5 * LOG_2PI + self.log_std).sum()
+        return gaussian + log_tanh_slope(self.sample(noise)).sum(-1) if self.squashed else gaussian
+
+
+def log_tanh_slope(x: torch.Tensor) -> torch.Tensor:
+    """log(1 - tanh(x)^2), which does not overflow: 1 - tanh^2 = 4 / (e^x + e^-x)^2."""
+    return 2 * (math.log(2) - x - F.softplus(-2 * x))
+
+
+class GraspPolicyNetwork(nn.Module):
+    """Policy and critic: an image encoder that both share, and layers of their own.
+
+    image_feature_dim: numbers that an image becomes. state_dim, action_dim: sizes of the state and
+    action vectors. hidden_dim, hidden_layers: units and number of the policy's and of the critic's
+    layers. image_channels: 4 for RGB-D; 0 for a policy without an image. privileged_dim: numbers
+    that only the critic sees (asymmetric actor-critic, Pinto et al., RSS 2018).
+    conv_channels: of the encoder's 3x3 convolutions with stride 2. squash: see ActionDistribution.
+    normalise: by running statistics, see `observe`.
+
+    Weights start orthogonal, with gain sqrt 2, or 0.01 for the mean and 1 for the value, so that a
+    new policy acts around 0 (Huang et al., "The 37 implementation details of PPO", 2022).
+    The deviation does not depend on the observation.
+    """
+
+    def __init__(
+        self,
+        image_feature_dim: int = 512,
+        state_dim: int = 15,
+        action_dim: int = 7,
+        hidden_dim: int = 256,
+        image_channels: int = 4,
+        privileged_dim: int = 0,
+        conv_channels: Sequence[int] = (32, 64, 128),
+        hidden_layers: int = 2,
+        activation: str = "relu",
+        squash: bool = False,
+        normalise: bool = True,
+        initial_log_std: float = 0.0,
+    ):
+        super().__init__()
+        self.model_args = {
+            "image_feature_dim": image_feature_dim, "state_dim": state_dim,
+            "action_dim": action_dim, "hidden_dim": hidden_dim, "image_channels": image_channels,
+            "privileged_dim": privileged_dim, "conv_channels": list(conv_channels),
+            "hidden_layers": hidden_layers, "activation": activation, "squash": squash,
+            "normalise": normalise, "initial_log_std": initial_log_std,
+        }  # fmt: skip
+        self.squash, self.normalise = squash, normalise
+        self.image_norm = ObservationNormaliser(image_channels)
+        self.state_norm = ObservationNormaliser(state_dim)
+        self.privileged_norm = ObservationNormaliser(privileged_dim)
+        self.encoder = None
+        if image_channels:
+            self.encoder = encoder(image_channels, conv_channels, image_feature_dim)
+        seen = state_dim + (image_feature_dim if image_channels else 0)
+        widths, kind = [hidden_dim] * hidden_layers, ACTIVATIONS[activation]
+        self.actor = layers([seen, *widths], kind)
+        self.mean_head = initialised(nn.Linear(hidden_dim, action_dim), 0.01)
+        self.log_std = nn.Parameter(torch.full((action_dim,), initial_log_std))
+        self.critic = layers([seen + privileged_dim, *widths], kind)
+        self.value_head = initialised(nn.Linear(hidden_dim, 1), 1.0)
+        self.register_buffer("action_low", torch.full((action_dim,), -1.0))
+        self.register_buffer("action_high", torch.full((action_dim,), 1.0))
+
+    def forward(self, image: torch.Tensor | None, state: torch.Tensor) -> ActionDistribution:
+        """What to do. image: (B, C, H, W) colours in 0..1 and depth in metres, or None where there
+        are no image channels; state: (B, S), both as observed: normalising is done in here."""
+        return self._distribution(self._features(image, state))
+
+    def value(
+        self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
+    ) -> torch.Tensor:
+        """(B,) the expected return; privileged: (B, P), P may be 0."""
+        return self._value(self._features(image, state), privileged)
+
+    def policy_and_value(
+        self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
+    ) -> tuple[ActionDistribution, torch.Tensor]:
+        """Both at the price of one image encoding."""
+        features = self._features(image, state)
+        return self._distribution(features), self._value(features, privileged)
+
+    def action(self, latent: torch.Tensor) -> torch.Tensor:
+        """(B, A) what the robot is told for latents: squashed and stretched to the bounds of the
+        action space, or clipped to them."""
+        if self.squash:
+            half = (self.action_high - self.action_low) / 2
+            return self.action_low + half * (latent.tanh() + 1)
+        return torch.minimum(torch.maximum(latent, self.action_low), self.action_high)
+
+    def observe(self, observations: Observations, team) -> None:
+        """Take a rollout's observations into the statistics by which they are normalised."""
+        if not self.normalise:
+            return
+        if self.encoder is not None:
+            self.image_norm.update(observations.image().movedim(1, -1).flatten(0, -2), team)
+        if observations.state.shape[-1]:
+            self.state_norm.update(observations.state, team)
+        if observations.privileged.shape[-1]:
+            self.privileged_norm.update(observations.privileged, team)
+
+    def _features(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
+        if self.normalise:
+            state = self.state_norm(state)
+        if self.encoder is None:
+            return state
+        if self.normalise:
+            image = self.image_norm(image.movedim(1, -1)).movedim(-1, 1)
+        return torch.cat([self.encoder(image), state], -1)
+
+    def _distribution(self, features: torch.Tensor) -> ActionDistribution:
+        log_std = self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
+        return ActionDistribution(self.mean_head(self.actor(features)), log_std, self.squash)
+
+    def _value(self, features: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
+        if privileged.shape[-1]:
+            if self.normalise:
+                privileged = self.privileged_norm(privileged)
+            features = torch.cat([features, privileged], -1)
+        return self.value_head(self.critic(features)).squeeze(-1)
+
+
+def encoder(channels: int, conv_channels: Sequence[int], features: int) -> nn.Sequential:
+    """(B, channels, H, W) to (B, features), for images of any size."""
+    parts: list[nn.Module] = []
+    for before, after in zip([channels, *conv_channels], conv_channels):
+        parts += [initialised(nn.Conv2d(before, after, 3, stride=2), math.sqrt(2)), nn.ReLU()]
+    parts += [nn.AdaptiveAvgPool2d(POOLED), nn.Flatten()]
+    return nn.Sequential(*parts, *layers([conv_channels[-1] * POOLED**2, features], nn.ReLU))
+
+
+def layers(widths: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    """Fully connected layers, each with its activation."""
+    parts: list[nn.Module] = []
+    for before, after in zip(widths, widths[1:]):
+        parts += [initialised(nn.Linear(before, after), math.sqrt(2)), activation()]
+    return nn.Sequential(*parts)
+
+
+def initialised(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Linear | nn.Conv2d:
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+# --- Fitted to an environment, and from a file --------------------------------------------------
+
+
+def policy_for(
+    layout: ObservationLayout, action_space: spaces.Space, settings: RLConfig
+) -> GraspPolicyNetwork:
+    """A new network for an environment's observations and actions.
+
+    Raises UserError for actions that are not a vector of real numbers, or without bounds where
+    they would have to be squashed.
+    """
+    if not isinstance(action_space, spaces.Box) or not np.issubdtype(
+        action_space.dtype, np.floating
+    ):
+        raise UserError(
+            f"rl.env_id {settings.env_id}: its actions are {action_space}; this PPO has a Gaussian "
+            "policy, choose an environment whose action space is a Box of floats"
+        )
+    low, high = (torch.as_tensor(b, dtype=torch.float32).flatten()
+                 for b in (action_space.low, action_space.high))  # fmt: skip
+    if settings.squash and not action_space.is_bounded():
+        raise UserError(
+            f"rl.squash: the actions of {settings.env_id} have no bounds to be squashed between; "
+            "use rl.squash=false"
+        )
+    network = GraspPolicyNetwork(
+        settings.image_feature_dim,
+        layout.state_dim,
+        len(low),
+        settings.hidden_dim,
+        layout.image_channels,
+        layout.privileged_dim,
+        settings.conv_channels,
+        settings.hidden_layers,
+        settings.activation,
+        settings.squash,
+        settings.normalise_observations,
+        settings.initial_log_std,
+    )
+    network.action_low.copy_(low)
+    network.action_high.copy_(high)
+    return network
+
+
+class SavedPolicy(NamedTuple):
+    """network: in evaluation mode. layout: what it sees of an environment's observations. extra:
+    anything else plain that was saved."""
+
+    network: GraspPolicyNetwork
+    layout: ObservationLayout
+    extra: dict
+
+    def __call__(self, observation: dict[str, np.ndarray] | np.ndarray) -> np.ndarray:
+        """(A,) the deterministic action for one observation of one environment."""
+        seen = self.layout.read_one(observation)
+        with torch.inference_mode():
+            latent = self.network(seen.image(), seen.state).mean
+            return self.network.action(latent)[0].numpy()
+
+
+def load_policy(path: Path | str) -> SavedPolicy:
+    """The policy of a checkpoint of `GraspPPO.save`, on the CPU. Raises UserError."""
+    checkpoint = load_checkpoint(path, KIND)
+    network = GraspPolicyNetwork(**checkpoint["model_args"])
+    load_weights(network, checkpoint, path)
+    extra = checkpoint["extra"]
+    return SavedPolicy(network.eval(), ObservationLayout.from_plain(extra["layout"]), extra)

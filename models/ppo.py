@@ -1,0 +1,303 @@
+"""GraspPPO: proximal policy optimisation of a GraspPolicyNetwork, from rollouts.
+
+The algorithm is Schulman et al., "Proximal policy optimization algorithms" (2017, below "PPO"),
+with the advantages of Schulman et al., "High-dimensional continuous control using generalized
+advantage estimation" (ICLR 2016, below "GAE"). This module never sees an environment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from models.normalisers import RewardScaler
+from models.observations import ObservationLayout, Observations
+from models.ranks import ALONE, average, gather, share_weights
+from models.rollouts import NotFinite, Rollout
+from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.config_schema import Config, RLConfig
+from utils.errors import UserError
+
+KIND = "grasp_policy"
+ADAM_EPSILON = 1e-5  # Huang et al., "The 37 implementation details of PPO" (2022), detail 3
+SMALLEST_DEVIATION = 1e-8  # of advantages, so that equal ones do not divide by zero
+KL_SLACK = 1.5  # an update stops beyond this many times the target, as in OpenAI's baselines
+
+
+class Batch(NamedTuple):
+    """B steps to learn from; everything but observations and latents is (B,)."""
+
+    observations: Observations
+    latents: torch.Tensor
+    log_probs: torch.Tensor
+    advantages: torch.Tensor
+    returns: torch.Tensor
+
+    def rows(self, index: torch.Tensor | slice) -> Batch:
+        return Batch(self.observations.map(lambda part: part[index]), *(p[index] for p in self[1:]))
+
+
+class Losses(NamedTuple):
+    """Parts of a minibatch's loss, and what is watched beside them; scalars."""
+
+    loss: torch.Tensor
+    policy_loss: torch.Tensor
+    value_loss: torch.Tensor
+    entropy: torch.Tensor
+    approx_kl: torch.Tensor
+    clip_fraction: torch.Tensor
+
+
+class GraspPPO:
+    """A policy in training.
+
+    network: what is trained; it sees observations by `layout`. settings: the config's section `rl`.
+    seed: of everything random in here, which is the order of minibatches and what `generator` is
+    used for by others. In a team every process brings its own rollouts, and gradients are averaged,
+    so that together they take the step of the joint minibatch.
+    """
+
+    def __init__(self, network, layout: ObservationLayout, settings: RLConfig, team=ALONE, seed=0):
+        if settings.batch_size % team.ranks or settings.envs % team.ranks:
+            raise UserError(
+                f"rl.envs is {settings.envs} and rl.batch_size {settings.batch_size}, but "
+                f"{team.ranks} processes have to share both equally; make them multiples"
+            )
+        self.network, self.layout = network.to(team.device), layout
+        self.settings, self.team, self.seed = settings, team, seed
+        self.rewards = RewardScaler(settings.gamma).to(team.device)
+        self.updates = 0
+        self.generator = torch.Generator()
+        share_weights(team, network)
+        self.weights = in_one_vector(self.network)
+        self.optimizer = torch.optim.Adam([self.weights], settings.lr, eps=ADAM_EPSILON, fused=True)
+
+    @staticmethod
+    def compute_gae(
+        rewards: np.ndarray, values: np.ndarray, next_values: np.ndarray,
+        terminated: np.ndarray, ended: np.ndarray, gamma: float, lamda: float,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Advantages and returns, (T, N) each; GAE equations 11 to 16.
+
+        values: V(s_t); next_values: V of the observation after the step, which is the *final* one
+        where an episode ended. terminated: nothing comes after, so that V counts as 0; ended:
+        terminated or truncated, the sum over future errors ends there either way. All (T, N).
+        """
+        advantages = np.empty_like(values)
+        errors = rewards + gamma * next_values * ~terminated - values
+        carried = gamma * lamda * ~ended
+        advantage = np.zeros_like(values[0])
+        for t in reversed(range(len(values))):
+            advantage = errors[t] + carried[t] * advantage
+            advantages[t] = advantage
+        return advantages, advantages + values
+
+    def update(self, rollout: Rollout, progress: float = 0.0) -> dict[str, float]:
+        """Learn from a rollout: several passes over it in shuffled minibatches.
+
+        progress: share of the training that is done, for the annealed learning rate.
+        Returns means over the minibatches, and the gradients' norm before it was clipped.
+        Raises NotFinite, with the weights as they were before that minibatch, if a gradient is no
+        number.
+        """
+        batch, explained_variance = self._prepare(rollout)
+        lr = self.settings.lr * (1 - progress if self.settings.anneal_lr else 1)
+        for group in self.optimizer.param_groups:
+            group["lr"] = lr
+        watched: list[torch.Tensor] = []
+        norms: list[float] = []
+        for minibatch in self._minibatches(batch):
+            losses = self.losses(minibatch)
+            norm = self.gradient(losses.loss)
+            if not math.isfinite(norm):
+                raise NotFinite(
+                    f"a gradient is not finite at update {self.updates} (loss "
+                    f"{losses.loss.item():.3g}, of the value {losses.value_loss.item():.3g})"
+                )
+            watched.append(torch.stack([part.detach() for part in losses]))
+            norms.append(norm)
+            if self._too_far(losses.approx_kl):
+                break
+            self.optimizer.step()
+        # Only now, so that all of the rollout and its update saw the same normalised numbers.
+        self.network.observe(batch.observations, self.team)
+        self.updates += 1
+        means = gather(self.team, torch.stack(watched).mean(0)).mean(0).tolist()
+        return dict(zip(Losses._fields, means)) | {
+            "gradient_norm": float(np.mean(norms)),
+            "explained_variance": explained_variance,
+            "std": self.network.log_std.detach().exp().mean().item(),
+            "learning_rate": lr,
+            "minibatches": float(len(watched)),
+        }
+
+    def gradient(self, loss: torch.Tensor) -> float:
+        """Put the gradient of a loss, averaged over the team, in `weights.grad`, its norm clipped
+        as that of one vector; returns the norm before."""
+        gradient = self.weights.grad
+        gradient.zero_()
+        loss.backward()
+        average(self.team, gradient)
+        norm = gradient.norm().item()
+        if norm > self.settings.max_gradient_norm:
+            gradient.mul_(self.settings.max_gradient_norm / norm)
+        return norm
+
+    def losses(self, batch: Batch) -> Losses:
+        """The loss of a minibatch: PPO equation 9 with the clipped objective of equation 7, signs
+        turned for minimising."""
+        settings, advantages = self.settings, self._normalised(batch.advantages)
+        seen = batch.observations
+        distribution, values = self.network.policy_and_value(
+            seen.image(), seen.state, seen.privileged
+        )
+        log_ratio = distribution.log_prob(batch.latents) - batch.log_probs
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1 - settings.clip_epsilon, 1 + settings.clip_epsilon)
+        policy_loss = -torch.minimum(ratio * advantages, clipped * advantages).mean()
+        value_loss = F.mse_loss(values, batch.returns)
+        entropy = distribution.entropy(self._entropy_noise(batch.latents)).mean()
+        loss = policy_loss + settings.value_coef * value_loss - settings.entropy_coef * entropy
+        with torch.no_grad():
+            # The estimator of KL(old, new) with the least variance (Schulman's note on it, 2020).
+            approx_kl = (ratio - 1 - log_ratio).mean()
+            clip_fraction = (ratio != clipped).float().mean()
+        return Losses(loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
+
+    def _prepare(self, rollout: Rollout) -> tuple[Batch, float]:
+        """What an update learns from, and the share of the returns' variance that the critic had
+        foreseen."""
+        steps, envs = rollout.rewards.shape
+        device = self.team.device
+        observations = rollout.observations.map(lambda part: part.flatten(0, 1).to(device))
+        latents = rollout.latents.flatten(0, 1).to(device)
+        log_probs, values = self._judge(observations, latents)
+        after = Observations(
+            *(
+                (tuple(map(torch.cat, zip(a, b))) if isinstance(a, tuple) else torch.cat([a, b]))
+                for a, b in zip(rollout.cut_final, rollout.last)
+            )
+        ).map(lambda part: part.to(device))
+        _, after_values = self._judge(after)
+        after_values = after_values.cpu().numpy()
+        values = values.cpu().numpy().reshape(steps, envs)
+        next_values = np.concatenate([values[1:], after_values[None, -envs:]])
+        for (t, env), value in zip(rollout.cut, after_values):
+            next_values[t, env] = value
+        ended = rollout.terminated | rollout.truncated
+        rewards = rollout.rewards
+        if self.settings.normalise_rewards:
+            rewards = self.rewards.scale(rewards, ended, self.team)
+        advantages, returns = self.compute_gae(
+            rewards.astype(np.float32), values, next_values, rollout.terminated, ended,
+            self.settings.gamma, self.settings.gae_lambda,
+        )  # fmt: skip
+        batch = Batch(
+            observations, latents, log_probs,
+            *(torch.from_numpy(x.ravel()).to(device) for x in (advantages, returns)),
+        )  # fmt: skip
+        spread = float(returns.var())
+        return batch, 1 - float((returns - values).var()) / spread if spread else 0.0
+
+    @torch.no_grad()
+    def _judge(
+        self, observations: Observations, latents: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B,) log-probabilities of latents and values, a part at a time to bound the memory."""
+        size = self.settings.batch_size
+        log_probs, values = [], []
+        for start in range(0, len(observations.state), size):
+            part = observations.map(lambda whole: whole[start : start + size])  # noqa: B023
+            distribution, value = self.network.policy_and_value(
+                part.image(), part.state, part.privileged
+            )
+            values.append(value)
+            if latents is not None:
+                log_probs.append(distribution.log_prob(latents[start : start + size]))
+        return torch.cat(log_probs) if log_probs else torch.empty(0), torch.cat(values)
+
+    def _minibatches(self, batch: Batch) -> Iterator[Batch]:
+        size = self.settings.batch_size // self.team.ranks
+        for _ in range(self.settings.epochs):
+            order = torch.randperm(len(batch.latents), generator=self.generator)
+            shuffled = batch.rows(order.to(self.team.device))
+            for start in range(0, len(order), size):
+                yield shuffled.rows(slice(start, start + size))
+
+    def _normalised(self, advantages: torch.Tensor) -> torch.Tensor:
+        """Advantages with zero mean and unit deviation over the joint minibatch."""
+        joint = gather(self.team, advantages)
+        if joint.numel() == 1:
+            return advantages
+        return (advantages - joint.mean()) / (joint.std() + SMALLEST_DEVIATION)
+
+    def _entropy_noise(self, latents: torch.Tensor) -> torch.Tensor | None:
+        """What the entropy of a squashed policy is estimated by."""
+        if not self.network.squash:
+            return None
+        return torch.randn(latents.shape, generator=self.generator).to(latents.device)
+
+    def _too_far(self, approx_kl: torch.Tensor) -> bool:
+        target = self.settings.target_kl
+        if target is None:
+            return False
+        return float(gather(self.team, approx_kl.detach()).mean()) > KL_SLACK * target
+
+    # --- Checkpoints ----------------------------------------------------------------------------
+
+    def save(self, path: Path, config: Config | None = None, **extra: Any) -> None:
+        """Everything that `load` needs to go on, and `load_policy` to act."""
+        save_checkpoint(
+            path,
+            kind=KIND,
+            model_args=self.network.model_args,
+            model=self.network,
+            optimizer=self.optimizer,
+            step=self.updates,
+            config=None if config is None else config.model_dump(mode="json"),
+            extra={
+                "layout": self.layout.to_plain(),
+                "rewards": self.rewards.state_dict(),
+                **extra,
+            },
+        )
+
+    def load(self, path: Path) -> dict[str, Any]:
+        """Go on from a checkpoint of `save`; returns its extra entries. UserError if it does not
+        fit."""
+        checkpoint = load_checkpoint(
+            path, KIND, model_args=self.network.model_args, map_location=self.team.device
+        )
+        extra = checkpoint["extra"]
+        if extra["layout"] != self.layout.to_plain():
+            raise UserError(f"{path}: a policy of other observations than this environment's")
+        if checkpoint["optimizer"] is None:
+            raise UserError(f"{path}: holds weights only, no training to go on with")
+        load_weights(self.network, checkpoint, path)
+        self.rewards.load_state_dict(extra["rewards"])
+        self.optimizer.load_state_dict(checkpoint["optimizer"])
+        self.updates = checkpoint["step"]
+        return extra
+
+
+def in_one_vector(network: nn.Module) -> nn.Parameter:
+    """Lay all weights and all gradients of a network side by side: its parameters become views of
+    the vector returned, their gradients views of its `grad`.
+
+    So that a norm, a step of the optimiser or a message between processes is one operation, which
+    counts for small networks; that the gradient is clipped as a whole needs no care either.
+    """
+    parameters = list(network.parameters())
+    whole = nn.Parameter(torch.cat([p.detach().flatten() for p in parameters]))
+    whole.grad = torch.zeros_like(whole)
+    sizes = [p.numel() for p in parameters]
+    for p, part, gradient in zip(parameters, whole.detach().split(sizes), whole.grad.split(sizes)):
+        p.data, p.grad = part.view_as(p), gradient.view_as(p)
+    return whole

@@ -1,0 +1,286 @@
+"""Train a policy by PPO: any Gymnasium environment with continuous actions, first of all the cell.
+
+    python train_rl.py --config configs/ppo_state.yaml
+    python train_rl.py rl.env_id=Pendulum-v1 rl.gamma=0.9 rl.total_steps=200000
+    torchrun --nproc_per_node=2 train_rl.py --config configs/ppo.yaml
+
+Leaves best.pt (chosen by evaluations), last.pt, results.json and TensorBoard events in
+runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit.
+
+No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
+all environments begin new episodes from seeds that follow from the run's seed and the number of
+updates: a run that goes on from there meets the same episodes as one that was never stopped.
+"""
+
+from __future__ import annotations
+
+import os
+
+# The processes that simulate need the cores while a thread waits for another one.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from envs.vector import VectorEnvs, vector_envs
+from models.grasp_policy import GraspPPO, policy_for
+from models.graspnet_training import Team, team
+from models.observations import ObservationLayout
+from models.ppo import KIND
+from models.rollouts import (
+    NETWORK,
+    SIMULATION,
+    Episode,
+    NotFinite,
+    RolloutCollector,
+    derived_seeds,
+    evaluate_policy,
+)
+from train_graspnet import stop_on_interrupt
+from utils.checkpoint import load_checkpoint, load_weights
+from utils.config import Config, load_config, parse_args, run_script
+from utils.errors import UserError
+from utils.results import write_json_atomic
+from utils.runs import git_state, new_run_folder
+from utils.stopwatch import Stopwatch
+
+FREE_TO_CHANGE = ("name", "device", "parallel", "worker_timeout", "target_success", "target_return")
+TRAINING, EVALUATION, LEARNING = range(3)  # purposes of seeds, which never share any
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    config, options = parse_args(argv, "Train a policy by PPO.")
+    check_resume(config, options.resume)
+    with rl_team(config) as us, vector_envs(config, envs_of(config, us)) as envs:
+        ppo = make_ppo(config, envs, us)
+        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
+        history = load_progress(ppo, run / "last.pt")
+        announce(config, run, envs, ppo)
+
+        finished = train(config, run, envs, ppo, history)
+
+        if us.leads:
+            save_results(run, history)
+            if not finished:
+                print(f"stopped; go on after {history[-1]['step']:,} steps with --resume {run}")
+    return 0 if finished else 130
+
+
+def check_resume(config: Config, run: Path | None) -> None:
+    """Raise UserError if a run cannot be gone on with, or not with this config."""
+    if run is None:
+        return
+    if not (run / "last.pt").is_file():
+        raise UserError(f"--resume {run}: no last.pt in there; start a new run")
+    before, now = (c.model_dump() for c in (load_config(run / "config.yaml"), config))
+    for key in FREE_TO_CHANGE:
+        before["rl"].pop(key), now["rl"].pop(key)
+    if before != now:
+        free = ", ".join(f"rl.{key}" for key in FREE_TO_CHANGE)
+        raise UserError(
+            f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
+            "for anything else, from its weights with rl.initial"
+        )
+
+
+def rl_team(config: Config):
+    try:
+        return team(config.rl.device, dict(os.environ))
+    except UserError as error:
+        raise UserError(str(error).replace("train.device", "rl.device")) from None
+
+
+def envs_of(config: Config, us: Team) -> int:
+    """How many environments this process steps."""
+    if config.rl.envs % us.ranks:
+        raise UserError(f"rl.envs is {config.rl.envs}; {us.ranks} processes cannot share it")
+    return config.rl.envs // us.ranks
+
+
+def make_ppo(config: Config, envs: VectorEnvs, us: Team) -> GraspPPO:
+    """A new policy, or one with the weights of rl.initial, fitted to the environments."""
+    settings = config.rl
+    layout = ObservationLayout.of(
+        envs.observation_space, settings.policy_observations, settings.privileged_observations
+    )
+    torch.manual_seed(config.seed)
+    network = policy_for(layout, envs.action_space, settings)
+    if settings.initial is not None:
+        load_weights(network, load_checkpoint(settings.initial, KIND), settings.initial)
+    return GraspPPO(network, layout, settings, us)
+
+
+def open_run(config: Config) -> str:
+    return str(new_run_folder("train_rl", config.rl.name, config))
+
+
+def load_progress(ppo: GraspPPO, last: Path) -> list[dict]:
+    """Go on from a checkpoint, if there is one; the evaluations so far."""
+    return ppo.load(last)["history"] if last.is_file() else []
+
+
+def announce(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO) -> None:
+    us, settings = ppo.team, config.rl
+    if us.leads:
+        layout = ppo.layout
+        seen = ", ".join(part.key for part in (*layout.images, *layout.state))
+        hidden = ", ".join(part.key for part in layout.privileged)
+        print(
+            f"PPO on {settings.env_id}: {settings.envs} environments, {updates(config)} updates of "
+            f"{settings.envs * settings.rollout_steps:,} steps each, "
+            f"{ppo.weights.numel():,} parameters, {us.ranks} process(es), "
+            f"{us.device}, seed {config.seed}; the policy sees {seen}"
+            f"{f', only the critic {hidden}' if hidden else ''}; results in {run}",
+            flush=True,
+        )
+
+
+def updates(config: Config) -> int:
+    """Updates until rl.total_steps are reached."""
+    return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
+
+
+def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: list[dict]) -> bool:
+    """Train to the end, to a target, or until Ctrl-C (False). history gets a row an evaluation."""
+    us, settings, watch = ppo.team, config.rl, Stopwatch()
+    collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, us.device, watch)
+    per_update, total = settings.envs * settings.rollout_steps, updates(config)
+    step = ppo.updates * per_update
+    writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.leads else None
+    bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
+    try:
+        with stop_on_interrupt() as interrupted, bar:
+            while True:
+                if ppo.updates % settings.evaluate_every == 0 or ppo.updates == total:
+                    if not history or history[-1]["update"] < ppo.updates:
+                        row = evaluate(config, envs, ppo, watch, step)
+                        history.append(row)
+                        save_evaluation(run, config, ppo, history, writer, bar)
+                    if reached(config, history[-1]) or ppo.updates == total:
+                        break
+                    place = (config.seed, TRAINING, us.rank, ppo.updates)
+                    collector.restart(derived_seeds(envs.num_envs, *place))
+                    ppo.rewards.restart()
+                place = (config.seed, LEARNING, us.rank, ppo.updates)
+                ppo.generator.manual_seed(derived_seeds(1, *place)[0])
+                rollout = collector.collect(ppo.network, ppo.generator, step)
+                with watch(NETWORK):
+                    losses = ppo.update(rollout, ppo.updates / total)
+                step += per_update
+                episodes = summary(from_all(us, rollout.episodes))
+                bar.update(per_update)
+                bar.set_postfix({k: f"{v:.3g}" for k, v in episodes.items() if k != "length"})
+                if us.leads:
+                    log(writer, step, episodes, losses, bar)
+                if us.any(interrupted.is_set()):
+                    return False
+    except NotFinite as error:
+        raise UserError(
+            f"{error}; the weights of {run / 'last.pt'} are sound: go on from there with "
+            "rl.initial, perhaps with a lower rl.lr"
+        ) from error
+    finally:
+        if us.leads:
+            writer.close()
+            print(shares_in_words(watch), flush=True)
+    return True
+
+
+def evaluate(
+    config: Config, envs: VectorEnvs, ppo: GraspPPO, watch: Stopwatch, step: int
+) -> dict[str, Any]:
+    """Deterministic episodes on seeds that stay the same and are never trained on."""
+    seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
+    own = seeds[ppo.team.rank :: ppo.team.ranks]
+    episodes = (
+        evaluate_policy(ppo.network, envs, ppo.layout, own, ppo.team.device, watch) if own else []
+    )
+    return {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
+
+
+def from_all(us: Team, episodes: list[Episode]) -> list[Episode]:
+    """The episodes of all processes."""
+    if us.ranks == 1:
+        return episodes
+    lists = [None] * us.ranks
+    dist.all_gather_object(lists, episodes)
+    return [Episode(*episode) for part in lists for episode in part]
+
+
+def summary(episodes: Sequence[Episode]) -> dict[str, float]:
+    """Means over episodes, as far as there are some: return, length, success."""
+    if not episodes:
+        return {}
+    told = [episode.success for episode in episodes if episode.success is not None]
+    means = {
+        "return": float(np.mean([episode.total for episode in episodes])),
+        "length": float(np.mean([episode.length for episode in episodes])),
+    }
+    return means | ({"success": float(np.mean(told))} if told else {})
+
+
+def score(row: dict[str, Any]) -> tuple[float, float]:
+    """What the best evaluation is chosen by: success first, where it is told, then the return."""
+    return row.get("success", 0.0), row["return"]
+
+
+def reached(config: Config, row: dict[str, Any]) -> bool:
+    """Whether an evaluation meets one of the targets."""
+    success, total = config.rl.target_success, config.rl.target_return
+    return (success is not None and row.get("success", 0.0) >= success) or (
+        total is not None and row["return"] >= total
+    )
+
+
+def save_evaluation(
+    run: Path, config: Config, ppo: GraspPPO, history: list[dict], writer: SummaryWriter, bar: tqdm
+) -> None:
+    """Checkpoints, TensorBoard and a line for the last row of history."""
+    if ppo.team.leads:
+        row = history[-1]
+        if score(row) == max(map(score, history)):
+            ppo.save(run / "best.pt", config, history=history)
+        ppo.save(run / "last.pt", config, history=history)
+        for name in ("return", "length", "success"):
+            if name in row:
+                writer.add_scalar(f"evaluation/{name}", row[name], row["step"])
+        writer.flush()
+        bar.write(", ".join(f"{name} {value:.6g}" for name, value in row.items()))
+    ppo.team.wait()
+
+
+def log(
+    writer: SummaryWriter, step: int, episodes: dict[str, float], losses: dict[str, float],
+    bar: tqdm,
+) -> None:  # fmt: skip
+    for name, value in episodes.items():
+        writer.add_scalar(f"rollout/{name}", value, step)
+    for name, value in losses.items():
+        writer.add_scalar(f"update/{name}", value, step)
+    if bar.format_dict["rate"]:
+        writer.add_scalar("time/steps_per_second", bar.format_dict["rate"], step)
+
+
+def shares_in_words(watch: Stopwatch) -> str:
+    seconds = watch.seconds()
+    total = sum(seconds.values())
+    shares = ", ".join(f"{100 * part / total:.0f} % {name}" for name, part in seconds.items())
+    return f"{total:.0f} s: {shares.replace(SIMULATION, 'simulation and rendering')}"
+
+
+def save_results(run: Path, history: list[dict]) -> None:
+    best = max(history, key=score)
+    results = {"schema": 1, "commit": git_state().commit, "best": best, "history": history}
+    write_json_atomic(run / "results.json", results)
+    print(", ".join(["best evaluation:", *(f"{name} {value:.6g}" for name, value in best.items())]))
+
+
+if __name__ == "__main__":
+    run_script(main)
