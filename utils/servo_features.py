@@ -29,7 +29,7 @@ from utils.servo_errors import (
 
 MIN_POINTS = 3  # six unknowns, two equations each; four or more have no singular cylinder
 COLLINEAR = 1e-3  # a set of points narrower than this share of its length is a line
-RIGID = 1e-6  # how far R^T R may be from the identity
+RIGID = 1e-6  # how far a rotation may be from orthonormal
 
 MOUNTINGS = ("eye_in_hand", "eye_to_hand")
 CAMERA_KEYS = ("intrinsics", "width", "height", "mounting", "T_EC", "T_WC")
@@ -49,6 +49,11 @@ class ServoCamera:
     mounting: str
     T_EC: np.ndarray | None
     T_WC: np.ndarray | None
+
+    def __post_init__(self) -> None:
+        # Read many times in each step.
+        object.__setattr__(self, "_focal", np.array([self.K[0, 0], self.K[1, 1]]))
+        object.__setattr__(self, "_centre", self.K[:2, 2].copy())
 
     @classmethod
     def from_config(cls, config: Mapping) -> ServoCamera:
@@ -104,11 +109,11 @@ class ServoCamera:
 
     def normalise_unchecked(self, pixels: np.ndarray) -> np.ndarray:
         """Normalised coordinates (..., 2) of pixels (..., 2)."""
-        return (pixels - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
+        return (pixels - self._centre) / self._focal
 
     def to_pixels(self, xy: np.ndarray) -> np.ndarray:
         """Pixels (..., 2) of normalised coordinates (..., 2)."""
-        return xy * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
+        return xy * self._focal + self._centre
 
     def _check_inside(self, pixels: np.ndarray) -> None:
         low, high = pixels.min(axis=0), pixels.max(axis=0)
@@ -146,13 +151,17 @@ def check_pose(name: str, T) -> np.ndarray:
     T = np.asarray(T, dtype=float)
     if T.shape != (4, 4):
         raise PoseError(f"{name}: expected a (4, 4) transform, got shape {T.shape}")
-    R = T[:3, :3]
-    error = R.T @ R - np.eye(3)
-    # `not <` also catches NaN.
-    if not np.abs(error).max() < RIGID or np.linalg.det(R) < 0 or not isfinite(T[:3, 3].sum()):
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
+    # Rows of unit length, at right angles, right-handed; scalars, as this is checked in every step.
+    off = max(
+        abs(a * a + b * b + c * c - 1), abs(d * d + e * e + f * f - 1),
+        abs(g - (b * f - c * e)), abs(h - (c * d - a * f)), abs(i - (a * e - b * d)),
+        abs(a * d + b * e + c * f),
+    )  # fmt: skip
+    if not isfinite(a + b + c + d + e + f + g + h + i + x + y + z) or off > RIGID:
         raise PoseError(f"{name}: not a rigid transform: {T.tolist()}")
-    if T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        raise PoseError(f"{name}: the last row must be 0, 0, 0, 1, got {T[3].tolist()}")
+    if last != [0.0, 0.0, 0.0, 1.0]:
+        raise PoseError(f"{name}: the last row must be 0, 0, 0, 1, got {last}")
     return T
 
 

@@ -80,12 +80,15 @@ class VisualServo:
         for name, value in (("damping", damping), ("truncation", truncation)):
             if not 0.0 <= value < np.inf:
                 raise UserError(f"{name}: expected zero or a positive number, got {value}")
+        if smooth_start is not None and not 0.0 < smooth_start < np.inf:
+            raise UserError(f"smooth_start: expected a positive rate in 1/s, got {smooth_start}")
         self.lambda_ = lambda_
         self.dt = dt
         self.smooth_start = smooth_start
         self.limits = limits
         self.damping = damping
         self.truncation = truncation
+        self._goal: tuple[tuple[bytes, tuple], np.ndarray] | None = None
         self.reset()
 
     @property
@@ -214,6 +217,15 @@ class VisualServo:
     def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
         """Error (m,), L^+ error (6,), condition number of L."""
         raise NotImplementedError
+
+    def _goal_xy(self, points) -> np.ndarray:
+        """Normalised coordinates of the goal's points: checked once, not in every step."""
+        points = np.asarray(points, dtype=float)
+        # Compared by value, as the caller may write into the array.
+        content = points.tobytes(), points.shape
+        if self._goal is None or self._goal[0] != content:
+            self._goal = content, self.camera.normalise(points)
+        return self._goal[1]
 
     def _history(self, views, steps, goal, converged, reason) -> ServoHistory:
         unknown = np.full((4, 4), np.nan)

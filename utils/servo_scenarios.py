@@ -54,6 +54,7 @@ def object_pose(translation, rotation_degrees) -> np.ndarray:
 
 START = object_pose([0.15, -0.1, 1.0], [10, -10, 50])
 GOAL = object_pose([0, 0, 0.75], [0, 0, 0])
+NEAR_GOAL = object_pose([0, 0, 0.5], [0, 0, 0])  # no farther than any random start
 FACING = object_pose([0, 0, 1.0], [0, 0, 0])
 
 

@@ -52,7 +52,7 @@ from utils.servo_laws import (
     scale_joint_velocities,
 )
 from utils.servo_loop import ServoStep, View, VisualServo
-from utils.transforms import transform_points
+from utils.transforms import inverse_pose, transform_points
 
 __all__ = [
     "AdaptiveGain",
@@ -125,7 +125,7 @@ class ImageBasedVisualServo(VisualServo):
     def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
         if view.points is None or goal.points is None:
             raise FeatureCountError("points: needed in the view and in the goal, got None")
-        xy, xy_goal = self.camera.normalise(view.points), self.camera.normalise(goal.points)
+        xy, xy_goal = self.camera.normalise(view.points), self._goal_xy(goal.points)
         if len(xy) != len(xy_goal):
             raise FeatureCountError(f"points: got {len(xy)}, wanted are {len(xy_goal)}")
         error = (xy - xy_goal).ravel()
@@ -243,9 +243,12 @@ class HybridVisualServo(VisualServo):
     def _correct_extended(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
         turn = rotation_log(relative_pose(view, goal)[:3, :3])
         # The centre of the points in space, not of their images, is a fixed point of the object.
-        centre, centre_goal = self._centre(view), self._centre(goal)
-        if len(view.points) != len(goal.points):
-            raise FeatureCountError(f"points: got {len(view.points)}, wanted {len(goal.points)}")
+        if view.points is None or goal.points is None:
+            raise FeatureCountError("points: needed in the view and in the goal, got None")
+        xy, xy_goal = self.camera.normalise(view.points), self._goal_xy(goal.points)
+        if len(xy) != len(xy_goal):
+            raise FeatureCountError(f"points: got {len(xy)}, wanted are {len(xy_goal)}")
+        centre, centre_goal = centre_of(xy, view.depths), centre_of(xy_goal, goal.depths)
         error = np.empty(6)
         error[:2] = centre[:2] / centre[2] - centre_goal[:2] / centre_goal[2]
         error[2] = np.log(centre[2] / centre_goal[2])
@@ -256,19 +259,18 @@ class HybridVisualServo(VisualServo):
         inverse, condition = pseudo_inverse(L, self.damping, self.truncation)
         return error, inverse @ error, condition
 
-    def _centre(self, view: View) -> np.ndarray:
-        if view.points is None:
-            raise FeatureCountError("points: needed in the view and in the goal, got None")
-        if view.depths is None:
-            raise DepthError("depths: needed in the view and in the goal, got None")
-        xy = self.camera.normalise(view.points)
-        return points_from_depths(xy, check_depths(view.depths, len(xy))).mean(axis=0)
+
+def centre_of(xy: np.ndarray, depths) -> np.ndarray:
+    """(3,) mean in C of points at normalised coordinates (n, 2) and depths (n,), metres."""
+    if depths is None:
+        raise DepthError("depths: needed in the view and in the goal, got None")
+    return points_from_depths(xy, check_depths(depths, len(xy))).mean(axis=0)
 
 
 def relative_pose(view: View, goal: View) -> np.ndarray:
     """(4, 4) T_GC, the camera seen from its goal."""
     T_CO, T_GO = check_pose("view.T_CO", view.T_CO), check_pose("goal.T_CO", goal.T_CO)
-    return T_GO @ np.linalg.inv(T_CO)
+    return T_GO @ inverse_pose(T_CO)
 
 
 if __name__ == "__main__":
