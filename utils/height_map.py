@@ -194,9 +194,11 @@ def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
     rows, cols = shape
     height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for what lies outside
     for col, row, z in parts:
-        col, row = np.rint(np.clip(col, -1, cols)), np.rint(np.clip(row, -1, rows))
-        index = ((row + 1) * (cols + 2) + (col + 1)).astype(np.intp)
-        np.maximum.at(height.reshape(-1), index.ravel(), z.ravel().astype(np.float32))
+        index = np.rint(np.clip(row, -1, rows)) + 1
+        index *= cols + 2
+        index += np.rint(np.clip(col, -1, cols)) + 1
+        index, z = index.astype(np.intp), z.astype(np.float32)
+        np.maximum.at(height.reshape(-1), index.ravel(), z.ravel())
     return height[1:-1, 1:-1]
 
 
@@ -234,7 +236,8 @@ def _grazing_points(
         here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
         there = frame.depth[step[1] :, step[0] :]
         edge = (np.abs(here - there) > jump) & (here > 0) & (there > 0)
-        pixel = np.argwhere(edge)[:, ::-1]
+        row, column = np.divmod(np.flatnonzero(edge), edge.shape[1])
+        pixel = np.stack([column, row], axis=-1)
         if len(pixel) == 0:
             continue
         near, far = (
