@@ -51,14 +51,17 @@ def refine(
     repeated = [grasp for grasp in grasps for _ in settings.deeper]
     tip = np.array([grasp.position[2] for grasp in repeated]) - gripper.tip_below_centre
     deeper = np.tile(settings.deeper, len(grasps))
-    quality = np.array([grasp.quality for grasp in repeated])
     found = Candidates.rough(
         xy=np.array([grasp.position[:2] for grasp in repeated]),
         angle=np.array([grasp.angle for grasp in repeated]),
         tip=np.maximum(tip - deeper, np.minimum(tip, lowest)),
         width=np.minimum([grasp.width for grasp in repeated], widest),
-        score=quality,
+        score=np.array([grasp.quality for grasp in repeated]),
     )
+    # Where the table stops several of the depths, one of them is enough.
+    depths = found.tip.reshape(len(grasps), -1)
+    found = found.take((np.diff(depths, axis=1, prepend=np.inf) != 0).ravel())
+    quality = found.score
     found = measure(found, heights, gripper, settings.search)
     found = turn_onto_faces(found, heights, gripper, settings.search, settings.turns)
     fits = found.score > 0
