@@ -219,9 +219,8 @@ def measure(
     touched = np.isfinite(left) & np.isfinite(high_left)
     left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
     width, shift = right - left, (right + left) / 2
-    slope_left, cover_left = _face(low_left - left[:, None], v)
-    slope_right, cover_right = _face(right[:, None] - low_right, v)
-    yaw_left, yaw_right = np.arctan(slope_left), -np.arctan(slope_right)
+    slope, cover = _face(np.stack([low_left - left[:, None], right[:, None] - low_right]), v)
+    yaw_left, yaw_right = np.arctan(slope) * [[1], [-1]]
     turn, wedge = -(yaw_left + yaw_right) / 2, np.abs(yaw_left - yaw_right) / 2
     rise = upper - tip - 0.001
     tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
@@ -258,13 +257,14 @@ def measure(
 
     score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
     score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
-    score *= 0.4 + 0.6 * np.minimum(cover_left, cover_right)
+    score *= 0.4 + 0.6 * cover.min(axis=0)
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
     score *= np.exp(-4 * blind)
     score *= np.where(ends[0] == ends[1], 1.0, 0.5)
     score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
-    feasible = np.isin(np.arange(N), left_over)
+    feasible = np.zeros(N, bool)
+    feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
     return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
 
@@ -317,15 +317,15 @@ def _widest_opening(
 
 
 def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.0025):
-    """Slope (N,) of the gap between pad and face (N, V) across the pad, and share (N,) in touch."""
+    """Slope (...) of the gap (..., V) between pad and face across the pad, and share in touch."""
     weight = (gap < near).astype(float)
     gap = np.where(gap < near, gap, 0.0)
-    total = np.maximum(weight.sum(axis=1), 1)
-    mean_v = (weight * v).sum(axis=1) / total
-    spread = weight * (v - mean_v[:, None])
-    variance = (spread * v).sum(axis=1)
-    slope = (spread * gap).sum(axis=1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < touch)).mean(axis=1)
+    total = np.maximum(weight.sum(axis=-1), 1)
+    mean_v = (weight * v).sum(axis=-1) / total
+    spread = weight * (v - mean_v[..., None])
+    variance = (spread * v).sum(axis=-1)
+    slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
+    return slope, (weight * (gap < touch)).mean(axis=-1)
 
 
 def _palm_gap(
