@@ -19,7 +19,10 @@ import os
 # The processes that simulate need the cores while a thread waits for another one.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+import sys
+import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +32,9 @@ import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.vector import VectorEnvs, vector_envs
+from envs.vector import VectorEnvs, WorkerError, vector_envs
 from models.grasp_policy import GraspPPO, policy_for
-from models.graspnet_training import Team, team
+from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
 from models.ppo import KIND
 from models.rollouts import (
@@ -90,11 +93,13 @@ def check_resume(config: Config, run: Path | None) -> None:
         )
 
 
-def rl_team(config: Config):
+def rl_team(config: Config) -> AbstractContextManager[Team]:
+    """This process's place among those of torchrun; UserError for a device that is not there."""
     try:
-        return team(config.rl.device, dict(os.environ))
+        choose_device(config.rl.device, int(os.environ.get("LOCAL_RANK", 0)))
     except UserError as error:
         raise UserError(str(error).replace("train.device", "rl.device")) from None
+    return team(config.rl.device, dict(os.environ))
 
 
 def envs_of(config: Config, us: Team) -> int:
@@ -170,6 +175,7 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                     ppo.rewards.restart()
                 place = (config.seed, LEARNING, us.rank, ppo.updates)
                 ppo.generator.manual_seed(derived_seeds(1, *place)[0])
+                begun = time.perf_counter()
                 rollout = collector.collect(ppo.network, ppo.generator, step)
                 with watch(NETWORK):
                     losses = ppo.update(rollout, ppo.updates / total)
@@ -178,7 +184,10 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                 bar.update(per_update)
                 bar.set_postfix({k: f"{v:.3g}" for k, v in episodes.items() if k != "length"})
                 if us.leads:
-                    log(writer, step, episodes, losses, bar)
+                    log(writer, step, "rollout", episodes)
+                    log(writer, step, "update", losses)
+                    rate = per_update / (time.perf_counter() - begun)
+                    log(writer, step, "time", {"steps_per_second": rate})
                 if us.any(interrupted.is_set()):
                     return False
     except NotFinite as error:
@@ -186,6 +195,9 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
             f"{error}; the weights of {run / 'last.pt'} are sound: go on from there with "
             "rl.initial, perhaps with a lower rl.lr"
         ) from error
+    except WorkerError:
+        print(f"after this error, go on with --resume {run}", file=sys.stderr)
+        raise
     finally:
         if us.leads:
             writer.close()
@@ -248,24 +260,16 @@ def save_evaluation(
         if score(row) == max(map(score, history)):
             ppo.save(run / "best.pt", config, history=history)
         ppo.save(run / "last.pt", config, history=history)
-        for name in ("return", "length", "success"):
-            if name in row:
-                writer.add_scalar(f"evaluation/{name}", row[name], row["step"])
+        scores = {name: row[name] for name in ("return", "length", "success") if name in row}
+        log(writer, row["step"], "evaluation", scores)
         writer.flush()
         bar.write(", ".join(f"{name} {value:.6g}" for name, value in row.items()))
     ppo.team.wait()
 
 
-def log(
-    writer: SummaryWriter, step: int, episodes: dict[str, float], losses: dict[str, float],
-    bar: tqdm,
-) -> None:  # fmt: skip
-    for name, value in episodes.items():
-        writer.add_scalar(f"rollout/{name}", value, step)
-    for name, value in losses.items():
-        writer.add_scalar(f"update/{name}", value, step)
-    if bar.format_dict["rate"]:
-        writer.add_scalar("time/steps_per_second", bar.format_dict["rate"], step)
+def log(writer: SummaryWriter, step: int, group: str, values: dict[str, float]) -> None:
+    for name, value in values.items():
+        writer.add_scalar(f"{group}/{name}", value, step)
 
 
 def shares_in_words(watch: Stopwatch) -> str:

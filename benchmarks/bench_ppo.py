@@ -48,7 +48,7 @@ COMMON = (
 TASKS = {
     "Pendulum-v1": Task(
         "gymnasium", 100_000,
-        ("rl.lr=1e-3", "rl.gamma=0.9", "rl.epochs=10", "rl.rollout_steps=1024",
+        ("rl.lr=1e-3", "rl.gamma=0.9", "rl.epochs=10", "rl.rollout_steps=256",
          "rl.batch_size=64", "rl.parallel=false"),
     ),
     "PandaReachDense-v3": Task(

@@ -11,9 +11,11 @@ import multiprocessing
 import os
 import signal
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing.connection import wait
 from typing import Any
 
 import gymnasium
@@ -28,6 +30,9 @@ from utils.errors import UserError
 OWN_ENV = "RobotGrasping-v0"  # is given the whole config
 # Imported once by the process that all workers are forked from, instead of by each of them.
 PRELOADED = ["envs.vector", "envs.grasping_env", "torch", "torch.utils.tensorboard", "tqdm"]
+
+# Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
+warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
 
 
 class WorkerError(RuntimeError):
@@ -113,6 +118,7 @@ class VectorEnvs:
         """Which workers do not live any more."""
         if not hasattr(self, "_envs"):
             return "a worker process died while it was started; its message stands above"
+        wait([process.sentinel for process in self.processes], timeout=1.0)
         dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes)
                 if not p.is_alive()]  # fmt: skip
         return f"worker process {', '.join(dead) or 'of an environment'} died (out of memory?)"

@@ -13,8 +13,8 @@ from gymnasium import spaces
 class PointEnv(gymnasium.Env):
     """Move a point in the plane to a goal: an episode is ten steps long, or ends within 0.1 of it.
 
-    images: besides, show the goal as a bright pixel in 16 x 16 `rgb` and `depth`. `goal` is in
-    info. trouble: what happens at step 3 of the third episode.
+    images: show the goal as a bright pixel in 16 x 16 `rgb` and `depth` instead, and be content
+    with 0.2. `goal` is in info. trouble: what happens at step 3 of the third episode.
     """
 
     def __init__(self, images: bool = False, trouble: str | None = None):
@@ -28,6 +28,7 @@ class PointEnv(gymnasium.Env):
         self.observation_space = spaces.Dict(boxes)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._images, self._trouble, self._episodes = images, trouble, 0
+        self._near = 0.2 if images else 0.1
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -57,14 +58,18 @@ class PointEnv(gymnasium.Env):
                 observation["velocity"] = observation.pop("state")
             if self._trouble == "shape":
                 observation["state"] = observation["state"][:1]
-        terminated = self._distance() < 0.1
+        terminated = self._distance() < self._near
         return observation, reward, terminated, self._steps >= 10, self._info()
 
     def _distance(self) -> float:
         return float(np.linalg.norm(self._goal - self._position))
 
     def _info(self):
-        return {"is_success": self._distance() < 0.1, "goal": self._goal.copy(), "name": "point"}
+        return {
+            "is_success": self._distance() < self._near,
+            "goal": self._goal.copy(),
+            "name": "point",
+        }
 
     def _observation(self):
         if not self._images:

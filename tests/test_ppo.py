@@ -334,11 +334,13 @@ class Counting:
 COUNTED = ObservationLayout.of(spaces.Box(-np.inf, np.inf, (1,)))
 
 
-def ppo_of(*overrides: str, layout=COUNTED, actions: int = 1, seed: int = 0) -> GraspPPO:
+def ppo_of(
+    *overrides: str, layout=COUNTED, actions: int = 1, seed: int = 0, team=ALONE
+) -> GraspPPO:
     torch.manual_seed(seed)
     space = spaces.Box(-1.0, 1.0, (actions,), np.float32)
     settings = settings_of(*overrides)
-    ppo = GraspPPO(policy_for(layout, space, settings), layout, settings)
+    ppo = GraspPPO(policy_for(layout, space, settings), layout, settings, team)
     ppo.generator.manual_seed(seed)
     return ppo
 
