@@ -10,12 +10,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -28,8 +30,7 @@ from utils.config import Config
 from utils.errors import UserError
 
 OWN_ENV = "RobotGrasping-v0"  # is given the whole config
-# Imported once by the process that all workers are forked from, instead of by each of them.
-PRELOADED = ["envs.vector", "envs.grasping_env", "torch", "torch.utils.tensorboard", "tqdm"]
+REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
 warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
@@ -68,8 +69,8 @@ class VectorEnvs:
         self._parallel = config.rl.parallel and count > 1
         if self._parallel:
             # Not forked from here: threads, GPU contexts and OpenGL do not survive that.
-            multiprocessing.set_forkserver_preload(PRELOADED)
-            with one_thread(), _told(self._died):
+            multiprocessing.set_forkserver_preload(loaded_here())
+            with worker_environment(), _told(self._died):
                 self._envs = AsyncVectorEnv(
                     makers, context="forkserver", copy=False, autoreset_mode=AutoresetMode.DISABLED
                 )
@@ -137,12 +138,22 @@ def _told(died) -> Iterator[None]:
         ) from error
 
 
+def loaded_here() -> list[str]:
+    """Modules that a worker would import, as it imports the script: their common parent does so
+    once for all of them."""
+    own = {path.stem for path in REPOSITORY.iterdir() if path.suffix in ("", ".py")}
+    names = [name for name in sys.modules if name.partition(".")[0] in own]
+    return [*names, "torch.utils.tensorboard"]
+
+
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Processes started in here compute with one thread each: there are as many as cores."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+def worker_environment() -> Iterator[None]:
+    """Processes started in here find this project, and compute with one thread each: there are as
+    many of them as cores."""
+    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
+    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
     try:
         yield
     finally:

@@ -53,9 +53,9 @@ class ObservationNormaliser(RunningMoments):
     """Features (..., size) to zero mean and unit variance, clipped; unchanged until `update`."""
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        deviation = (self.variance + SMALLEST_VARIANCE).sqrt()
+        scale = (self.variance + SMALLEST_VARIANCE).rsqrt()
         centred = features - self.mean.to(features.dtype)
-        return (centred / deviation.to(features.dtype)).clamp(-LARGEST, LARGEST)
+        return centred.mul_(scale.to(features.dtype)).clamp_(-LARGEST, LARGEST)
 
 
 class RewardScaler(nn.Module):

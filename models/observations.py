@@ -31,8 +31,13 @@ class Observations(NamedTuple):
         """(B, C, H, W) float32 all images behind one another, bytes as 0..1; None without any."""
         if not self.images:
             return None
-        parts = [i / 255 if i.dtype == torch.uint8 else i for i in self.images]
-        return torch.cat(parts, -1).movedim(-1, 1)
+        sizes = [image.shape[-1] for image in self.images]
+        whole = self.state.new_empty(*self.images[0].shape[:-1], sum(sizes))
+        for image, channels in zip(self.images, whole.split(sizes, -1)):
+            channels.copy_(image)  # into place at once: memory is what images cost
+            if image.dtype == torch.uint8:
+                channels.div_(255)
+        return whole.movedim(-1, 1)
 
     def map(self, change) -> Observations:
         """change(tensor) of every part."""

@@ -370,7 +370,7 @@ def test_what_an_update_learns_from():
 
     def value(count: float) -> float:
         empty = torch.empty(1, 0)
-        return ppo.network.value(None, torch.tensor([[count]]), empty).item()
+        return ppo.network.value(None, torch.tensor([[float(count)]]), empty).item()
 
     expected = [  # per step, environments beside each other
         [1 + 0.9 * 2 + 0.81 * (3 + 0.9 * value(3)), 1 + 0.9 * 2 + 0.81 * 3 + 0.729 * 4],
