@@ -1,19 +1,27 @@
 """One round of clutter removal: a policy picks until the scene is empty or it gives up.
 
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when everything is cleared, when
-the policy finds no grasp, or after `max_failures` failed grasps in a row.
+the policy finds no grasp, or after `max_failures` failed grasps in a row. What has just failed is
+not tried again as long as the policy names another grasp: often nothing has moved, and a
+deterministic planner would repeat itself.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from envs.cell import Cell, PhysicsError
 from envs.execution import GraspOutcome, execute_grasp
 from envs.scenes import Scene
 from utils.results import NO_PLAN, AttemptRecord, RoundRecord
-from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
+
+# A grasp nearer than both to one that failed is the same one again.
+TRIED_DISTANCE = 0.02  # m
+TRIED_ANGLE = np.deg2rad(30)
 
 
 def run_round(
@@ -34,9 +42,10 @@ def run_round(
     """
     cell.load(scene)
     attempts: list[AttemptRecord] = []
-    failures_in_a_row, plan_seconds, ended = 0, 0.0, "cleared"
+    failed: list[Grasp] = []  # in a row
+    plan_seconds, ended = 0.0, "cleared"
     try:
-        while cell.remaining and failures_in_a_row < max_failures:
+        while cell.remaining and len(failed) < max_failures:
             frame = cell.frame(with_truth)
             start = time.perf_counter()
             grasps = plan(frame if with_truth else frame.without_truth())
@@ -45,16 +54,17 @@ def run_round(
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
                 ended = NO_PLAN
                 break
-            outcome = execute_grasp(cell, grasps[0])
-            on_image = grasp_to_image(grasps[0], frame.K, frame.T_WC)
+            grasp = first_untried(grasps, failed)
+            outcome = execute_grasp(cell, grasp)
+            on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
             attempts.append(
                 AttemptRecord(
                     outcome.success, outcome.reason, plan_seconds, outcome.sim_seconds, on_image
                 )
             )
-            failures_in_a_row = 0 if outcome.success else failures_in_a_row + 1
+            failed = [] if outcome.success else [*failed, grasp]
             if on_attempt is not None:
-                on_attempt(frame, grasps[0], outcome)
+                on_attempt(frame, grasp, outcome)
     except PhysicsError:
         attempts.append(AttemptRecord(False, "physics", plan_seconds, 0.0))
         ended = "physics"
@@ -67,3 +77,18 @@ def run_round(
         policy, scene.layout, objects, scene.seed, len(scene.placements), cleared,
         tuple(attempts), ended,
     )  # fmt: skip
+
+
+def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:
+    """The first grasp that is not about the same as one of those that failed; the first of all if
+    there is none."""
+    untried = (
+        grasp
+        for grasp in grasps
+        if all(
+            np.linalg.norm(grasp.position[:2] - other.position[:2]) > TRIED_DISTANCE
+            or angle_difference(grasp.angle, other.angle) > TRIED_ANGLE
+            for other in failed
+        )
+    )
+    return next(untried, grasps[0])

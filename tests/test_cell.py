@@ -9,7 +9,7 @@ from envs.execution import choose_posture, execute_grasp
 from envs.kinematics import forward_kinematics, inverse_kinematics
 from envs.objects import load_object_set
 from envs.panda import FINGERS
-from envs.rounds import run_round
+from envs.rounds import first_untried, run_round
 from envs.scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.world import BIN_CENTRE, BIN_HALF_SIZE
 from utils.config import with_settings
@@ -266,3 +266,14 @@ def test_stop_rule(cell, box_set):
     miss = cube_grasp(offset=(0.13, 0, 0))
     failed = run_round(cell, scene, _planner_that_returns([miss]), **settings)
     assert (failed.ended, failed.executed, failed.successes) == ("failures", 2, 0)
+
+
+def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
+    first, again, beside, turned = (
+        Grasp(np.array([x, 0.0, 0.05]), angle, 0.08, 1.0)
+        for x, angle in ((0.5, 0.0), (0.51, 0.1), (0.53, 0.0), (0.5, 1.0))
+    )
+    assert first_untried([first, beside], []) is first
+    assert first_untried([again, beside, turned], [first]) is beside
+    assert first_untried([again, turned], [first]) is turned
+    assert first_untried([again, first], [first]) is again  # nothing else is left
