@@ -8,6 +8,7 @@ nor the solids behind them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -38,37 +39,50 @@ class SearchSettings:
     returned: int = 20
 
 
+# What is given up where nothing meets the margins: room and wedge for lying on slopes or between
+# others, the height under the tips for things as flat as a pencil.
+DARING = {
+    "table_clearance": 0.002,
+    "clearance": 0.001,
+    "rooms": (0.003, *SearchSettings.rooms),
+    "inner_margin": 0.0,
+    "min_engagement": 0.003,
+    "max_wedge": np.deg2rad(38),
+    "min_facing": 0.6,
+}
+
+
 def search(
-    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    settings: SearchSettings,
+    value: Callable[[Candidates], np.ndarray] | None = None,
 ) -> Candidates:
     """Feasible candidates on a height map, measured and scored, best first; may be empty.
 
-    Where nothing meets the margins, a second search gives some of them up: a poor attempt may clear
-    an object, none ends the round.
+    value: (N,) what else is known of the candidates' worth, such as a network's opinion; a factor
+    on their scores. Where nothing meets the margins, a second search gives some of them up: a poor
+    attempt may clear an object, none ends the round.
     """
-    found = _search_once(heights, gripper, workspace, settings)
+    found = _search_once(heights, gripper, workspace, settings, value)
     if len(found) == 0:
-        daring = replace(
-            settings,
-            clearance=0.0015,
-            rooms=(0.003, *settings.rooms),
-            inner_margin=0.0,
-            min_engagement=0.004,
-            max_wedge=np.deg2rad(38),
-            min_facing=0.6,
-        )
-        found = _search_once(heights, gripper, workspace, daring)
+        found = _search_once(heights, gripper, workspace, replace(settings, **DARING), value)
     return found
 
 
-def _search_once(
-    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
-) -> Candidates:
-    found = dense_candidates(heights, gripper, workspace, settings).best(settings.shortlist)
+def _search_once(heights, gripper, workspace, settings, value) -> Candidates:
+    found = _valued(dense_candidates(heights, gripper, workspace, settings), value)
+    found = found.best(settings.shortlist)
     if len(found) == 0:
         return found
     found = measure(found, heights, gripper, settings).best(settings.finalists)
-    return turn_onto_faces(found, heights, gripper, settings).best(len(found))
+    found = turn_onto_faces(found, heights, gripper, settings)
+    return _valued(found, value).best(len(found))
+
+
+def _valued(found: Candidates, value) -> Candidates:
+    return found if value is None else replace(found, score=found.score * value(found))
 
 
 def dense_candidates(
@@ -245,7 +259,7 @@ def measure(
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
     near, opening, blind = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
     opening[left_over] = _widest_opening(
-        heights.highest_around(1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
+        heights.highest_around("height", 1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
         near[left_over], tip[left_over], width[left_over], gripper, settings,
     )  # fmt: skip
     left_over = left_over[opening[left_over] > 0]
@@ -331,11 +345,11 @@ def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.
 def _palm_gap(
     xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
 ) -> np.ndarray:
-    """(N,) smallest height of the palm's underside, fingertips at 0, over the scene in W."""
+    """(N,) smallest height of the palm's underside, fingertips at 0, over whatever may be there."""
     # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
     # more cell for rounding to the grid.
     radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
-    scene = heights.highest_around(radius, cv2.MORPH_ELLIPSE)
+    scene = heights.highest_around("ceiling", radius, cv2.MORPH_ELLIPSE)
     ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
     u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
     nearby = scene.take(_cells(xy, along, across, u, v, heights)).max(axis=2)

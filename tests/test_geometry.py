@@ -16,8 +16,8 @@ from utils.geometry import (
     Workspace,
     intersect_lines,
 )
-from utils.height_map import height_map_from_frame, height_map_from_scene, near_side
-from utils.transforms import RGBDFrame, look_at, pose_matrix
+from utils.height_map import HOLE_RISE, height_map_from_frame, height_map_from_scene, near_side
+from utils.transforms import RGBDFrame, look_at, pose_matrix, project
 
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 K = np.array([[390.6, 0, 111.5], [0, 390.6, 111.5], [0, 0, 1.0]])  # 224 px, 32 degrees
@@ -173,6 +173,10 @@ def test_holes_count_as_the_near_surface_beside_them() -> None:
     assert filled[15, 2] == np.float32(0.8)
     known = depth > 0
     np.testing.assert_array_equal(filled[known], depth[known])
+    depth[5:8] = 0.0  # a hole takes the nearest surface around it as far as it reaches
+    depth[5:8, 19] = 0.6
+    assert (near_side(depth, reach=9)[5:8, 10:19] == np.float32(0.6)).all()
+    assert near_side(depth, reach=9)[6, 5] == np.float32(0.7)
     assert (near_side(np.zeros((20, 20), np.float32)) == 0).all()
     clean = np.full((4, 4), 0.5, np.float32)
     assert near_side(clean) is clean
@@ -189,3 +193,18 @@ def test_a_hole_at_an_edge_does_not_lower_the_map() -> None:
     whole, holed = (height_map_from_frame(f, Workspace()).height for f in (frame, lossy))
     assert edge.sum() > 200
     assert (holed >= whole - 1e-3).all()
+
+
+def test_what_is_in_a_hole_may_be_higher_than_what_is_beside_it() -> None:
+    frame = boxes_frame([((0.06, 0.06, 0.05), 0.0, (0.5, 0.0))])
+    depth = frame.depth.copy()
+    (u, v), _ = project(np.array([0.5, 0.0, 0.05]), frame.K, frame.T_WC)
+    rows, columns = np.s_[int(v) - 3 : int(v) + 4], np.s_[int(u) - 3 : int(u) + 4]
+    depth[rows, columns] = 0
+    clean = height_map_from_frame(frame, Workspace())
+    holed = height_map_from_frame(replace(frame, depth=depth), Workspace())
+    np.testing.assert_allclose(holed.height, clean.height, atol=1e-4)
+    raised = holed.ceiling - clean.ceiling
+    assert raised.max() == pytest.approx(HOLE_RISE, abs=1e-4)
+    at = np.argwhere(raised > 1e-3) * holed.cell + holed.origin[::-1]
+    assert np.abs(at - (0.0, 0.5)).max() < 0.012

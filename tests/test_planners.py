@@ -53,6 +53,15 @@ def test_no_finger_goes_into_a_one_centimetre_gap(name: str) -> None:
             assert not in_gap or grasp.position[2] - 0.0072 > 0.05
 
 
+@pytest.mark.parametrize("degrees", [0, 35, 90])
+def test_a_flat_stick_is_held_below_its_top_and_above_the_table(degrees: int) -> None:
+    """7 mm high: the usual margins leave no room for fingers, so some are given up."""
+    stick = ((0.006, 0.06, 0.007), np.deg2rad(degrees), (0.5, 0.0))
+    best = planner("heuristic")(boxes_frame([stick]))[0]
+    assert 0.001 < best.position[2] - 0.0072 < 0.0045
+    assert np.linalg.norm(best.position[:2] - (0.5, 0.0)) < 0.012
+
+
 @pytest.mark.parametrize("name", PLANNERS)
 def test_an_empty_table_has_nothing_to_grasp(name: str) -> None:
     assert planner(name)(boxes_frame([])) == []

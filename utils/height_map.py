@@ -16,6 +16,10 @@ import numpy as np
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject
 
+# Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
+# this much higher than the surface beside it.
+HOLE_RISE = 0.015  # m
+
 
 @dataclass(frozen=True)
 class HeightMap:
@@ -23,8 +27,8 @@ class HeightMap:
 
     height: (R, C) metres in W, the highest surface known in the cell; hidden cells hold the lowest
         height nearby, as if nothing were there.
-    ceiling: (R, C) metres in W, the highest that hidden matter could reach; equals `height` where
-        the cell was seen.
+    ceiling: (R, C) metres in W, the highest that matter could reach which was hidden or not
+        measured; equals `height` where the cell was seen.
     label: (R, C) int, which object the cell belongs to; -1 for the table.
     centres: (M, 3) each label's centre of mass in W, or an estimate of it.
     """
@@ -47,13 +51,13 @@ class HeightMap:
         )
         return row.astype(np.intp), col.astype(np.intp)
 
-    def highest_around(self, radius: int, shape: int) -> np.ndarray:
-        """(R, C) highest surface within `radius` cells of each one, in a window of one of OpenCV's
-        `shape`s. Worked out once."""
-        if (radius, shape) not in self._highest:
+    def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
+        """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
+        window of one of OpenCV's `shape`s. Worked out once."""
+        if (surface, radius, shape) not in self._highest:
             window = cv2.getStructuringElement(shape, (2 * radius + 1, 2 * radius + 1))
-            self._highest[radius, shape] = cv2.dilate(self.height, window)
-        return self._highest[radius, shape]
+            self._highest[surface, radius, shape] = cv2.dilate(getattr(self, surface), window)
+        return self._highest[surface, radius, shape]
 
 
 def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,10 +75,11 @@ def height_map_from_frame(
 ) -> HeightMap:
     """Height map of what a depth image shows; uses nothing of the frame but depth, K and T_WC.
 
-    Unknown pixels count as the nearest surface beside them (`near_side`). Labels are the pieces
-    between height discontinuities; their centres are volume centroids of the columns between the
-    table and the visible surface.
+    Unknown pixels count as the nearest surface beside them (`near_side`), and what may be there
+    is bounded a little higher. Labels are the pieces between height discontinuities; their centres
+    are volume centroids of the columns between the table and the visible surface.
     """
+    measured = frame.depth > 0
     frame = replace(frame, depth=near_side(frame.depth))
     grid, origin = grid_points(workspace, margin, cell)
     seen = _highest(_surface_points(frame, origin, cell), grid.shape[:2])
@@ -87,24 +92,30 @@ def height_map_from_frame(
     # The rays that graze an edge bound what may stand in its shadow.
     ceiling = _highest(_grazing_points(frame, origin, cell), grid.shape[:2])
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
+    if not measured.all():
+        nearer = replace(frame, depth=np.where(measured, 0, frame.depth - HOLE_RISE))
+        risen = _highest(_surface_points(nearer, origin, cell), grid.shape[:2])
+        ceiling = np.maximum(ceiling, risen)
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
     return HeightMap(height, ceiling, label, centres, origin, cell, table)
 
 
-def near_side(depth: np.ndarray, window: int = 9) -> np.ndarray:
-    """(H, W) depth whose unknown pixels take the nearest surface in the `window` pixels around.
+def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
+    """(H, W) depth whose unknown pixels take the nearest surface around their hole, up to `reach`
+    pixels away through the hole.
 
-    Depth cameras lose pixels at the edges of whatever stands up; a finger that took such a hole for
-    table would come down on the edge. Holes without any known pixel in reach stay 0.
+    Depth cameras lose pixels at the edges of whatever stands up, and thin parts whole; a finger
+    that took such a hole for table would come down on them. Deeper holes stay 0.
     """
     unknown = ~(depth > 0)
     if not unknown.any():
         return depth
     far = np.float32(np.finfo(np.float32).max)
-    known = np.where(unknown, far, depth).astype(np.float32)
-    nearest = cv2.erode(known, np.ones((window, window), np.uint8))
-    return np.where(unknown, np.where(nearest < far, nearest, 0), depth).astype(np.float32)
+    known = nearest = np.where(unknown, far, depth).astype(np.float32)
+    for _ in range(reach):
+        nearest = np.where(unknown, cv2.erode(nearest, np.ones((3, 3), np.uint8)), known)
+    return np.where(nearest < far, nearest, np.float32(0))
 
 
 def height_map_from_scene(
