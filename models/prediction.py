@@ -91,21 +91,6 @@ def predict(
     )
 
 
-def predict_grasps(
-    model: GraspNet,
-    metres_per_pixel: float,
-    frame: RGBDFrame,
-    table_height: float,
-    count: int = 20,
-    gripper: GripperGeometry = PANDA_HAND,
-    labels: LabelSettings = LABELS,
-    peaks: PeakSettings = PEAKS,
-) -> list[PredictedGrasp]:
-    """The grasps of `predict` without its maps, which cost time that a robot has not."""
-    scaling, maps = scaled_maps(model, metres_per_pixel, frame)
-    return grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)[:count]
-
-
 def scaled_maps(model: GraspNet, metres_per_pixel: float, frame: RGBDFrame) -> tuple:
     """The scaling to the training's pixels, and the network's three maps there."""
     if model.input_channels != INPUT_CHANNELS:
