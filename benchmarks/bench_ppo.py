@@ -61,12 +61,14 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Result:
-    """Of one training. seconds: from the first step to the last update; megabytes: the most that
+    """Of one training. seconds: from the first step to the last update; cpu_seconds: in this time,
+    of the process and its workers, which a busy machine lengthens less; megabytes: the most that
     the process and its workers held together."""
 
     final_return: float
     steps: int
     seconds: float
+    cpu_seconds: float
     megabytes: float
 
 
@@ -98,7 +100,8 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
             print(f"{env} {who} seed {seed}: {results[who][-1]}", file=sys.stderr, flush=True)
     returns = {who: [r.final_return for r in results[who]] for who in TRAIN}
     rate = {who: np.array([r.steps / r.seconds for r in results[who]]) for who in TRAIN}
-    memory = {who: max(r.megabytes for r in results[who]) for who in TRAIN}
+    cpu = {who: np.array([r.cpu_seconds / r.steps for r in results[who]]) for who in TRAIN}
+    megabytes = {who: max(r.megabytes for r in results[who]) for who in TRAIN}
     low, high = interval(returns["sb3"])
     ours_low, ours_high = interval(returns["ours"])
     return [
@@ -111,8 +114,9 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
         Metric(f"{env}_speed_vs_sb3", float(np.median(rate["ours"] / rate["sb3"])), "x",
                at_least=1.3),
         Metric(f"{env}_steps_per_second", float(np.median(rate["ours"])), "1/s"),
-        Metric(f"{env}_memory", memory["ours"], "MB"),
-        Metric(f"{env}_memory_vs_sb3", memory["ours"] / memory["sb3"], "x"),
+        Metric(f"{env}_cpu_vs_sb3", float(np.median(cpu["ours"] / cpu["sb3"])), "x"),
+        Metric(f"{env}_memory", megabytes["ours"], "MB"),
+        Metric(f"{env}_memory_vs_sb3", megabytes["ours"] / megabytes["sb3"], "x"),
     ]  # fmt: skip
 
 
@@ -137,8 +141,16 @@ def in_own_process(env: str, who: str, seed: int, steps: int) -> Result:
 
 def memory() -> float:
     """Megabytes of this process and its children, shared pages counted once (PSS)."""
-    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
-    return sum(process.memory_full_info().pss for process in processes) / 2**20
+    return sum(process.memory_full_info().pss for process in family()) / 2**20
+
+
+def cpu_seconds() -> float:
+    """What this process and its children have used so far."""
+    return sum(sum(process.cpu_times()[:2]) for process in family())
+
+
+def family() -> list[psutil.Process]:
+    return [psutil.Process(), *psutil.Process().children(recursive=True)]
 
 
 # --- The two ------------------------------------------------------------------------------------
@@ -169,14 +181,14 @@ def train_ours(env: str, seed: int, steps: int) -> Result:
         collector = RolloutCollector(envs, ppo.layout, config.rl.rollout_steps, ALONE.device, watch)
         collector.restart(derived_seeds(envs.num_envs, seed))
         ppo.generator.manual_seed(seed)
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), cpu_seconds()
         for _ in range(count):
             ppo.update(collector.collect(ppo.network, ppo.generator))
-        seconds, megabytes = time.perf_counter() - start, memory()
+        spent = time.perf_counter() - start, cpu_seconds() - cpu, memory()
         seeds = range(FIRST_SEED, FIRST_SEED + EPISODES)
         episodes = evaluate_policy(ppo.network, envs, ppo.layout, seeds, ALONE.device, watch)
     final = float(np.mean([episode.total for episode in episodes]))
-    return Result(final, count * envs.num_envs * config.rl.rollout_steps, seconds, megabytes)
+    return Result(final, count * envs.num_envs * config.rl.rollout_steps, *spent)
 
 
 def train_sb3(env: str, seed: int, steps: int) -> Result:
@@ -199,13 +211,13 @@ def train_sb3(env: str, seed: int, steps: int) -> Result:
         policy_kwargs={"net_arch": {"pi": widths, "vf": widths}, "activation_fn": torch.nn.Tanh},
     )  # fmt: skip
     steps = whole_updates(config, steps) * rl.envs * rl.rollout_steps
-    start = time.perf_counter()
+    start, cpu = time.perf_counter(), cpu_seconds()
     model.learn(steps)
-    seconds, megabytes = time.perf_counter() - start, memory()
+    spent = time.perf_counter() - start, cpu_seconds() - cpu, memory()
     envs.close()
     judge, seeds = gymnasium.make(rl.env_id), range(FIRST_SEED, FIRST_SEED + EPISODES)
     final = float(np.mean([deterministic_return(model, judge, number) for number in seeds]))
-    return Result(final, steps, seconds, megabytes)
+    return Result(final, steps, *spent)
 
 
 def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
