@@ -24,15 +24,16 @@ from utils.real_data import RealSample, Split, image_folds, object_folds, open_r
 from utils.statistics import wilson_interval
 
 VIEWS = {
-    # The table, which fills the middle of the image. A first Kinect (525 px focal length) at a
-    # median 1.2 m; three quarters of its resolution make objects as large as simulated ones.
-    "cornell": View(side=400, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
+    # The table, which fills the middle of the image, seen 45 degrees from above. A first Kinect
+    # (525 px focal length) at a median 1.2 m; at three fifths of its resolution the network sees
+    # all of a cereal box at once.
+    "cornell": View(side=400, size=240, metres_per_pixel=1.2 / 525 * 400 / 240, slanted=True),
     # The whole image, as small as GG-CNN and GR-ConvNet take it. Its objects have no true size
     # (ShapeNet's are scaled at random): a pixel is taken to span what one of Cornell does.
     "jacquard": View(side=1024, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
 }
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does
-CROP = 160  # pixels, side of a training example, as for simulated images
+CROP = 128  # pixels, side of a training example
 IN_MEMORY = 1000  # images that are decoded once: all of Cornell, 2 GB
 ASKED_FOR_PLATES = 500  # most images whose labels tell the plates' length
 DEPTH_NOISE = 0.002  # m, standard deviation; real depth is noisy already
@@ -50,6 +51,19 @@ AUGMENTATION = Augmentation(
     colour=ColourJitter(0.4, 0.4, 0.4, 0.05),
     depth_noise=white_noise,
 )
+
+
+class Levelled(Sequence[RealSample]):
+    """The samples with the table's slope taken out of their depth, as a view sees it."""
+
+    def __init__(self, samples: Sequence[RealSample], view: View):
+        self.samples, self.view = samples, view
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> RealSample:
+        return self.view.levelled(self.samples[index])
 
 
 class Chosen(Sequence[RealSample]):
@@ -94,7 +108,9 @@ def real_folds(config: Config) -> list[Fold]:
     dataset = open_real_data(settings.kind, settings.root)
     splits = folds_of(dataset.object_ids, settings.split, settings.folds, config.seed)
     numbers = range(settings.folds) if settings.fold is None else [settings.fold]
-    samples = list(dataset) if len(dataset) <= IN_MEMORY else dataset
+    view = VIEWS[settings.kind]
+    samples = Levelled(dataset, view) if view.slanted else dataset
+    samples = list(samples) if len(dataset) <= IN_MEMORY else samples
     return [_fold(config, number, splits[number], samples, dataset.names) for number in numbers]
 
 

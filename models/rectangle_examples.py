@@ -8,11 +8,12 @@ in `models.grasp_examples`. This module knows no file format and no network's we
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from torch.utils.data import Dataset
 
 from models.grasp_examples import Example
@@ -21,6 +22,11 @@ from utils.augmentation import Augmentation, LabelledImage
 from utils.real_data import RealSample
 from utils.rectangles import GraspRectangle, rasterise
 
+FLAT = 0.005  # of the table's distance: noise, below which a pixel belongs to the table
+TABLE_STEP = 8  # pixels between those that the table is found from
+ANYWHERE = 0.25  # of the examples show any part of the view: what surrounds objects is no grasp
+PLATE_SHARE = 0.5  # of a label's plates, around its centre, counts as graspable
+
 
 @dataclass(frozen=True)
 class View:
@@ -28,12 +34,14 @@ class View:
 
     side: pixels of the image that the square measures; it never depends on the labels. size: pixels
     that it measures for the network. metres_per_pixel: what one of these spans at the image's
-    typical depth, which turns widths from pixels to metres and back.
+    typical depth, which turns widths from pixels to metres and back. slanted: whether the camera
+    looks at the table from the side, so that its samples are to be `levelled`.
     """
 
     side: int
     size: int
     metres_per_pixel: float
+    slanted: bool = False
 
     def matrix(self, shape: tuple[int, int]) -> np.ndarray:
         """(3, 3) that takes a pixel (u, v, 1) of an image of shape (H, W) to its place in here."""
@@ -58,6 +66,39 @@ class View:
             for image, method in ((sample.rgb, cv2.INTER_LINEAR), (sample.depth, cv2.INTER_NEAREST))
         )  # fmt: skip
         return rgb, depth, [rectangle.transformed(matrix) for rectangle in sample.positives]
+
+    def levelled(self, sample: RealSample) -> RealSample:
+        """The sample with depth as if every ray met the table at the same distance.
+
+        Seen at a slant, depth tells mostly where on the table something lies; levelled, how high it
+        is, as in images from above. The table is most of what the square shows.
+        """
+        inverse = _inverse_table(sample.depth, self.side)
+        middle = float(np.median(_central(inverse, self.side)))
+        return replace(sample, depth=(sample.depth * (inverse / middle)).astype(np.float32))
+
+
+def _inverse_table(depth: np.ndarray, side: int) -> np.ndarray:
+    """(H, W) one over the table's depth (H, W) metres, a quadratic of the pixel.
+
+    For a plane it is linear; the squares take lens distortion, and ranges in place of depths. A
+    robust fit over the central square: objects and walls lie far off the table and hardly count.
+    """
+    height, width = depth.shape
+    v, u = (np.mgrid[:height, :width] - np.reshape([height / 2, width / 2], (2, 1, 1))) / side
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    seen = _central(terms * depth[..., None], side)[::TABLE_STEP, ::TABLE_STEP].reshape(-1, 6)
+    start = np.linalg.lstsq(seen, np.ones(len(seen)), rcond=None)[0]
+    found = least_squares(
+        lambda x: seen @ x - 1, start, jac=lambda x: seen, loss="cauchy", f_scale=FLAT
+    )
+    return terms @ found.x
+
+
+def _central(image: np.ndarray, side: int) -> np.ndarray:
+    """The square of `side` pixels in the middle of (H, W, ...), or what there is of it."""
+    top, left = (max(0, (length - side) // 2) for length in image.shape[:2])
+    return image[top : top + side, left : left + side]
 
 
 class RectangleImages:
@@ -123,7 +164,10 @@ class RectangleExamples(Dataset):
     def _corner(
         self, rectangles: Sequence[GraspRectangle], rng: np.random.Generator
     ) -> tuple[int, int]:
-        """Row and column at which a crop starts that holds a random label, wherever in it."""
+        """Row and column at which a crop starts: anywhere, or to hold a random label somewhere."""
+        if rng.random() < ANYWHERE:
+            row, column = rng.integers(self.view.size - self.crop + 1, size=2)
+            return int(row), int(column)
         u, v = rectangles[rng.integers(len(rectangles))].centre
         shift = rng.uniform(-0.4, 0.4, size=2) * self.crop
         corner = np.rint(np.array([v, u]) + shift - self.crop / 2).astype(int)
@@ -131,8 +175,12 @@ class RectangleExamples(Dataset):
         return int(row), int(column)
 
     def _targets(self, rectangles: Sequence[GraspRectangle]) -> GraspTargets:
-        """Targets (C, crop, crop) of rectangles in the crop's pixels."""
-        quality, width = map(torch.from_numpy, rasterise(rectangles, (self.crop, self.crop)))
+        """Targets (C, crop, crop) of rectangles in the crop's pixels.
+
+        The metric asks for a label's middle, so the ends of its plates are no targets.
+        """
+        middles = [replace(r, height=PLATE_SHARE * r.height) for r in rectangles]
+        quality, width = map(torch.from_numpy, rasterise(middles, (self.crop, self.crop)))
         metres = (width * self.view.metres_per_pixel).clamp(max=self.max_width)
         targets = targets_from_labels(
             quality[None], metres[None], graspable_from=self.graspable_from

@@ -1,6 +1,7 @@
 """Training and cross-validation on real data, on tiny Cornell and Jacquard folders made here."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -105,9 +106,9 @@ def test_a_view_looks_at_the_middle_of_the_image():
     assert rgb[20, 30].tolist() == [60, 40, 30] and rgb[5, 5].tolist() == [230] * 3
 
 
-def test_views_are_of_network_scale():
-    # Cornell's Kinect: 2.29 mm a pixel at 1.2 m, three quarters as many in the view.
-    assert VIEWS["cornell"].metres_per_pixel == pytest.approx(0.0030476, rel=1e-4)
+def test_views_are_of_their_cameras_scale():
+    # Cornell's Kinect: 2.29 mm a pixel at 1.2 m, three fifths as many in the view.
+    assert VIEWS["cornell"].metres_per_pixel == pytest.approx(0.0038095, rel=1e-4)
 
 
 def test_widths_go_from_pixels_to_metres_and_back():
@@ -169,6 +170,37 @@ def test_turned_rectangles_are_turned_exactly():
     rectangle = VIEW.warp(one, change)[2][0]
     assert rectangle.angle == pytest.approx(0.6)
     assert rectangle.width == pytest.approx(12 * 1.2)
+
+
+@pytest.mark.parametrize("ranges", [False, True])
+def test_a_slanted_table_is_levelled(ranges):
+    # A plane 45 degrees from the image, 1 m away in its middle; a box is 10 % nearer than it.
+    v, u = (np.mgrid[:120, :160] - np.reshape([60, 80], (2, 1, 1))) / 260
+    table = 1 / (1 + v)
+    table = table * np.sqrt(1 + u**2 + v**2) if ranges else table
+    depth = table.astype(np.float32)
+    depth[50:70, 60:90] *= 0.9
+    one = replace(sample(GraspRectangle([80, 60], 0.0, 24, 12)), depth=depth)
+    seen = VIEW.levelled(one).depth[10:110, 30:130]
+    box = np.zeros((120, 160), bool)
+    box[50:70, 60:90] = True
+    box = box[10:110, 30:130]
+    middle = np.median(seen[~box])
+    assert seen.dtype == np.float32 and middle == pytest.approx(1.0, abs=0.05)
+    assert np.abs(seen[~box] / middle - 1).max() < 0.01
+    assert seen[box] / middle == pytest.approx(0.9, abs=0.005)
+
+
+def test_only_slanted_views_level_their_samples(tmp_path):
+    root = write_cornell(tmp_path / "cornell", 4)
+    slope = np.linspace(0.9, 1.4, SHAPE[0], dtype=np.float32)[:, None].repeat(SHAPE[1], 1)
+    for file in root.glob("*d.tiff"):
+        Image.fromarray(slope).save(file)
+    config = load_config(None, ["data.kind=cornell", f"data.root={root}", "data.folds=2"])
+    fold = real_folds(config)[0]
+    for samples in (fold.test_samples, fold.data.train.samples):
+        assert np.ptp(samples[0].depth) < 0.05
+    assert VIEWS["cornell"].slanted and not VIEWS["jacquard"].slanted
 
 
 # --- The metric -----------------------------------------------------------------------------
