@@ -1,9 +1,9 @@
 """GraspNet as a planner: the depth image tells which grasps fit, the network what they are worth.
 
 A network names places well to a few millimetres; fingers need better than that beside an object.
-So the antipodal search of the other planners proposes exact poses, and the network's quality at
-each of them ranks them: before they are measured on the height map, so that few have to be, and
-after. Nothing but the RGB-D image is seen.
+So the antipodal search of the other planners proposes exact poses, and what the network says of
+their places and angles ranks them: before they are measured on the height map, so that few have to
+be, and after. Nothing but the RGB-D image is seen.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from models.antipodal import SearchSettings, search
 from models.candidates import Candidates
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.prediction import scaled_maps
 from utils.geometry import GripperGeometry, Workspace
-from utils.height_map import HeightMap, height_map_from_frame
+from utils.height_map import height_map_from_frame
 from utils.transforms import Grasp, RGBDFrame, project
 
 # Coarser than the heuristic's: turning onto the faces and the network make up for it.
@@ -57,26 +58,33 @@ class GraspNetPlanner:
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         scaling, maps = scaled_maps(self.network.model, self.network.metres_per_pixel, frame)
-        quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
-        quality = scaling.original_map(quality, frame.depth.shape)
         heights = height_map_from_frame(frame, self.workspace)
-        found = search(
-            heights,
-            self.gripper,
-            self.workspace,
-            self.settings,
-            lambda candidates: np.maximum(seen_quality(candidates, quality, heights, frame), LEAST),
-        )
+
+        def value(candidates: Candidates) -> np.ndarray:
+            xy, (along, _) = candidates.xy, candidates.axes()
+            surface = np.column_stack([xy, heights.height[heights.index(xy)]])
+            ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
+            pixels, _ = project(ends, frame.K, frame.T_WC)
+            return np.maximum(quality_between(maps, *scaling.pixels(pixels)), LEAST)
+
+        found = search(heights, self.gripper, self.workspace, self.settings, value)
         found = found.distinct(self.settings.returned, 0.01, np.deg2rad(20))
         return found.grasps(self.gripper)
 
 
-def seen_quality(
-    candidates: Candidates, quality: np.ndarray, heights: HeightMap, frame: RGBDFrame
+def quality_between(
+    maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor], start: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
-    """(N,) of the map `quality` (H, W) at the pixels that show the surface over each candidate."""
-    surface = heights.height[heights.index(candidates.xy)]
-    pixels, _ = project(np.column_stack([candidates.xy, surface]), frame.K, frame.T_WC)
-    u, v = np.rint(pixels).astype(int).T
-    rows, columns = quality.shape
-    return quality[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)]
+    """(N,) what a network's maps say of closing along the lines from `start` to `end` (N, 2), in
+    the maps' pixels: the quality in their middle times the share of the best angle's that theirs
+    has. The cube root turns the bins' probabilities into qualities (`targets_from_labels`)."""
+    quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
+    u, v = np.rint((start + end) / 2).astype(int).T
+    u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
+    share = np.cbrt(maps[1][0, :, v, u].softmax(dim=0).numpy())
+    bins, each = len(share), np.arange(len(u))
+    du, dv = (end - start).T
+    place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
+    below, part = np.floor(place).astype(int), place - np.floor(place)
+    at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
+    return quality[v, u] * at / share.max(axis=0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from models.graspnet_io import SavedGraspNet
-from models.graspnet_planner import GraspNetPlanner
+from models.graspnet_planner import GraspNetPlanner, quality_between
 from tests.test_geometry import boxes_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import RGBDFrame, angle_difference, project
@@ -81,3 +81,16 @@ def test_an_image_at_twice_the_resolution_gives_the_same_grasp() -> None:
     small_best, large_best = planner(frame)[0], planner(large)[0]
     np.testing.assert_allclose(small_best.position, large_best.position, atol=0.004)
     assert small_best.quality == pytest.approx(large_best.quality, abs=0.1)
+
+
+def test_quality_between_two_pixels_is_that_of_their_angle() -> None:
+    """Bins 4 (40 degrees) and 5 hold 8/9 and 1/9: qualities in the ratio of 2 to 1."""
+    probability = torch.full((18,), 1e-12)
+    probability[4], probability[5] = 8 / 9, 1 / 9
+    angle = probability.log()[None, :, None, None].expand(1, 18, 40, 60)
+    maps = (torch.full((1, 1, 40, 60), 0.6), angle, torch.zeros(1, 1, 40, 60))
+    for degrees, expected in ((40, 0.6), (220, 0.6), (50, 0.3), (45, 0.45), (100, 0.0)):
+        step = 5 * np.array([[np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))]])
+        middle = np.array([[30.0, 20.0]])
+        found = quality_between(maps, middle - step, middle + step)
+        assert found == pytest.approx([expected], abs=1e-3)
