@@ -89,28 +89,33 @@ def dense_candidates(
     heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
 ) -> Candidates:
     """Every angle, fingertip height and row of the map: what might fit between the fingers."""
-    size, cell = heights.height.shape[0], heights.cell
-    half = (size - 1) / 2
-    middle = heights.origin + cell * half
-    lowest = heights.table_height + settings.table_clearance
+    cell, lowest = heights.cell, heights.table_height + settings.table_clearance
     levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
+    if len(levels) == 0:
+        return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
+    # A square that holds whatever may be grasped, and fingers beside it, at any angle.
+    matter = np.argwhere(heights.height > lowest)[:, ::-1]
+    first, last = matter.min(axis=0), matter.max(axis=0)
+    centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
+    beside = max(settings.rooms) + 2 * thickness
+    half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
+    size, middle = 2 * half + 1, heights.origin + cell * centre_cell
     # Gradients of the blurred map point across an edge whatever its height.
     slope = np.stack(
         np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1
     )
     slope /= np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9
-    thickness = gripper.finger_outline[1][0]
     finger = np.ones(
         (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
     )
     palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
-    parts = [Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))]
-    for angle in np.arange(settings.angles) * np.pi / settings.angles if len(levels) else ():
+    parts = []
+    for angle in np.arange(settings.angles) * np.pi / settings.angles:
         along = np.array([np.cos(angle), np.sin(angle)])
         across = np.array([-along[1], along[0]])
         axes = np.column_stack([along, across])
-        warp = np.column_stack([axes, half - axes @ (half, half)])
+        warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
         turned = cv2.warpAffine(
             heights.height, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
             borderValue=heights.table_height,
