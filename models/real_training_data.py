@@ -33,7 +33,7 @@ VIEWS = {
     "jacquard": View(side=1024, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
 }
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does
-CROP = 128  # pixels, side of a training example
+CROPS = {"cornell": 128, "jacquard": 160}  # pixels of the view, side of a training example
 IN_MEMORY = 1000  # images that are decoded once: all of Cornell, 2 GB
 ASKED_FOR_PLATES = 500  # most images whose labels tell the plates' length
 DEPTH_NOISE = 0.002  # m, standard deviation; real depth is noisy already
@@ -127,8 +127,9 @@ def _fold(
     view = VIEWS[config.data.kind]
     train, test = Chosen(samples, split.train), Chosen(samples, split.test)
     examples = RectangleExamples(
-        train, view, AUGMENTATION, seed=config.seed, repeats=config.data.repeats, crop=CROP,
-        max_width=MAX_WIDTH, graspable_from=config.train.graspable_from,
+        train, view, AUGMENTATION, seed=config.seed, repeats=config.data.repeats,
+        crop=CROPS[config.data.kind], max_width=MAX_WIDTH,
+        graspable_from=config.train.graspable_from,
     )  # fmt: skip
     data = TrainingData(
         examples, RectangleImages(test, view), lambda model: {}, None, view.metres_per_pixel,

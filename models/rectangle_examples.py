@@ -24,8 +24,7 @@ from utils.rectangles import GraspRectangle, rasterise
 
 FLAT = 0.005  # of the table's distance: noise, below which a pixel belongs to the table
 TABLE_STEP = 8  # pixels between those that the table is found from
-ANYWHERE = 0.25  # of the examples show any part of the view: what surrounds objects is no grasp
-PLATE_SHARE = 0.5  # of a label's plates, around its centre, counts as graspable
+ANYWHERE = 0.5  # of the examples show any part of the view: its corners hold nothing to grasp
 
 
 @dataclass(frozen=True)
@@ -166,21 +165,17 @@ class RectangleExamples(Dataset):
     ) -> tuple[int, int]:
         """Row and column at which a crop starts: anywhere, or to hold a random label somewhere."""
         if rng.random() < ANYWHERE:
-            row, column = rng.integers(self.view.size - self.crop + 1, size=2)
-            return int(row), int(column)
-        u, v = rectangles[rng.integers(len(rectangles))].centre
-        shift = rng.uniform(-0.4, 0.4, size=2) * self.crop
-        corner = np.rint(np.array([v, u]) + shift - self.crop / 2).astype(int)
+            middle = rng.uniform(0, self.view.size, size=2)
+        else:
+            u, v = rectangles[rng.integers(len(rectangles))].centre
+            middle = np.array([v, u]) + rng.uniform(-0.4, 0.4, size=2) * self.crop
+        corner = np.rint(middle - self.crop / 2).astype(int)
         row, column = np.clip(corner, 0, self.view.size - self.crop)
         return int(row), int(column)
 
     def _targets(self, rectangles: Sequence[GraspRectangle]) -> GraspTargets:
-        """Targets (C, crop, crop) of rectangles in the crop's pixels.
-
-        The metric asks for a label's middle, so the ends of its plates are no targets.
-        """
-        middles = [replace(r, height=PLATE_SHARE * r.height) for r in rectangles]
-        quality, width = map(torch.from_numpy, rasterise(middles, (self.crop, self.crop)))
+        """Targets (C, crop, crop) of rectangles in the crop's pixels."""
+        quality, width = map(torch.from_numpy, rasterise(rectangles, (self.crop, self.crop)))
         metres = (width * self.view.metres_per_pixel).clamp(max=self.max_width)
         targets = targets_from_labels(
             quality[None], metres[None], graspable_from=self.graspable_from

@@ -152,6 +152,18 @@ def test_examples_show_what_their_targets_say():
     assert np.nanmean(covered) > 0.95
 
 
+def test_examples_show_the_corners_of_the_view_too():
+    # Crops around the label in the middle alone would start at 6 to 23.
+    one = sample(GraspRectangle([79.5, 59.5], 0.0, 24, 12))
+    examples = RectangleExamples(
+        [one], VIEW, AUGMENTATION, seed=0, repeats=1, crop=20, max_width=0.2, graspable_from=0.5
+    )
+    rng, rectangles = np.random.default_rng(0), VIEW.warp(one)[2]
+    starts = {examples._corner(rectangles, rng) for _ in range(400)}
+    assert starts >= {(0, 0), (0, 30), (30, 0), (30, 30)}
+    assert max(max(start) for start in starts) == 30
+
+
 def test_labelled_images_have_widths_in_pixels_of_the_view():
     image = RectangleImages([sample(GraspRectangle([79.5, 59.5], 0.0, 24, 12))], VIEW)[0]
     assert image.width_in_pixels and image.width.max() == 12
