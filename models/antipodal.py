@@ -38,18 +38,19 @@ class SearchSettings:
     finalists: int = 250  # of these, turned onto the faces and measured again
     returned: int = 20
 
-
-# What is given up where nothing meets the margins: room and wedge for lying on slopes or between
-# others, the height under the tips for things as flat as a pencil.
-DARING = {
-    "table_clearance": 0.002,
-    "clearance": 0.001,
-    "rooms": (0.003, *SearchSettings.rooms),
-    "inner_margin": 0.0,
-    "min_engagement": 0.003,
-    "max_wedge": np.deg2rad(38),
-    "min_facing": 0.6,
-}
+    def daring(self) -> SearchSettings:
+        """What is given up where nothing meets the margins: room and wedge for things on slopes or
+        between others, height under the tips for things as flat as a pencil."""
+        return replace(
+            self,
+            table_clearance=min(self.table_clearance, 0.002),
+            clearance=min(self.clearance, 0.001),
+            rooms=(min(self.rooms[0], 0.003), *self.rooms),
+            inner_margin=0.0,
+            min_engagement=min(self.min_engagement, 0.003),
+            max_wedge=max(self.max_wedge, np.deg2rad(38)),
+            min_facing=min(self.min_facing, 0.6),
+        )
 
 
 def search(
@@ -67,7 +68,7 @@ def search(
     """
     found = _search_once(heights, gripper, workspace, settings, value)
     if len(found) == 0:
-        found = _search_once(heights, gripper, workspace, replace(settings, **DARING), value)
+        found = _search_once(heights, gripper, workspace, settings.daring(), value)
     return found
 
 

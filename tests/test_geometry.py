@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.planners import HeuristicPlanner
 from utils.geometry import (
     ConvexSolid,
     GripperGeometry,
@@ -208,3 +209,18 @@ def test_what_is_in_a_hole_may_be_higher_than_what_is_beside_it() -> None:
     assert raised.max() == pytest.approx(HOLE_RISE, abs=1e-4)
     at = np.argwhere(raised > 1e-3) * holed.cell + holed.origin[::-1]
     assert np.abs(at - (0.0, 0.5)).max() < 0.012
+
+
+def test_a_thing_that_the_camera_did_not_measure_is_a_wall() -> None:
+    """A black box, say: all of its pixels are holes."""
+    small, black = ((0.03, 0.03, 0.04), 0.0, (0.45, 0.0)), ((0.10, 0.16, 0.10), 0.0, (0.56, 0.0))
+    frame = boxes_frame([small, black])
+    depth = np.where(frame.depth < boxes_frame([small]).depth - 1e-4, 0, frame.depth)
+    heights = height_map_from_frame(replace(frame, depth=depth), Workspace())
+    x, y = np.meshgrid(np.arange(0.53, 0.59, 0.01), np.arange(-0.05, 0.06, 0.01))
+    inside = heights.index(np.stack([x, y], axis=-1))
+    assert heights.height[inside].min() > 0.08 and set(heights.label[inside].ravel()) == {-1}
+    for grasp in HeuristicPlanner(GripperGeometry(), Workspace())(replace(frame, depth=depth)):
+        for side in (-1, 1):
+            finger = grasp.position + side * (grasp.width / 2 + 0.007) * grasp.closing_direction
+            assert not (abs(finger[0] - 0.56) < 0.04 and abs(finger[1]) < 0.07)

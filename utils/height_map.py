@@ -19,6 +19,7 @@ from utils.transforms import RGBDFrame, deproject
 # Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
 # this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
+WALL = 0.05  # m, over all that is known: what counts as standing in a hole too wide to fill
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class HeightMap:
     height: (R, C) metres in W, the highest surface known in the cell; hidden cells hold the lowest
         height nearby, as if nothing were there.
     ceiling: (R, C) metres in W, the highest that matter could reach which was hidden or not
-        measured; equals `height` where the cell was seen.
+        measured; equals `height` where the surface was measured.
     label: (R, C) int, which object the cell belongs to; -1 for the table.
     centres: (M, 3) each label's centre of mass in W, or an estimate of it.
     """
@@ -98,7 +99,12 @@ def height_map_from_frame(
         ceiling = np.maximum(ceiling, risen)
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
-    return HeightMap(height, ceiling, label, centres, origin, cell, table)
+    # Anything may stand where nothing is known even of the surroundings: a wall, not an object.
+    unknown = hidden & np.isfinite(
+        _highest(_table_points(frame, table, origin, cell), height.shape)
+    )
+    height = np.where(unknown, height.max() + WALL, height)
+    return HeightMap(height, np.maximum(ceiling, height), label, centres, origin, cell, table)
 
 
 def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
@@ -106,7 +112,8 @@ def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
     pixels away through the hole.
 
     Depth cameras lose pixels at the edges of whatever stands up, and thin parts whole; a finger
-    that took such a hole for table would come down on them. Deeper holes stay 0.
+    that took such a hole for table would come down on them. Wider holes, whose middle is out of
+    reach, stay 0: a black thing may fill them.
     """
     unknown = ~(depth > 0)
     if not unknown.any():
@@ -115,7 +122,9 @@ def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
     known = nearest = np.where(unknown, far, depth).astype(np.float32)
     for _ in range(reach):
         nearest = np.where(unknown, cv2.erode(nearest, np.ones((3, 3), np.uint8)), known)
-    return np.where(nearest < far, nearest, np.float32(0))
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    wide = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    return np.where((nearest < far) & ~wide, nearest, np.float32(0))
 
 
 def height_map_from_scene(
@@ -236,6 +245,20 @@ def _surface_points(
         )
         z[unknown] = -np.inf
         yield col, row, z
+
+
+def _table_points(
+    frame: RGBDFrame, table: float, origin: np.ndarray, cell: float
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """As `_surface_points`, where the rays of pixels without a depth meet the table."""
+    unknown = ~(frame.depth > 0)
+    if not unknown.any():
+        return iter(())
+    v, u = np.mgrid[: unknown.shape[0], : unknown.shape[1]]
+    along = deproject(np.stack([u, v], axis=-1), np.ones(unknown.shape), frame.K, frame.T_WC)
+    with np.errstate(divide="ignore"):
+        reach = (table - frame.T_WC[2, 3]) / (along[..., 2] - frame.T_WC[2, 3])
+    return _surface_points(replace(frame, depth=np.where(unknown, reach, 0)), origin, cell)
 
 
 def _grazing_points(
