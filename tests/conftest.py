@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hypothesis
 import pytest
 
 from utils.config import Config, load_config
+
+# The same examples everywhere, and no verdict from how busy the machine is.
+hypothesis.settings.register_profile("everywhere", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("everywhere")
 
 
 @pytest.fixture(scope="session")

@@ -73,5 +73,5 @@ def test_the_peak_of_memory_stays_after_it_was_given_back():
     assert held.all() and resident > 256
     del held
     assert psutil.Process().memory_info().rss / 2**20 < resident - 200
-    # The kernel counts in batches of pages.
-    assert bench_graspnet.peak_mib() > resident - 2
+    # The kernel counts in batches of pages, for every processor.
+    assert bench_graspnet.peak_mib() > resident - 64

