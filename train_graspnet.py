@@ -8,7 +8,8 @@
 
 Leaves best.pt (chosen on held-out training objects), last.pt, graspnet.pt (the best one's weights
 alone), results.json, curves.png, predictions.png and TensorBoard events in
-runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it was, bit for bit.
+runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it was, bit for bit on
+the same device and number of processes.
 
 On real data (data.kind cornell or jacquard) it cross-validates: every fold of the images is tested
 by a network that is trained on the other folds for a fixed schedule. The last weights count, so no
@@ -44,6 +45,7 @@ from models.grasp_examples import EpochBatches
 from models.graspnet import create_model
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_pictures import draw_curves, draw_predictions
+from models.graspnet_scores import check_graspable
 from models.graspnet_training import Team, Trainer, team
 from models.real_training_data import (
     Fold,
@@ -64,6 +66,7 @@ from utils.results import write_json_atomic
 from utils.runs import check_writable, git_state, new_run_folder
 
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
+WEIGHTS_HELP = "also write graspnet.pt here, once the training has reached its end"
 FREE_TO_CHANGE = (("train", "name"), ("train", "device"), ("train", "workers"), ("data", "workers"))
 
 
@@ -85,14 +88,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         finished = train(config, run, data, trainer, history, losses)
 
         if us.leads:
-            save_results(run, data, history, options.weights)
+            # A network that is half trained must not replace one that is not.
+            save_results(run, data, history, options.weights if finished else None)
             if not finished:
                 print(f"stopped after {trainer.step} steps; go on with --resume {run}")
     return 0 if finished else 130
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="also write graspnet.pt here")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS_HELP)
 
 
 def check_resume(config: Config, run: Path | None) -> None:
@@ -116,11 +120,14 @@ def check_network(config: Config) -> None:
     """Raise UserError for a network that cannot be made, before work is put into its data."""
     create_model(name=config.train.backbone)
     if config.train.initial is not None:
-        load_checkpoint(config.train.initial, KIND)
+        load_graspnet(config.train.initial)
 
 
 def make_data(config: Config, us: Team) -> TrainingData:
-    """What to train on; simulated images are made here as far as they lack."""
+    """What to train on; simulated images are made here as far as they lack.
+
+    Raises UserError if the validation images could not tell a good network from a bad one.
+    """
     folder = generate(config, us.rank, us.ranks)
     us.wait()
     truth = label_truth(read_trials(folder))
@@ -133,7 +140,9 @@ def make_data(config: Config, us: Team) -> TrainingData:
         )
     camera = config.camera
     focal, distance = camera_intrinsics(camera).K[0, 0], math.dist(camera.position, camera.target)
-    return simulated_data(config, folder, float(focal), distance)
+    data = simulated_data(config, folder, float(focal), distance)
+    check_graspable(data.validation)
+    return data
 
 
 def open_run(config: Config) -> str:

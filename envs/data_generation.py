@@ -21,7 +21,7 @@ import yaml
 from tqdm import tqdm
 
 from envs.appearance import Appearance, draw_camera
-from envs.cell import Cell, camera_intrinsics
+from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.execution import execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.scenes import LAYOUTS, Scene, SceneError, make_scene
@@ -37,6 +37,7 @@ SPLITS = ("train", "validation")
 HELD_OUT = 10  # every tenth training object is kept for validation
 FRAMES_PER_SCENE = 4  # the whole scene, then parts of it as they are met on the way to clearing it
 SCENES_PER_SHARD = 8
+MOST_DRAWS = 100  # of one scene, each of which makes tries of its own
 _LAYOUT_SHARES = {"isolated": 0.15, "packed": 0.35, "pile": 0.5}
 _FIRST_SEED = {"train": 1_000_000_000, "validation": 2_000_000_000}  # never met in evaluation
 
@@ -65,7 +66,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     """Write the shards that the data set of a config still lacks; returns its folder.
 
     rank, ranks: this process makes every ranks-th shard (`torchrun`).
-    Raises UserError if the folder holds data of another config, or a worker died.
+    Raises UserError if the folder holds data of another config, or a worker died. Whatever stops
+    it, the shards under way are finished and no others begun.
     """
     folder = data_folder(config)
     _claim(folder, config)
@@ -93,8 +95,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
                 jobs = [pool.submit(_make_shard, folder, *job) for job in missing]
                 for job in as_completed(jobs):
                     progress.update(job.result())
-            except KeyboardInterrupt:
-                progress.write("interrupted: finishing the shards under way")
+            except BaseException:  # Ctrl-C, or an error in a worker such as a full disk
+                progress.write("stopping: finishing the shards under way")
                 pool.shutdown(cancel_futures=True)
                 raise
     except BrokenProcessPool as error:
@@ -188,9 +190,12 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
 def draw_scene(
     config: Config, split: str, seed: int, sets: dict[tuple[str, str], ObjectSet], cell: Cell
 ) -> tuple[Scene, str]:
-    """A scene of random layout, object set and number of objects, and the name of its set."""
+    """A scene of random layout, object set and number of objects, and the name of its set.
+
+    Raises UserError if hardly any such scene can be made.
+    """
     rng = np.random.default_rng([config.seed, seed])
-    while True:
+    for _ in range(MOST_DRAWS):
         layout = LAYOUTS[rng.choice(len(LAYOUTS), p=[_LAYOUT_SHARES[name] for name in LAYOUTS])]
         name = config.data.object_sets[rng.integers(len(config.data.object_sets))]
         count = int(rng.integers(2, config.data.max_objects + 1))
@@ -201,6 +206,11 @@ def draw_scene(
         except SceneError:  # too many for this layout: another draw, from the same generator
             continue
         return Scene(layout, seed, scene.placements), name
+    raise UserError(
+        f"none of {MOST_DRAWS} scenes drawn for seed {seed} came to rest inside the workspace; use "
+        "smaller objects (objects.scale, objects.fit), fewer (data.max_objects) or a larger "
+        "workspace.size"
+    )
 
 
 def label_scene(
@@ -239,9 +249,14 @@ def _part(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 def execute_pairs(cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator) -> list[Trial]:
-    """Carry out labelled pairs of every quality, each on the scene freshly loaded."""
+    """Carry out labelled pairs of every quality, each on the scene freshly loaded. Where the
+    simulation blows up, the grasp has failed."""
     trials = []
     for grasp, quality, weight in draw_pairs(frame, labels, rng):
         cell.load(scene)
-        trials.append(Trial(quality, weight, execute_grasp(cell, grasp).success))
+        try:
+            success = execute_grasp(cell, grasp).success
+        except PhysicsError:  # the next pair's scene is a new world
+            success = False
+        trials.append(Trial(quality, weight, success))
     return trials

@@ -10,6 +10,7 @@ import torch
 from models.grasp_examples import LabelledImages
 from models.graspnet import GraspNet, Peaks, PeakSettings, find_peaks, to_input
 from utils.augmentation import LabelledImage
+from utils.errors import UserError
 from utils.grasp_labels import LabelSettings
 from utils.transforms import angle_difference
 
@@ -33,6 +34,21 @@ class LabelScores(NamedTuple):
     images: int
 
 
+def check_graspable(images: LabelledImages) -> None:
+    """Raise UserError if no image shows anything to grasp; looks no further than the first that
+    does."""
+    if not any(shows_a_grasp(images[index]) for index in range(len(images))):
+        raise UserError(
+            f"none of the {len(images)} validation images shows anything that can be grasped, so "
+            "no network could be chosen by them; use more images (data.validation_frames) or "
+            "objects that fit the gripper (objects.scale, data.object_sets)"
+        )
+
+
+def shows_a_grasp(image: LabelledImage) -> bool:
+    return bool((image.quality >= LabelSettings().positive).any())
+
+
 @torch.inference_mode()
 def predict(model: GraspNet, image: LabelledImage) -> tuple[torch.Tensor, ...]:
     """The network's maps (1, C, H, W) of one labelled image."""
@@ -48,7 +64,7 @@ def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
     rows = []
     for index in range(len(images)):
         image = images[index]
-        if (image.quality >= LabelSettings().positive).any():
+        if shows_a_grasp(image):
             found = find_peaks(*predict(model, image), BEST)
             rows.append(score_peak(found, image))
     if not rows:

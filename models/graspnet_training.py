@@ -62,13 +62,23 @@ class Team(NamedTuple):
 @contextmanager
 def team(device: str, environment: dict[str, str]) -> Iterator[Team]:
     """This process's place among those that `torchrun` started (its variables in `environment`),
-    or alone. device: auto | cpu | cuda | cuda:N; auto takes a GPU where there is one."""
+    or alone. device: auto | cpu | cuda | cuda:N; auto takes a GPU where there is one.
+
+    Raises UserError for a device that is not here, or one GPU for several processes.
+    """
     ranks = int(environment.get("WORLD_SIZE", 1))
     local = int(environment.get("LOCAL_RANK", 0))
+    if ranks > 1 and device.startswith("cuda:"):
+        raise UserError(
+            f"device {device}: {ranks} processes cannot share one GPU; choose cuda or auto, and "
+            "each takes its own"
+        )
     chosen = choose_device(device, local)
     if ranks == 1:
         yield Team(0, 1, chosen)
         return
+    if chosen.type == "cuda":  # objects are broadcast by way of the current device
+        torch.cuda.set_device(chosen)
     dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:
         yield Team(dist.get_rank(), ranks, chosen)
@@ -182,7 +192,8 @@ class Trainer:
         return self.loss(*predicted, targets)
 
     def save(self, path: Path, config: Config, metres_per_pixel: float, **extra: Any) -> None:
-        """Everything that `load` needs to go on as if nothing had happened."""
+        """Everything that `load` needs to go on as if nothing had happened, bit for bit on the
+        same device and number of processes."""
         save_checkpoint(
             path,
             kind=KIND,
@@ -206,7 +217,8 @@ class Trainer:
         load_weights(self.model, checkpoint, path)
         self.optimizer.load_state_dict(checkpoint["optimizer"])
         self.scheduler.load_state_dict(checkpoint["scheduler"])
-        self.scaler.load_state_dict(checkpoint["extra"]["scaler"])
+        if checkpoint["extra"]["scaler"]:  # empty from a device that needed none, such as a CPU
+            self.scaler.load_state_dict(checkpoint["extra"]["scaler"])
         self.step = checkpoint["step"]
         restore_rng(checkpoint["rng"], {})
         return checkpoint["extra"]

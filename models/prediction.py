@@ -98,7 +98,6 @@ def scaled_maps(model: GraspNet, metres_per_pixel: float, frame: RGBDFrame) -> t
             f"the network takes {model.input_channels} channels; an RGB-D image has "
             f"{INPUT_CHANNELS}"
         )
-    check_rgbd(frame.rgb, frame.depth)
     scaling = training_scale(frame, metres_per_pixel)
     return scaling, run_network(model, frame, scaling)
 
@@ -140,9 +139,10 @@ def grasps_in_maps(
 def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
     """The scaling after which a pixel spans `metres_per_pixel` at the median known depth.
 
-    Raises UserError where the view would be far too small or too wide.
+    Raises UserError for images that cannot be meant, and where the view would be far too small or
+    too wide.
     """
-    distance = float(np.median(frame.depth[frame.depth > 0]))
+    distance = check_rgbd(frame.rgb, frame.depth)
     scaling = PixelScaling.to_focal_length(frame.K, distance / metres_per_pixel)
     height, width = frame.depth.shape
     rows, columns = height * scaling.v, width * scaling.u

@@ -3,28 +3,34 @@ gives the same bytes whoever does it and whenever it is interrupted."""
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from envs import data_generation
 from envs.appearance import Appearance, Texture, draw_camera
 from envs.camera import Intrinsics
-from envs.cell import Cell, camera_intrinsics
+from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.data_generation import (
     SPLITS,
     data_folder,
     draw_scene,
+    execute_pairs,
     generate,
     label_scene,
     missing_shards,
     object_sets,
 )
 from envs.objects import ObjectError
+from envs.scenes import SceneError
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, SceneGeometry
@@ -150,6 +156,21 @@ def test_a_shard_that_cannot_be_read_is_named(stored, spoil, message):
         with pytest.raises(UserError, match=message) as caught:
             read()
         assert "00001.h5" in str(caught.value)
+
+
+def test_a_sound_shard_is_not_blamed_for_the_system(stored, monkeypatch):
+    def no_more_files(*_):
+        raise OSError(errno.EMFILE, "unable to open file")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py, "File", no_more_files)
+        with pytest.raises(UserError, match="00000.h5: cannot be read .Too many open") as caught:
+            read_trials(stored[0])
+    assert "delete" not in str(caught.value)
+    shard_path(stored[0], "train", 1).unlink()
+    shard_path(stored[0], "train", 1).mkdir()
+    with pytest.raises(UserError, match="00001.h5: cannot be read .Is a directory"):
+        read_trials(stored[0])
 
 
 def test_a_folder_without_shards_is_said(tmp_path):
@@ -318,6 +339,38 @@ def test_every_shard_has_one_owner_whatever_is_there_already(tmp_path):
     assert [missing_shards(config, tmp_path, rank, 3) for rank in range(3)] == [[], *shares[1:]]
 
 
+def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch):
+    begun = []
+
+    def make_shard(folder, split, number):
+        begun.append(number)
+        if number == 0:
+            raise OSError(errno.ENOSPC, "no space")
+        time.sleep(0.2)  # under way when the error is met
+        return 32
+
+    # A thread in place of the process, which would not know of the replaced functions.
+    monkeypatch.setattr(
+        data_generation, "ProcessPoolExecutor", lambda workers, **_: ThreadPoolExecutor(workers)
+    )
+    monkeypatch.setattr(data_generation, "_make_shard", make_shard)
+    config = load_config(None, [f"data.root={tmp_path / 'data'}", "data.frames=960",
+                                "data.object_sets=primitives", "data.workers=1"])  # fmt: skip
+    with pytest.raises(OSError, match="no space"):
+        generate(config)
+    assert len(begun) < 5
+
+
+def test_scenes_that_cannot_be_made_are_told(config, monkeypatch):
+    def none(*_):
+        raise SceneError("too many")
+
+    monkeypatch.setattr(data_generation, "make_scene", none)
+    given = load_config(None, ["data.object_sets=primitives"])
+    with Cell(config) as cell, pytest.raises(UserError, match="none of 100 .*data.max_objects"):
+        draw_scene(given, "train", 1, object_sets(given), cell)
+
+
 def test_generated_frames_are_whole(tiny_data):
     folder, _ = tiny_data
     for split in SPLITS:
@@ -377,6 +430,20 @@ def test_without_randomisation_the_plain_camera_sees_plain_objects(tiny_data, ce
     random = load_config(None, [*tiny_data[1], "data.executed_share=0"])
     first, _ = next(label_scene(random, scene, "primitives", cell))
     assert not np.allclose(first.frame.T_WC, expected.T_WC)
+
+
+def test_a_grasp_that_blows_up_the_simulation_has_failed(cell_with_scene, monkeypatch):
+    cell, scene = cell_with_scene
+    cell.load(scene)
+
+    def blow_up(*_):
+        raise PhysicsError("as if")
+
+    pairs = [("grasp", 0.9, 2.0), ("grasp", 0.0, 5.0)]
+    monkeypatch.setattr(data_generation, "draw_pairs", lambda *_: pairs)
+    monkeypatch.setattr(data_generation, "execute_grasp", blow_up)
+    trials = execute_pairs(cell, scene, None, None, np.random.default_rng(0))
+    assert trials == [Trial(0.9, 2.0, False), Trial(0.0, 5.0, False)]
 
 
 def stripes(strength: float) -> Texture:

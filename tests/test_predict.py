@@ -205,6 +205,18 @@ def test_another_distance_and_focal_length_give_the_same_metric_grasps(cell):
     check_on_cubes(prediction.predict(hand_made(), PIXEL, frame, 0.0).grasps, 0.002)
 
 
+@pytest.mark.parametrize("unknown", [0.0, -1.0, np.inf, np.nan])
+def test_unknown_depth_has_no_part_in_the_scale(unknown):
+    depth = np.full((64, 64), 0.8, np.float32)
+    depth[:, :30] = 0.6
+    depth[:60, 34:] = unknown  # infinite ones would make most of the image's depths
+    frame = RGBDFrame(
+        np.zeros((64, 64, 3), np.uint8), depth, np.diag([400.0, 400.0, 1.0]), OVERHEAD
+    )
+    scaling = prediction.training_scale(frame, 0.0015)
+    assert (scaling.u, scaling.v) == pytest.approx((1.0, 1.0))  # 0.6 / 400 = 1.5 mm
+
+
 def test_pixels_that_are_not_square(cell):
     square = cell.look(Intrinsics(320, 240, 28), OVERHEAD)
     wider = PixelScaling(1.25, 1.0)

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -22,12 +23,13 @@ import train_graspnet
 from models.grasp_examples import AtPixelSize, EpochBatches, GraspExamples
 from models.graspnet import Peaks, create_model
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
-from models.graspnet_scores import score_labels, score_peak
+from models.graspnet_scores import check_graspable, score_labels, score_peak
 from models.graspnet_training import (
     Team,
     Trainer,
     choose_device,
     choose_precision,
+    team,
     warm_up_and_cosine,
 )
 from tests.one_step import joint_batch, part_of, take_steps
@@ -35,6 +37,7 @@ from utils.augmentation import Augmentation, LabelledImage
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
+from utils.grasp_data import shard_path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 ALONE = Team(0, 1, torch.device("cpu"))
@@ -235,6 +238,15 @@ def test_resumed_training_is_the_same_bit_for_bit(tmp_path, config, backbone, pr
         assert same(ours, theirs), part
 
 
+def test_a_checkpoint_of_a_device_without_a_scaler_goes_on_where_there_is_one(tmp_path, config):
+    trainer_of().save(tmp_path / "last.pt", config, 0.002)
+    other = trainer_of()
+    other.scaler = torch.amp.GradScaler("cpu", init_scale=8.0)  # as a GPU's float16 has
+    other.load(tmp_path / "last.pt")
+    other.train_step(joint_batch(0))
+    assert other.scaler.get_scale() == 8.0
+
+
 def test_float32_is_float32_and_bfloat16_is_near():
     loss = {}
     for precision in ("float32", "bfloat16"):
@@ -314,6 +326,26 @@ def test_devices(monkeypatch):
     assert choose_device("cuda:0", local_rank=1) == torch.device("cuda", 0)
     with pytest.raises(UserError, match="cuda:2: this machine has 2 CUDA GPUs"):
         choose_device("cuda:2")
+
+
+def test_several_processes_do_not_share_one_gpu():
+    with (
+        pytest.raises(UserError, match="cuda:0: 2 processes cannot share one GPU.*cuda or auto"),
+        team("cuda:0", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}),
+    ):
+        pass
+
+
+def test_a_process_takes_its_gpu_before_it_talks_to_the_others(monkeypatch):
+    calls = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", calls.append)
+    monkeypatch.setattr(torch.distributed, "init_process_group", calls.append)
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: None)
+    with team("cuda", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}) as us:
+        assert us == Team(1, 2, torch.device("cuda", 1))
+    assert calls == [torch.device("cuda", 1), "nccl"]
 
 
 def test_precisions():
@@ -412,6 +444,13 @@ def test_scores_are_means_over_images_with_something_to_grasp():
     assert (nothing.images, nothing.label_quality, nothing.precision) == (0, 0.0, 0.0)
 
 
+def test_one_image_with_something_to_grasp_is_enough():
+    poor = labelled((4, 10, 12, 0.5, 0.05))
+    check_graspable([poor, labelled((4, 10, 12, 0.9, 0.05))])
+    with pytest.raises(UserError, match="none of the 2 validation images.*validation_frames"):
+        check_graspable([poor, labelled()])
+
+
 # --- The script ------------------------------------------------------------------------------
 
 SMALL = [
@@ -498,6 +537,27 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     assert ours == theirs
 
 
+def test_only_a_finished_training_replaces_the_weights(finished, tmp_path, monkeypatch):
+    arguments = [*finished[1], "--weights", str(tmp_path / "shipped.pt")]
+    (tmp_path / "shipped.pt").write_text("the good old ones")
+    monkeypatch.chdir(tmp_path)
+    take_step = Trainer.train_step
+
+    def interrupted(trainer, batch):
+        if trainer.step == 4:  # after the first epoch
+            signal.raise_signal(signal.SIGINT)
+        return take_step(trainer, batch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", interrupted)
+        assert train_graspnet.main(arguments) == 130
+    (run,) = Path("runs/train_graspnet").iterdir()
+    assert (run / "graspnet.pt").exists()
+    assert (tmp_path / "shipped.pt").read_text() == "the good old ones"
+    assert train_graspnet.main(["--resume", str(run), *arguments[-2:]]) == 0
+    assert (tmp_path / "shipped.pt").read_bytes() == (run / "graspnet.pt").read_bytes()
+
+
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch):
     run, _ = finished
     copy = tmp_path / "copy"
@@ -529,12 +589,21 @@ def test_mistakes_are_told_before_a_run_folder_is_made(tiny_data, finished, tmp_
     empty = tmp_path / "empty"
     empty.mkdir()
     shutil.copy(run / "config.yaml", empty)
+    diverged = create_model(name="tutorial_skip", max_width=0.08)
+    next(diverged.parameters()).data.fill_(float("nan"))
+    save_graspnet(tmp_path / "diverged.pt", diverged, 0.002)
+    ungraspable = tmp_path / "ungraspable"
+    shutil.copytree(tiny_data[0], ungraspable)
+    with h5py.File(shard_path(ungraspable, "validation", 0), "a") as file:
+        file["quality"][:] = 0
     for arguments, message in (
         (["--resume", str(empty)], "no last.pt"),
         ([*tiny_data[1], "train.batch_size=33"], "only 32 images"),
         ([*tiny_data[1], "train.device=tpu"], "train.device"),
         ([*tiny_data[1], "train.backbone=resnet"], "'resnet', expected"),
         ([*tiny_data[1], "train.initial=nowhere.pt"], "nowhere.pt"),
+        ([*tiny_data[1], "train.initial=diverged.pt"], "diverged.pt: .*not finite"),
+        ([*tiny_data[1], f"data.root={ungraspable}"], "none of the 32 validation images"),
     ):
         with pytest.raises(UserError, match=message):
             train_graspnet.main(arguments)

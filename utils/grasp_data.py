@@ -8,6 +8,7 @@ generation goes on with what is missing. This module knows no simulator and no n
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,6 +147,9 @@ def _open(path: Path) -> h5py.File:
         file = h5py.File(path, "r")
         version = file.attrs["format_version"]
     except (OSError, KeyError) as error:
+        # Only the operating system sets a number: the file's content is not to blame.
+        if getattr(error, "errno", None) is not None:
+            raise UserError(f"{path}: cannot be read ({os.strerror(error.errno)})") from error
         raise UserError(
             f"{path}: not a readable data shard ({error}); delete it, and it is made again"
         ) from error
