@@ -92,7 +92,7 @@ def dense_candidates(
     """Every angle, fingertip height and row of the map: what might fit between the fingers."""
     cell, lowest = heights.cell, heights.table_height + settings.table_clearance
     levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
-    if len(levels) == 0:
+    if len(levels) == 0 or len(heights.centres) == 0:  # nothing stands up, or only slivers do
         return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
     # A square that holds whatever may be grasped, and fingers beside it, at any angle.
     matter = np.argwhere(heights.height > lowest)[:, ::-1]
@@ -150,7 +150,7 @@ def dense_candidates(
             slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
         )
         inside = heights.label[heights.index(at_inside)]
-        arm = np.abs((heights.centres[inside, :2] - xy) @ across) if len(heights.centres) else 0.0
+        arm = np.abs((heights.centres[inside, :2] - xy) @ across)
         rise = turned[row, first] - tip
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
         score *= (

@@ -106,3 +106,9 @@ def test_ranking_is_sorted_and_distinct(name: str) -> None:
         for b in grasps[:i]:
             apart = np.linalg.norm(a.position[:2] - b.position[:2])
             assert apart >= 0.01 or angle_difference(a.angle, b.angle) >= np.deg2rad(20) - 1e-9
+
+
+@pytest.mark.parametrize("name", ["heuristic", "graspnet"])
+def test_a_crumb_is_nothing_to_grasp(name: str) -> None:
+    """4 mm x 6 mm x 12 mm: smaller than what counts as an object in a depth image."""
+    assert planner(name)(boxes_frame([((0.004, 0.006, 0.012), 0.0, (0.5, 0.0))])) == []
