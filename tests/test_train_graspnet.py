@@ -23,7 +23,7 @@ import train_graspnet
 from models.grasp_examples import AtPixelSize, EpochBatches, GraspExamples
 from models.graspnet import Peaks, create_model
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
-from models.graspnet_scores import check_graspable, score_labels, score_peak
+from models.graspnet_scores import LabelScores, check_graspable, score_labels, score_peak
 from models.graspnet_training import (
     Team,
     Trainer,
@@ -254,7 +254,7 @@ def test_float32_is_float32_and_bfloat16_is_near():
         loss[precision], _ = trainer.losses(joint_batch(0))
     batch, trainer = joint_batch(0), trainer_of()
     exact, _ = trainer.loss(*trainer.model(batch.image, logits=True), batch.targets)
-    torch.testing.assert_close(loss["float32"], exact, rtol=1e-6, atol=0)
+    torch.testing.assert_close(loss["float32"], exact, rtol=1e-5, atol=0)
     assert loss["bfloat16"] != exact
     torch.testing.assert_close(loss["bfloat16"], exact, rtol=1e-2, atol=0)
 
@@ -477,7 +477,6 @@ def test_a_training_leaves_all_its_files(finished):
     assert [(row["epoch"], row["step"]) for row in history] == [(1, 4), (2, 8), (3, 12)]
     scores = [row["label_quality"] for row in history]
     assert results["best"]["label_quality"] == max(scores) and results["best"] in history
-    assert len(set(scores)) > 1, "there was a choice"
     assert all(row["images"] > 20 and row["loss"] > 0 for row in history)
     for picture in ("curves.png", "predictions.png"):
         assert cv2.imread(str(run / picture)).std() > 10, "not a blank sheet"
@@ -489,6 +488,25 @@ def test_a_training_leaves_all_its_files(finished):
     assert saved.metres_per_pixel == pytest.approx(0.8 * math.tan(math.radians(14)) / 32)
     assert saved.extra["scores"] == results["best"]
     assert saved.model.max_width == pytest.approx(0.08)
+
+
+def test_the_best_epoch_is_kept(tiny_data, tmp_path, monkeypatch):
+    """With made-up scores: real ones of so short a training may all be the same."""
+    monkeypatch.chdir(tmp_path)
+    qualities = iter([0.2, 0.5, 0.1])
+    monkeypatch.setattr(
+        "models.training_data.score_labels",
+        lambda model, images: LabelScores(next(qualities), 0.5, 0.1, 0.01, 1.0, 32),
+    )
+    assert train_graspnet.main([*tiny_data[1], *SMALL]) == 0
+    (run,) = Path("runs/train_graspnet").iterdir()
+    best, last = (load_checkpoint(run / f"{name}.pt", KIND) for name in ("best", "last"))
+    assert (best["step"], last["step"]) == (8, 12)
+    weights = dict(load_graspnet(run / "graspnet.pt").model.state_dict())
+    assert same(weights, dict(load_graspnet(run / "best.pt").model.state_dict()))
+    assert not same(weights, dict(load_graspnet(run / "last.pt").model.state_dict()))
+    results = json.loads((run / "results.json").read_text())
+    assert results["best"] == results["history"][1] and results["best"]["label_quality"] == 0.5
 
 
 def test_tensorboard_holds_the_history(finished):
