@@ -110,6 +110,8 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
          "evaluate.policies=heuristic", "evaluate.scenarios=isolated"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
+        # A shell's background jobs ignore Ctrl-C, and so would what they start.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     deadline = time.monotonic() + 240
     while True:
