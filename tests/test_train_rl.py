@@ -248,7 +248,7 @@ def test_bad_numbers_end_a_run_with_a_sound_checkpoint(tmp_path, monkeypatch, tr
     ("trouble", "message"),
     [
         ("raise", "(?s)raised an error.*quick_envs.py.*OddError.*the table is gone"),
-        ("die", r"worker process [01] \(exit code 7\) died"),
+        ("die", r"worker process .*[01] \(exit code 7\) died"),
         ("hang", "hangs"),
     ],
 )
