@@ -291,7 +291,7 @@ def test_two_processes_take_the_step_of_the_joint_batch(tmp_path):
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert same(first, second), "the processes stay together"
     joint = take_steps(ALONE)["gradients"]
     half = trainer_of()

@@ -293,7 +293,7 @@ def test_two_processes_take_the_step_of_the_joint_minibatch(tmp_path):
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert same(dict(first), dict(second)), "the processes stay together"
     joint = take_step(ALONE)
     for name, value in joint.items():
