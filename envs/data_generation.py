@@ -7,12 +7,14 @@ them one by one, so an interrupted generation goes on with the shards that are m
 from __future__ import annotations
 
 import hashlib
+import json
 import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -30,7 +32,7 @@ from utils.errors import UserError
 from utils.files import write_atomic
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
-from utils.grasp_labels import dense_labels
+from utils.grasp_labels import LabelSettings, dense_labels
 from utils.label_trials import Trial, draw_pairs
 
 SPLITS = ("train", "validation")
@@ -59,6 +61,15 @@ def _content(config: Config) -> str:
     chosen["data"] = {
         key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")
     }
+    chosen["generation"] = {
+        "held_out": HELD_OUT,
+        "frames_per_scene": FRAMES_PER_SCENE,
+        "scenes_per_shard": SCENES_PER_SHARD,
+        "layout_shares": _LAYOUT_SHARES,
+        "first_seed": _FIRST_SEED,
+    }
+    chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
+    chosen["gripper"] = json.loads(json.dumps(asdict(GripperGeometry())))
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
 
 

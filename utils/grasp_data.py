@@ -25,7 +25,7 @@ from utils.grasp_labels import GraspLabels
 from utils.label_trials import Trial
 from utils.transforms import RGBDFrame
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # to be raised with the file format, and with what makes scenes, images or labels
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
 _WIDTH_UNIT = 0.08 / 255  # metres; the Panda hand opens 0.08 m
 _QUALITY_UNIT = 1 / 255
