@@ -153,7 +153,11 @@ def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
     """A new network, or one that starts from train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
     max_width = config.train.max_width or data.max_width
-    model = create_model(name=config.train.backbone, max_width=max_width)
+    model = create_model(
+        name=config.train.backbone,
+        max_width=max_width,
+        centre_head=config.train.centre_weight > 0,
+    )
     if config.train.initial is not None:
         load_weights(model, load_checkpoint(config.train.initial, KIND), config.train.initial)
     total_steps = steps_per_epoch(config, data) * config.train.epochs

@@ -94,8 +94,9 @@ class GraspExamples(Dataset):
         mask = image.mask if image.mask.ndim == 3 else image.mask[None]
         quality, width = image.quality[window], image.width[window]
         valid = mask[window].all(dim=0, keepdim=True)
+        offset = None if image.centre is None else offset_to(image.centre)[window][None]
         targets = targets_from_labels(
-            quality[None], width[None], valid[None].float(), self.graspable_from
+            quality[None], width[None], valid[None].float(), self.graspable_from, offset
         )
         return Example(x, GraspTargets(*(t[0] for t in targets)))
 
@@ -110,6 +111,13 @@ class GraspExamples(Dataset):
         corner = centre - side // 2 + rng.integers(-side // 4, side // 4 + 1)
         row, column = np.clip(corner, 0, shape - side)
         return (slice(None), slice(row, row + side[0]), slice(column, column + side[1]))
+
+
+def offset_to(centre: torch.Tensor) -> torch.Tensor:
+    """(2, H, W) what leads from each pixel (u, v) to a place `centre` (2, H, W) in the image."""
+    rows, columns = centre.shape[1:]
+    v, u = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    return centre - torch.stack([u, v])
 
 
 class EpochBatches(Sampler):

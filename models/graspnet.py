@@ -28,6 +28,7 @@ from utils.transforms import Grasp, ImageGrasp
 INPUT_CHANNELS = 4  # red, green, blue, depth
 PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
 DEPTH_UNIT = 0.1  # metres of depth that count 1 in the input: objects are about that high
+OFFSET_UNIT = 10.0  # pixels to a centre of mass that count 1 in the last layer
 DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is cut off
 
 
@@ -104,8 +105,9 @@ class GraspNet(nn.Module):
 
     input_channels: 4 for `to_input`. num_angle_bins: K bins over [0, pi). max_width: metres, the
     largest width that can be told; 0.15 in the tutorial, 0.08 fits the Panda hand. backbone: one
-    of `models.backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder.
-    `model_args` holds these four, so that `GraspNet(**model_args)` is the same architecture.
+    of `models.backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder. centre_head:
+    a fourth head tells what leads from each pixel to the centre of mass of the object seen there.
+    `model_args` holds these five, so that `GraspNet(**model_args)` is the same architecture.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class GraspNet(nn.Module):
         num_angle_bins: int = 18,
         max_width: float = 0.15,
         backbone: str = "tutorial",
+        centre_head: bool = False,
     ):
         super().__init__()
         if backbone not in BACKBONES:
@@ -123,6 +126,7 @@ class GraspNet(nn.Module):
             "num_angle_bins": num_angle_bins,
             "max_width": max_width,
             "backbone": backbone,
+            "centre_head": centre_head,
         }
         self.input_channels = input_channels
         self.num_angle_bins = num_angle_bins
@@ -132,16 +136,18 @@ class GraspNet(nn.Module):
         self.quality_head = nn.Conv2d(features, 1, kernel_size=1)
         self.angle_head = nn.Conv2d(features, num_angle_bins, kernel_size=1)
         self.width_head = nn.Conv2d(features, 1, kernel_size=1)
+        self.centre_head = nn.Conv2d(features, 2, kernel_size=1) if centre_head else None
 
     def forward(
-        self, x: torch.Tensor, logits: bool = False
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        self, x: torch.Tensor, logits: bool = False, centres: bool = False
+    ) -> tuple[torch.Tensor, ...]:
         """Maps of the input's height and width, whatever these are.
 
         x: (B, C, H, W). Returns quality (B, 1, H, W) in [0, 1], angle logits (B, K, H, W) and
         width (B, 1, H, W) in metres. With `logits` the quality comes before its sigmoid, which is
-        what GraspLoss wants; it is an argument, not a method, so that DistributedDataParallel
-        sees the call.
+        what GraspLoss wants. With `centres` a fourth map follows, of the centre head: (B, 2, H, W),
+        pixels (du, dv) to the centre of mass. Arguments, not methods, so that
+        DistributedDataParallel sees the call.
         """
         if x.ndim != 4 or x.shape[1] != self.input_channels:
             raise UserError(
@@ -156,7 +162,8 @@ class GraspNet(nn.Module):
         quality = self.quality_head(features)
         angle = self.angle_head(features)
         metres = torch.sigmoid(self.width_head(features)) * self.max_width
-        return quality if logits else torch.sigmoid(quality), angle, metres
+        maps = quality if logits else torch.sigmoid(quality), angle, metres
+        return (*maps, self.centre_head(features) * OFFSET_UNIT) if centres else maps
 
     @torch.no_grad()
     def predict_grasp(
@@ -201,9 +208,10 @@ def create_model(
     *,
     name: str = "tutorial",
     max_width: float = 0.15,
+    centre_head: bool = False,
 ) -> GraspNet:
     """A GraspNet with the backbone `name`; UserError with the known ones if there is no such."""
-    return GraspNet(input_channels, num_angle_bins, max_width, backbone=name)
+    return GraspNet(input_channels, num_angle_bins, max_width, name, centre_head)
 
 
 # --- Targets and loss ----------------------------------------------------------------------
@@ -214,7 +222,8 @@ class GraspTargets(NamedTuple):
 
     quality: (B, 1, H, W) in [0, 1]. angle: (B, K, H, W), at each pixel a distribution over bins.
     width: (B, 1, H, W) metres. valid: (B, 1, H, W) weight of the pixel in the quality loss, 0 to
-    leave it out. graspable: (B, 1, H, W) its weight in the angle and width losses.
+    leave it out. graspable: (B, 1, H, W) its weight in the angle and width losses. offset: (B, 2,
+    H, W) pixels to the centre of mass. on_object: (B, 1, H, W) weight of the pixel in its loss.
     """
 
     quality: torch.Tensor
@@ -222,6 +231,8 @@ class GraspTargets(NamedTuple):
     width: torch.Tensor
     valid: torch.Tensor
     graspable: torch.Tensor
+    offset: torch.Tensor
+    on_object: torch.Tensor
 
 
 def targets_from_labels(
@@ -229,6 +240,7 @@ def targets_from_labels(
     width: torch.Tensor,
     valid: torch.Tensor | None = None,
     graspable_from: float = 0.5,
+    offset: torch.Tensor | None = None,
 ) -> GraspTargets:
     """Targets from dense labels: what a grasp at each pixel AND in each angle bin is worth.
 
@@ -237,7 +249,8 @@ def targets_from_labels(
     gives every bin its share of the summed cubes of quality: where several angles are good, all of
     them are right (one hard angle makes the head collapse, see notes/grasping.md), and the cube,
     which is the labels' plain product of factors, keeps the barely feasible ones small. Pixels that
-    reach `graspable_from` teach angle and width.
+    reach `graspable_from` teach angle and width. offset: (B, 2, H, W) pixels to the centre of mass
+    of the object seen, NaN where there is none; None: not known anywhere.
     """
     best, bin_ = quality.max(dim=1, keepdim=True)
     share = quality**3
@@ -246,7 +259,11 @@ def targets_from_labels(
     angle = torch.where(total > 0, share / total.clamp(min=1e-12), 1 / bins)
     of_best = width.gather(1, bin_).nan_to_num(0.0)
     valid = torch.ones_like(best) if valid is None else valid.to(best.dtype)
-    return GraspTargets(best, angle, of_best, valid, valid * (best >= graspable_from))
+    if offset is None:
+        offset = quality.new_full((len(quality), 2, *best.shape[2:]), torch.nan)
+    on_object = offset.isfinite().all(dim=1, keepdim=True).to(best.dtype)
+    graspable = valid * (best >= graspable_from)
+    return GraspTargets(best, angle, of_best, valid, graspable, offset.nan_to_num(0.0), on_object)
 
 
 class GraspLoss(nn.Module):
@@ -254,17 +271,23 @@ class GraspLoss(nn.Module):
 
     Binary cross-entropy of the quality; cross-entropy of the angle against the target's whole
     distribution; L1 of the width in metres, so `width_weight` is per metre (10: one centimetre
-    counts 0.1). Averaging image by image makes every image count alike, and makes the mean over
-    processes with batches of equal size the loss of the joint batch.
+    counts 0.1); L1 of a centre head's offsets, so `centre_weight` is per pixel. Averaging image by
+    image makes every image count alike, and makes the mean over processes with batches of equal
+    size the loss of the joint batch.
     """
 
     def __init__(
-        self, quality_weight: float = 1.0, angle_weight: float = 1.0, width_weight: float = 10.0
+        self,
+        quality_weight: float = 1.0,
+        angle_weight: float = 1.0,
+        width_weight: float = 10.0,
+        centre_weight: float = 0.1,
     ):
         super().__init__()
         self.quality_weight = quality_weight
         self.angle_weight = angle_weight
         self.width_weight = width_weight
+        self.centre_weight = centre_weight
 
     def forward(
         self,
@@ -272,10 +295,12 @@ class GraspLoss(nn.Module):
         angle_logits: torch.Tensor,
         width: torch.Tensor,
         targets: GraspTargets,
+        offset: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """The weighted sum, and its unweighted parts (detached scalars).
 
-        The first three are `model(x, logits=True)`; half precision is widened here.
+        The first three, and `offset` of a network with a centre head, are what the network returns
+        with `logits` (and `centres`); half precision is widened here.
         """
         quality = F.binary_cross_entropy_with_logits(
             quality_logits.float(), targets.quality, reduction="none"
@@ -290,11 +315,12 @@ class GraspLoss(nn.Module):
             + self.angle_weight * angle_loss
             + self.width_weight * width_loss
         )
-        return total, {
-            "quality_loss": quality_loss.detach(),
-            "angle_loss": angle_loss.detach(),
-            "width_loss": width_loss.detach(),
-        }
+        parts = {"quality_loss": quality_loss, "angle_loss": angle_loss, "width_loss": width_loss}
+        if offset is not None:
+            off = (offset.float() - targets.offset).abs().sum(dim=1, keepdim=True)
+            parts["centre_loss"] = mean_per_image(off, targets.on_object)
+            total = total + self.centre_weight * parts["centre_loss"]
+        return total, {name: part.detach() for name, part in parts.items()}
 
 
 def mean_per_image(value: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -150,7 +150,12 @@ class Trainer:
                 model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
                 self.model = model
             self._parallel = DistributedDataParallel(model)
-        self.loss = GraspLoss(settings.quality_weight, settings.angle_weight, settings.width_weight)
+        self.loss = GraspLoss(
+            settings.quality_weight,
+            settings.angle_weight,
+            settings.width_weight,
+            settings.centre_weight,
+        )
         self.optimizer = torch.optim.AdamW(
             model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
         )
@@ -188,8 +193,9 @@ class Trainer:
         targets = type(batch.targets)(*(t.to(device, non_blocking=True) for t in batch.targets))
         mixed = self.precision != torch.float32
         with torch.autocast(device.type, dtype=self.precision, enabled=mixed):
-            predicted = self._parallel(image, logits=True)
-        return self.loss(*predicted, targets)
+            centres = self.model.centre_head is not None
+            quality, angle, width, *offset = self._parallel(image, logits=True, centres=centres)
+        return self.loss(quality, angle, width, targets, *offset)
 
     def save(self, path: Path, config: Config, metres_per_pixel: float, **extra: Any) -> None:
         """Everything that `load` needs to go on as if nothing had happened, bit for bit on the

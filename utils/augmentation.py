@@ -26,7 +26,8 @@ class LabelledImage:
 
     rgb: (3, H, W) uint8. depth: (H, W) float32 metres, 0 means unknown. quality: (B, H, W) float32
     in [0, 1]. width: (B, H, W) float32, the opening, metres. mask: (H, W) or (B, H, W) bool, where
-    labels hold.
+    labels hold. centre: (2, H, W) float32 or None where it is not known: the pixel (u, v) at which
+    the object that is seen has its centre of mass; NaN where none is seen.
     width_in_pixels: the widths are pixels of this image instead (rasterised rectangles).
     """
 
@@ -35,6 +36,7 @@ class LabelledImage:
     quality: torch.Tensor
     width: torch.Tensor
     mask: torch.Tensor
+    centre: torch.Tensor | None = None
     width_in_pixels: bool = False
 
     def __post_init__(self) -> None:
@@ -42,9 +44,11 @@ class LabelledImage:
         bins = (self.quality.shape[0], *size)
         allowed = {
             "rgb": [(3, *size)], "depth": [size], "quality": [bins], "width": [bins],
-            "mask": [size, bins],
+            "mask": [size, bins], "centre": [(2, *size)],
         }  # fmt: skip
         for name, shapes in allowed.items():
+            if name == "centre" and self.centre is None:
+                continue
             shape = tuple(getattr(self, name).shape)
             if len(size) != 2 or shape not in shapes:
                 raise ValueError(f"LabelledImage.{name}: shape {shape} with depth {size}")
@@ -106,18 +110,23 @@ def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
     outside = source < 0
     source.clamp_(min=0)
 
-    def moved(values: torch.Tensor) -> torch.Tensor:
+    def moved(values: torch.Tensor, beyond: float = 0) -> torch.Tensor:
         flat = values.flatten(-2).index_select(-1, source)
-        return flat.masked_fill_(outside, 0).unflatten(-1, size)
+        return flat.masked_fill_(outside, beyond).unflatten(-1, size)
 
     depth, quality, width = moved(image.depth), moved(image.quality), moved(image.width)
     mask = moved(image.mask.reshape(-1, *size))
     quality, width, mask = turn_bins(quality, width, mask, change.turn, change.mirror)
     if image.width_in_pixels:
         width = width * change.scale
+    centre = image.centre
+    if centre is not None:
+        matrix = torch.from_numpy(change.matrix(tuple(size))).float()
+        centre = torch.einsum("ij,jvu->ivu", matrix[:2, :2], moved(centre, np.nan))
+        centre += matrix[:2, 2, None, None]
     return replace(
         image, rgb=rgb, depth=depth, quality=quality, width=width,
-        mask=mask[0] if image.mask.ndim == 2 else mask,
+        mask=mask[0] if image.mask.ndim == 2 else mask, centre=centre,
     )  # fmt: skip
 
 

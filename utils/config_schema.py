@@ -176,6 +176,7 @@ class TrainConfig(Section):
     quality_weight: Annotated[float, Field(ge=0)]
     angle_weight: Annotated[float, Field(ge=0)]
     width_weight: Annotated[float, Field(ge=0)]
+    centre_weight: Annotated[float, Field(ge=0)]
     graspable_from: Share
     depth_noise_share: Annotated[float, Field(ge=0, le=1)]
     precision: Literal["auto", "float32", "bfloat16", "float16"]

@@ -23,9 +23,11 @@ from utils.errors import UserError
 from utils.files import write_atomic
 from utils.grasp_labels import GraspLabels
 from utils.label_trials import Trial
-from utils.transforms import RGBDFrame
+from utils.transforms import RGBDFrame, project
 
-FORMAT_VERSION = 1  # to be raised with the file format, and with what makes scenes, images or labels
+FORMAT_VERSION = (
+    2  # to be raised with the file format, and with what makes scenes, images or labels
+)
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
 _WIDTH_UNIT = 0.08 / 255  # metres; the Panda hand opens 0.08 m
 _QUALITY_UNIT = 1 / 255
@@ -47,7 +49,9 @@ def shard_path(folder: Path, split: str, number: int) -> Path:
 def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Trial]) -> None:
     """Write labelled frames, and the label trials made on them, as one HDF5 file.
 
-    Depth, quality and width are stored as whole numbers of their attribute `unit`.
+    Depth, quality and width are stored as whole numbers of their attribute `unit`; `instance` is
+    the number of the object at each pixel, -1 for none, and `centres` has the objects' centres of
+    mass in W. The frames carry segmentation and truth.
     """
     stacked = {
         "rgb": np.stack([f.frame.rgb for f in frames]),
@@ -55,7 +59,15 @@ def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Tr
         "quality": _whole([f.labels.quality for f in frames], _QUALITY_UNIT, np.uint8),
         "width": _whole([f.labels.width for f in frames], _WIDTH_UNIT, np.uint8),
         "valid": np.stack([f.labels.valid for f in frames]),
+        "instance": np.stack([np.maximum(f.frame.segmentation, -1) for f in frames]).astype(
+            np.int8
+        ),
     }
+    most = max(len(f.frame.truth.objects) for f in frames)
+    centres = np.full((len(frames), most, 3), np.nan)  # scenes differ in their number of objects
+    for row, f in zip(centres, frames):
+        for number, thing in enumerate(f.frame.truth.objects):
+            row[number] = thing.centre_of_mass
     units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": _WIDTH_UNIT}
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
@@ -69,6 +81,7 @@ def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Tr
                 data.attrs["unit"] = units[name]
         file["K"] = np.stack([f.frame.K for f in frames])
         file["T_WC"] = np.stack([f.frame.T_WC for f in frames])
+        file["centres"] = centres
         file["scene"] = [f.scene for f in frames]
         file["trials"] = np.array([(t.quality, t.weight, t.success) for t in trials]).reshape(-1, 3)
     write_atomic(path, buffer.getvalue())
@@ -125,7 +138,15 @@ class SimulatedDataset(Dataset):
             quality=torch.from_numpy(file["quality"][i] * np.float32(_QUALITY_UNIT)),
             width=torch.from_numpy(file["width"][i] * np.float32(_WIDTH_UNIT)),
             mask=torch.from_numpy(file["valid"][i]),
+            centre=torch.from_numpy(self._centre(index, file["instance"][i], file["centres"][i])),
         )
+
+    def _centre(self, index: int, instance: np.ndarray, centres: np.ndarray) -> np.ndarray:
+        """(2, H, W) where each pixel's object has its centre of mass; NaN where there is none."""
+        K, T_WC = self.cameras[index]
+        pixels, _ = project(centres, K, T_WC)
+        nowhere = np.full((1, 2), np.nan)
+        return np.moveaxis(np.vstack([pixels, nowhere])[instance], -1, 0).astype(np.float32)
 
     def table_distance(self, index: int) -> float:
         """From the camera to the table (z = 0) along the optical axis, metres."""
