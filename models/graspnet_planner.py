@@ -18,13 +18,15 @@ import torch
 from models.antipodal import SearchSettings, search
 from models.candidates import Candidates
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
+from models.instances import labelled_by_centres
 from models.prediction import scaled_maps
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame
 from utils.transforms import Grasp, RGBDFrame, project
 
-# Coarser than the heuristic's: turning onto the faces and the network make up for it.
-SETTINGS = SearchSettings(angles=9, level_step=0.009, shortlist=120, finalists=120)
+# Half the heuristic's angles: turning onto the faces and the network make up for it. What belongs
+# together is known better than by height alone.
+SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, two_things=0.1)
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 LEAST = 0.02  # quality that anything has which fits
 
@@ -57,7 +59,9 @@ class GraspNetPlanner:
         """Nothing to do: the planner is deterministic."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        scaling, maps = scaled_maps(self.network.model, self.network.metres_per_pixel, frame)
+        model, metres_per_pixel, *_ = self.network
+        knows_centres = model.centre_head is not None
+        scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
         heights = height_map_from_frame(frame, self.workspace)
 
         def value(candidates: Candidates) -> np.ndarray:
@@ -67,8 +71,10 @@ class GraspNetPlanner:
             pixels, _ = project(ends, frame.K, frame.T_WC)
             return np.maximum(quality_between(maps, *scaling.pixels(pixels)), LEAST)
 
+        if knows_centres:
+            heights = labelled_by_centres(heights, frame, scaling, maps[3][0].numpy())
         found = search(heights, self.gripper, self.workspace, self.settings, value)
-        found = found.distinct(self.settings.returned, 0.01, np.deg2rad(20))
+        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
         return found.grasps(self.gripper)
 
 

@@ -89,7 +89,7 @@ class HeuristicPlanner:
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         heights = height_map_from_frame(frame, self.workspace)
         found = search(heights, self.gripper, self.workspace, self.settings)
-        found = found.distinct(self.settings.returned, 0.01, np.deg2rad(20))
+        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
         return found.grasps(self.gripper)
 
 
@@ -128,7 +128,8 @@ class OraclePlanner:
         buried = buried_share(frame.truth, heights)
         # Antipodal ones first; if there is none, the best of the rest, by the map's measure.
         found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
-        found = found.best(len(found)).distinct(self.settings.returned, 0.01, np.deg2rad(20))
+        found = found.best(len(found))
+        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
         return found.grasps(self.gripper)
 
 

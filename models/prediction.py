@@ -91,15 +91,18 @@ def predict(
     )
 
 
-def scaled_maps(model: GraspNet, metres_per_pixel: float, frame: RGBDFrame) -> tuple:
-    """The scaling to the training's pixels, and the network's three maps there."""
+def scaled_maps(
+    model: GraspNet, metres_per_pixel: float, frame: RGBDFrame, centres: bool = False
+) -> tuple[PixelScaling, tuple[torch.Tensor, ...]]:
+    """The scaling to the training's pixels, and the network's three maps there; with `centres` a
+    fourth one, of the centre head."""
     if model.input_channels != INPUT_CHANNELS:
         raise UserError(
             f"the network takes {model.input_channels} channels; an RGB-D image has "
             f"{INPUT_CHANNELS}"
         )
     scaling = training_scale(frame, metres_per_pixel)
-    return scaling, run_network(model, frame, scaling)
+    return scaling, run_network(model, frame, scaling, centres)
 
 
 def grasps_in_maps(
@@ -158,12 +161,12 @@ def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
 
 @torch.no_grad()
 def run_network(
-    model: GraspNet, frame: RGBDFrame, scaling: PixelScaling
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """GraspNet's three maps of the scaled image, on the CPU."""
+    model: GraspNet, frame: RGBDFrame, scaling: PixelScaling, centres: bool = False
+) -> tuple[torch.Tensor, ...]:
+    """GraspNet's three maps of the scaled image, with `centres` four, on the CPU."""
     depth = scaling.image(fill_holes(frame.depth))
     image = to_input(scaling.image(frame.rgb), depth)
     device = next(model.parameters()).device
     model.eval()
-    quality, angle, width = model(image[None].to(device))
-    return quality.float().cpu(), angle.float().cpu(), width.float().cpu()
+    maps = model(image[None].to(device), centres=centres)
+    return tuple(part.float().cpu() for part in maps)

@@ -230,3 +230,24 @@ def test_colour_jitter_moves_colours_only():
 def test_wrong_shapes_are_refused(wrong):
     with pytest.raises(ValueError, match="LabelledImage"):
         replace(labelled(), **wrong)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("turn, scale, shift", [(0.0, 1.0, (4.0, -3.0)), (0.7, 1.2, (2.0, 5.0))])
+def test_centres_go_where_their_object_goes(turn, scale, shift, mirror):
+    """By hand: from the middle (30, 30), first mirrored, then turned clockwise and scaled."""
+    image = labelled()
+    centre = torch.full((2, SIZE, SIZE), torch.nan)
+    centre[:, 20:25, 36:45] = torch.tensor([40.0, 22.0])[:, None, None]
+    image = replace(image, centre=centre)
+    found = apply_similarity(image, Similarity(turn, shift, scale, mirror)).centre
+    du, dv = -10.0 if mirror else 10.0, -8.0
+    c, s = np.cos(turn), np.sin(turn)
+    expected = 30 + scale * (c * du - s * dv) + shift[0], 30 + scale * (s * du + c * dv) + shift[1]
+    on = found[0].isfinite()
+    assert on.sum() == pytest.approx(45 * scale**2, rel=0.2)
+    assert found[0][on].numpy() == pytest.approx(expected[0], abs=1e-4)
+    assert found[1][on].numpy() == pytest.approx(expected[1], abs=1e-4)
+    # The object's own middle lies there, whatever was done to it.
+    v, u = torch.nonzero(on, as_tuple=True)
+    assert (float(u.float().mean()), float(v.float().mean())) == pytest.approx(expected, abs=0.7)

@@ -33,22 +33,25 @@ from envs.objects import ObjectError
 from envs.scenes import SceneError
 from utils.config import load_config
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, SceneGeometry
+from utils.geometry import GripperGeometry, SceneGeometry, SolidObject
 from utils.grasp_data import LabelledFrame, SimulatedDataset, read_trials, shard_path, write_shard
 from utils.grasp_labels import GraspLabels, LabelSettings
 from utils.label_trials import Trial, draw_pairs, label_truth
-from utils.transforms import RGBDFrame, look_at
+from utils.transforms import RGBDFrame, look_at, project
 
 SHAPE = (5, 7)
 OVERHEAD = look_at((0.5, 0.0, 0.8), (0.5, 0.0, 0.0), (1, 0, 0))
 
 
 def made_up(rng: np.random.Generator, T_WC: np.ndarray = OVERHEAD) -> LabelledFrame:
+    things = [SolidObject((), rng.uniform(-0.1, 0.1, 3), 0.5) for _ in range(rng.integers(1, 4))]
     frame = RGBDFrame(
         rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8),
         rng.uniform(0, 3.2, SHAPE).astype(np.float32),
         rng.uniform(0, 500, (3, 3)),
         T_WC,
+        rng.integers(-2, len(things), SHAPE).astype(np.int32),
+        SceneGeometry(tuple(things)),
     )
     frame.depth[0, 0] = 0  # unknown
     quality = rng.uniform(0, 1, (18, *SHAPE)).astype(np.float32)
@@ -89,6 +92,15 @@ def test_what_is_stored_comes_back_to_half_a_unit(stored):
         assert image.depth[0, 0] == 0 and (image.quality[0] == 0).all()
         K, T_WC = images.cameras[index]
         assert np.array_equal(K, given.frame.K) and np.array_equal(T_WC, given.frame.T_WC)
+        for row, column in np.ndindex(SHAPE):
+            number = given.frame.segmentation[row, column]
+            u, v = image.centre[:, row, column].tolist()
+            if number < 0:
+                assert np.isnan(u) and np.isnan(v)
+            else:
+                centre = given.frame.truth.objects[number].centre_of_mass
+                expected, _ = project(centre, K, T_WC)
+                assert (u, v) == pytest.approx(tuple(expected), abs=1e-3)
     assert images.scenes == ["pile box 7"] * 4
     assert read_trials(folder) == 2 * trials
 

@@ -206,6 +206,32 @@ def test_loss_against_numpy() -> None:
     assert float(total) == pytest.approx(2 * sums[0] + 3 * sums[1] + 5 * sums[2], rel=1e-5)
 
 
+def test_centres_cost_what_leads_wrong_on_objects_alone() -> None:
+    """By hand: 3 + 4 pixels off at one pixel of two, nothing at the other: 3.5 on average."""
+    quality, width, _ = random_labels(batch=1, size=(1, 3))
+    offset = torch.tensor([[10.0, -2.0, torch.nan], [0.0, 5.0, torch.nan]]).reshape(1, 2, 1, 3)
+    targets = targets_from_labels(quality, width, offset=offset)
+    assert targets.on_object.flatten().tolist() == [1, 1, 0]
+    said = offset.nan_to_num(99.0) + torch.tensor([[3.0, 0, 0], [-4.0, 0, 0]]).reshape(1, 2, 1, 3)
+    maps = torch.zeros(1, 1, 1, 3), torch.zeros(1, BINS, 1, 3), targets.width
+    without, _ = GraspLoss(centre_weight=0.2)(*maps, targets)
+    total, parts = GraspLoss(centre_weight=0.2)(*maps, targets, said)
+    assert float(parts["centre_loss"]) == pytest.approx(3.5)
+    assert float(total - without) == pytest.approx(0.7, rel=1e-5)
+    # Images of which no centre is known teach the head nothing.
+    _, parts = GraspLoss()(*maps, targets_from_labels(quality, width), said)
+    assert float(parts["centre_loss"]) == 0
+
+
+def test_the_centre_head_is_a_fourth_map_when_asked_for() -> None:
+    model = create_model(name="ggcnn", centre_head=True)
+    assert GraspNet(**model.model_args).centre_head is not None
+    x = torch.randn(2, 4, 24, 36)
+    assert [tuple(m.shape) for m in model(x, centres=True)][3:] == [(2, 2, 24, 36)]
+    assert len(model(x)) == 3
+    assert create_model(name="ggcnn").centre_head is None
+
+
 def test_logits_that_say_nothing_cost_ln_18_and_ln_2() -> None:
     targets = targets_from_labels(*random_labels())
     _, parts = GraspLoss()(

@@ -7,6 +7,7 @@ import torch
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_planner import GraspNetPlanner, quality_between
 from tests.test_geometry import boxes_frame
+from tests.test_instances import TOUCHING, true_offset
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import RGBDFrame, angle_difference, project
 
@@ -18,14 +19,14 @@ class Opinion(torch.nn.Module):
     """A network that says the same of every image of a size: quality `best` in a disc around one
     pixel and `elsewhere` otherwise."""
 
-    input_channels, num_angle_bins = 4, 18
+    input_channels, num_angle_bins, centre_head = 4, 18, None
 
     def __init__(self, pixel=(0.0, 0.0), best=0.9, elsewhere=0.0, radius=12):
         super().__init__()
         self.pixel, self.best, self.elsewhere, self.radius = pixel, best, elsewhere, radius
         self.device = torch.nn.Parameter(torch.zeros(1))  # parameters tell where a network is
 
-    def forward(self, image):
+    def forward(self, image, centres=False):
         height, width = image.shape[-2:]
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         near = (u - self.pixel[0]) ** 2 + (v - self.pixel[1]) ** 2 < self.radius**2
@@ -94,3 +95,27 @@ def test_quality_between_two_pixels_is_that_of_their_angle() -> None:
         middle = np.array([[30.0, 20.0]])
         found = quality_between(maps, middle - step, middle + step)
         assert found == pytest.approx([expected], abs=1e-3)
+
+
+class KnowsCentres(Opinion):
+    """An opinion that is the same everywhere, and a centre head that says `offset` (2, H, W)."""
+
+    def __init__(self, offset: np.ndarray):
+        super().__init__(best=0.9, elsewhere=0.9)
+        self.offset, self.centre_head = torch.from_numpy(offset)[None], True
+
+    def forward(self, image, centres=False):
+        maps = super().forward(image)
+        return (*maps, self.offset) if centres else maps
+
+
+def test_two_things_that_touch_are_not_grasped_as_one() -> None:
+    """Blocks side by side, a piece of 4 cm x 6 cm by height alone: the best grasp of it is in the
+    middle, half on one and half on the other."""
+    frame = boxes_frame(TOUCHING)
+    as_one = plan(frame, Opinion(best=0.9, elsewhere=0.9))[0]
+    found = plan(frame, KnowsCentres(true_offset(frame)))
+    assert abs(as_one.position[1]) < 0.004, "otherwise this test shows nothing"
+    assert abs(abs(found[0].position[1]) - 0.015) < 0.004
+    for grasp in (g for g in found if g.quality > 0.3 * found[0].quality):
+        assert np.rad2deg(angle_difference(grasp.angle, 0.0)) < 20, "along the line of contact"
