@@ -257,7 +257,7 @@ class Watched(gymnasium.Wrapper):
             result = call()
         except UserError as error:
             raise UserError(f"environment {self._index}: {error}") from None
-        except Exception:
+        except Exception:  # whatever the environment of a user raises: told with its traceback
             raise WorkerError(
                 f"environment {self._index} raised an error:\n{traceback.format_exc()}"
             ) from None

@@ -21,7 +21,7 @@ from models.backbones import BACKBONES
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings, grasp_below_surface
-from utils.transforms import Grasp, ImageGrasp
+from utils.transforms import Grasp, ImageGrasp, known_depth
 
 # --- From an image to the input ------------------------------------------------------------
 
@@ -42,7 +42,7 @@ def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
     """
     median = check_rgbd(rgb, depth)
     filled = fill_holes(depth)
-    if not _known(depth).all():
+    if not known_depth(depth).all():
         median = float(np.median(filled))
     centred = np.clip(filled - median, -DEPTH_LIMIT, DEPTH_LIMIT) / DEPTH_UNIT
     image = np.empty((INPUT_CHANNELS, *depth.shape), np.float32)
@@ -67,7 +67,7 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
             f"rgb and depth differ in size: {rgb.shape[1]}x{rgb.shape[0]} and "
             f"{depth.shape[1]}x{depth.shape[0]} pixels; register the depth to the colour image"
         )
-    known = depth[_known(depth)]
+    known = depth[known_depth(depth)]
     if len(known) == 0:
         raise UserError("depth: no pixel is known; all are zero, negative or NaN")
     typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
@@ -82,7 +82,7 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
 def fill_holes(depth: np.ndarray) -> np.ndarray:
     """(H, W) float32 depth whose unknown pixels take the value of the nearest known one."""
     depth = np.asarray(depth, np.float32)
-    known = _known(depth)
+    known = known_depth(depth)
     if known.all() or not known.any():
         return depth
     _, label = cv2.distanceTransformWithLabels(
@@ -91,10 +91,6 @@ def fill_holes(depth: np.ndarray) -> np.ndarray:
     value = np.zeros(label.max() + 1, np.float32)
     value[label[known]] = depth[known]
     return value[label]
-
-
-def _known(depth: np.ndarray) -> np.ndarray:
-    return np.isfinite(depth) & (depth > 0)
 
 
 # --- The network ---------------------------------------------------------------------------
@@ -495,7 +491,7 @@ def surface_depth(depth: np.ndarray, pixels: np.ndarray, radius: int = 1) -> np.
     v = np.clip(v[:, None] + step, 0, rows - 1)[:, :, None]
     u = np.clip(u[:, None] + step, 0, columns - 1)[:, None, :]
     window = depth[v, u].reshape(len(u), len(step) ** 2).astype(float)
-    known = _known(window)
+    known = known_depth(window)
     ordered = np.sort(np.where(known, window, np.inf), axis=1)
     middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
     median = ordered[np.arange(len(ordered)), middle]

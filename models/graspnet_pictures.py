@@ -14,6 +14,7 @@ from models.grasp_examples import LabelledImages
 from models.graspnet import GraspNet, PeakSettings, find_peaks
 from models.graspnet_scores import predict
 from utils.files import write_atomic
+from utils.transforms import known_depth
 
 SHOWN = PeakSettings(threshold=0.3, count=5)
 
@@ -50,7 +51,7 @@ def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count:
         quality, angle, width = predict(model, image)
         depth = image.depth.numpy()
         row[0].imshow(image.rgb.permute(1, 2, 0))
-        known = depth[depth > 0]
+        known = depth[known_depth(depth)]
         row[1].imshow(depth, cmap="gray", vmin=known.min(), vmax=known.max())
         row[2].imshow(image.quality.amax(dim=0), vmin=0, vmax=1)
         row[3].imshow(torch.squeeze(quality).float().cpu(), vmin=0, vmax=1)

@@ -169,7 +169,7 @@ def test_holes_count_as_the_near_surface_beside_them() -> None:
     depth[:, 10:] = 0.7
     depth[5:8, 8:12] = 0.0  # over the edge
     depth[15, 2] = np.nan  # within the table
-    filled = near_side(depth)
+    filled = near_side(depth, 16)
     assert (filled[5:8, 8:12] == np.float32(0.7)).all()
     assert filled[15, 2] == np.float32(0.8)
     known = depth > 0
@@ -178,9 +178,9 @@ def test_holes_count_as_the_near_surface_beside_them() -> None:
     depth[5:8, 19] = 0.6
     assert (near_side(depth, reach=9)[5:8, 10:19] == np.float32(0.6)).all()
     assert near_side(depth, reach=9)[6, 5] == np.float32(0.7)
-    assert (near_side(np.zeros((20, 20), np.float32)) == 0).all()
+    assert (near_side(np.zeros((20, 20), np.float32), 16) == 0).all()
     clean = np.full((4, 4), 0.5, np.float32)
-    assert near_side(clean) is clean
+    assert near_side(clean, 16) is clean
 
 
 def test_a_hole_at_an_edge_does_not_lower_the_map() -> None:

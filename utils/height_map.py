@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
-from utils.transforms import RGBDFrame, deproject
+from utils.transforms import RGBDFrame, deproject, known_depth
 
 # Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
 # this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
+HOLE_REACH = 0.0285  # m from a hole's rim to its middle, up to which it is filled
 WALL = 0.05  # m, over all that is known: what counts as standing in a hole too wide to fill
 
 
@@ -80,8 +81,11 @@ def height_map_from_frame(
     is bounded a little higher. Labels are the pieces between height discontinuities; their centres
     are volume centroids of the columns between the table and the visible surface.
     """
-    measured = frame.depth > 0
-    frame = replace(frame, depth=near_side(frame.depth))
+    measured = known_depth(frame.depth)
+    if not measured.all():
+        metres_per_pixel = np.median(frame.depth[measured]) / frame.K[0, 0] if measured.any() else 1
+        reach = max(1, round(HOLE_REACH / metres_per_pixel))
+        frame = replace(frame, depth=near_side(frame.depth, reach))
     grid, origin = grid_points(workspace, margin, cell)
     seen = _highest(_surface_points(frame, origin, cell), grid.shape[:2])
     hidden = ~np.isfinite(seen)
@@ -107,7 +111,7 @@ def height_map_from_frame(
     return HeightMap(height, np.maximum(ceiling, height), label, centres, origin, cell, table)
 
 
-def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
+def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
     """(H, W) depth whose unknown pixels take the nearest surface around their hole, up to `reach`
     pixels away through the hole.
 
@@ -115,7 +119,7 @@ def near_side(depth: np.ndarray, reach: int = 16) -> np.ndarray:
     that took such a hole for table would come down on them. Wider holes, whose middle is out of
     reach, stay 0: a black thing may fill them.
     """
-    unknown = ~(depth > 0)
+    unknown = ~known_depth(depth)
     if not unknown.any():
         return depth
     far = np.float32(np.finfo(np.float32).max)
@@ -230,7 +234,7 @@ def _surface_points(
     gaps in a 2 mm grid. Without a depth, z is -inf.
     """
     depth = frame.depth.astype(float)
-    unknown = ~((depth > 0) & np.isfinite(depth))
+    unknown = ~known_depth(depth)
     depth[unknown] = 0
     to_cells = np.diag([1 / cell, 1 / cell, 1.0])
     start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
@@ -251,7 +255,7 @@ def _table_points(
     frame: RGBDFrame, table: float, origin: np.ndarray, cell: float
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """As `_surface_points`, where the rays of pixels without a depth meet the table."""
-    unknown = ~(frame.depth > 0)
+    unknown = ~known_depth(frame.depth)
     if not unknown.any():
         return iter(())
     v, u = np.mgrid[: unknown.shape[0], : unknown.shape[1]]

@@ -19,6 +19,7 @@ from scipy import ndimage
 from utils.errors import UserError, unknown_choice
 from utils.image_files import open_image
 from utils.rectangles import GraspRectangle, rectangles_from_corners
+from utils.transforms import known_depth
 
 MIN_DEPTH, MAX_DEPTH = 0.3, 10.0  # m: outside, a pixel is a hole; a whole image, a unit error
 IMAGES_PER_OBJECT = 4  # Cornell's usual number of consecutive images of one object
@@ -209,7 +210,7 @@ def _read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray
         raise UserError(f"{depth_file}: need one channel of depth, got shape {depth.shape}")
     if depth.shape != rgb.shape[:2]:
         raise UserError(f"{depth_file}: {_size(depth)}, but {rgb_file.name} is {_size(rgb)}")
-    known = depth[np.isfinite(depth) & (depth > 0)]
+    known = depth[known_depth(depth)]
     if known.size == 0:
         raise UserError(f"{depth_file}: every depth is zero, negative or NaN")
     if not MIN_DEPTH <= np.median(known) <= MAX_DEPTH:

@@ -6,6 +6,7 @@ the frames.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from math import exp, sqrt
 from typing import NamedTuple
@@ -49,7 +50,7 @@ class ServoStep(NamedTuple):
     gain: float
 
 
-class VisualServo:
+class VisualServo(ABC):
     """What the three laws share: gain, smooth start, limits, the loop, and the arm behind it.
 
     A law only says, in `_correct`, which displacement would null the error at once.
@@ -214,9 +215,9 @@ class VisualServo:
             raise PointError(f"point: not finite: {(u, v)}")
         return points_from_depths(xy, check_depths(Z, 1))[0]
 
+    @abstractmethod
     def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
         """Error (m,), L^+ error (6,), condition number of L."""
-        raise NotImplementedError
 
     def _goal_xy(self, points) -> np.ndarray:
         """Normalised coordinates of the goal's points: checked once, not in every step."""

@@ -77,7 +77,8 @@ class ImageGrasp:
 class RGBDFrame:
     """What a camera saw, with everything needed to turn a pixel into a point.
 
-    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; 0 means unknown.
+    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; `known_depth`
+        tells where it is known.
     K: (3, 3) pinhole matrix in pixels. T_WC: (4, 4) camera pose in the world.
     segmentation: (H, W) int32, the index of the object seen at each pixel in scene order, -1 for
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
@@ -96,12 +97,17 @@ class RGBDFrame:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
         height, width = self.depth.shape
         v, u = np.mgrid[0:height, 0:width]
-        depth = np.where(self.depth > 0, self.depth, np.nan).astype(float)
+        depth = np.where(known_depth(self.depth), self.depth, np.nan).astype(float)
         return deproject(np.stack([u, v], axis=-1), depth, self.K, self.T_WC)
 
     def without_truth(self) -> RGBDFrame:
         """The same frame as an unprivileged planner may see it."""
         return replace(self, segmentation=None, truth=None)
+
+
+def known_depth(depth: np.ndarray) -> np.ndarray:
+    """(...) bool, where a depth image was measured: 0, negative and not finite mean unknown."""
+    return np.isfinite(depth) & (depth > 0)
 
 
 def wrap_to_pi_range(angle: float) -> float:
