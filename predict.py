@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
     out = options.out or Path("runs/predict") / options.rgb.stem
-    check_output(out)
+    check_output(out, None if options.out else options.rgb)
     seen = read_image(options)
     training_scale(seen, saved.metres_per_pixel)  # tells wrong units before a table is looked for
     table = locate_table(seen, options)
@@ -91,8 +91,9 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")
     options = parser.parse_args(argv)
     image = [options.rgb, options.depth, options.intrinsics]
-    if options.export is not None and any(part is not None for part in image):
-        raise UserError("--export writes the network and takes no image; run them one by one")
+    others = [*image, options.depth_scale, options.camera_pose, options.table_height, options.out]
+    if options.export is not None and any(part is not None for part in others):
+        raise UserError("--export writes the network and takes only --checkpoint beside it")
     if options.export is None and any(part is None for part in image):
         raise UserError("--rgb, --depth and --intrinsics are needed (or --export FILE.onnx)")
     if options.count < 1:
@@ -105,8 +106,9 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def check_output(folder: Path) -> None:
-    """Raise UserError where the results would overwrite what this program did not write."""
+def check_output(folder: Path, rgb: Path | None) -> None:
+    """Raise UserError where the results would overwrite what this program did not write, or, where
+    the user did not choose the folder, the results of another image than `rgb` of the same name."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"--out {folder}: exists and is no folder")
     for path, ours in (
@@ -115,6 +117,11 @@ def check_output(folder: Path) -> None:
     ):
         if path.exists() and not ours(path):
             raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
+    told = folder / "grasps.json"
+    if rgb is not None and told.exists():
+        before = json.loads(told.read_text(encoding="utf-8"))["rgb"]
+        if before != str(rgb):
+            raise UserError(f"{told}: holds the grasps of {before}; give --out FOLDER for {rgb}")
 
 
 def write(path: Path, content: str | bytes) -> None:

@@ -3,6 +3,9 @@
 The twin has no physics of its own; it copies the poses of the cell that it shows. To see a scene:
 
     python -m envs.studio --objects primitives --layout pile --output scene.png seed=3
+    python -m envs.studio --layout packed --rgbd scene      # also what the cell's camera sees
+
+`--rgbd` leaves color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py takes them.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from envs.objects import load_object_set
 from envs.panda import ARM, FINGERS
 from envs.scenes import LAYOUTS, make_scene
 from utils.config import parse_args, run_script
-from utils.transforms import look_at
+from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
@@ -87,13 +90,22 @@ class Film:
             imageio.mimwrite(path, self._pictures, fps=speed * self._rate, quality=6)
 
 
+def write_rgbd(frame: RGBDFrame, folder: Path) -> None:
+    """color.png, depth.png in millimetres and T_WC.txt of a frame."""
+    folder.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(folder / "color.png", frame.rgb)
+    imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
+    np.savetxt(folder / "T_WC.txt", frame.T_WC)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    """Write a picture of one scene."""
+    """Write a picture of one scene, and what the cell's camera sees of it."""
 
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--output", type=Path, default="scene.png", help="PNG or JPEG file")
         parser.add_argument("--objects", default="primitives", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
+        parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
     objects = load_object_set(
@@ -103,7 +115,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         cell.load(make_scene(chosen.layout, objects, config.seed, config))
         with Studio(cell) as studio:
             imageio.imwrite(chosen.output, studio.picture())
-    print(f"wrote {chosen.output}")
+        print(f"wrote {chosen.output}")
+        if chosen.rgbd is not None:
+            frame, folder = cell.frame(), chosen.rgbd
+            write_rgbd(frame, folder)
+            numbers = " ".join(f"{frame.K[i]:.6g}" for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            print(
+                f"python predict.py --rgb {folder / 'color.png'} --depth {folder / 'depth.png'} "
+                f"--intrinsics {numbers} --camera-pose {folder / 'T_WC.txt'}"
+            )
 
 
 if __name__ == "__main__":

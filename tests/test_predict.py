@@ -24,6 +24,7 @@ import predict
 from envs.camera import Intrinsics
 from envs.cell import Cell
 from envs.scenes import Placement, Scene
+from envs.studio import write_rgbd
 from models import backbones, prediction
 from models.graspnet import GraspNet
 from models.graspnet_export import OUTPUTS, export_onnx
@@ -626,7 +627,7 @@ def options(**changes):
         (other_json, "was not written by predict.py"),
         (other_picture, "was not written by predict.py"),
         (out_is_a_file, "no folder"),
-        (options(export="x.onnx"), "takes no image"),
+        (options(export="x.onnx"), "takes only --checkpoint"),
     ],
 )
 def test_bad_input_is_one_sentence_and_writes_nothing(files, capsys, spoil, message):
@@ -638,6 +639,28 @@ def test_bad_input_is_one_sentence_and_writes_nothing(files, capsys, spoil, mess
     assert capsys.readouterr().out == ""
     after = {path: path.read_bytes() for path in files.folder.rglob("*") if path.is_file()}
     assert after == before
+
+
+def test_images_of_one_name_do_not_overwrite_each_other(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = files.command(out=None)
+    assert predict.main(command) == 0
+    told = tmp_path / "runs" / "predict" / "rgb" / "grasps.json"
+    before = told.read_bytes()
+    assert predict.main(command) == 0, "the same image again is no other one"
+    (files.folder / "second").mkdir()
+    other = files.folder / "second" / "rgb.png"
+    other.write_bytes((files.folder / "rgb.png").read_bytes())
+    with pytest.raises(UserError, match="holds the grasps of .*rgb.png; give --out"):
+        predict.main(files.command(out=None, rgb=other))
+    assert told.read_bytes() == before
+
+
+def test_what_the_studio_leaves_is_what_predict_takes(files, tmp_path, capsys):
+    write_rgbd(files.frame, tmp_path / "studio")
+    color, depth, pose = (tmp_path / "studio" / n for n in ("color.png", "depth.png", "T_WC.txt"))
+    theirs = files.run(capsys, rgb=color, depth=depth, camera_pose=pose)
+    assert theirs["grasps"] == files.run(capsys)["grasps"]
 
 
 def test_a_bad_input_ends_with_status_2():

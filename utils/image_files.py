@@ -56,7 +56,7 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     """
     if scale is not None and not 0 < scale < np.inf:
         raise UserError(f"--depth-scale: got {scale:g}, expected a positive number such as 0.001")
-    values = _load_array(path) if path.suffix == ".npy" else np.asarray(open_image(path))
+    values = _load_array(path) if path.suffix.lower() == ".npy" else np.asarray(open_image(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2:
@@ -145,11 +145,12 @@ def _load_array(path: Path) -> np.ndarray:
 
 def _pose_numbers(path: Path) -> np.ndarray:
     try:
-        if path.suffix == ".npy":
+        suffix = path.suffix.lower()
+        if suffix == ".npy":
             return np.asarray(_load_array(path), dtype=float)
         text = path.read_text(encoding="utf-8")
-        if path.suffix in (".json", ".yaml", ".yml"):
-            content: Any = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        if suffix in (".json", ".yaml", ".yml"):
+            content: Any = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
             if isinstance(content, dict):
                 if "T_WC" not in content:
                     raise UserError(f"{path}: has no entry T_WC")
