@@ -20,6 +20,7 @@ from models.candidates import Candidates
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.instances import labelled_by_centres
 from models.prediction import scaled_maps
+from utils.depth_holes import table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame
 from utils.transforms import Grasp, RGBDFrame, project
@@ -60,6 +61,7 @@ class GraspNetPlanner:
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel, *_ = self.network
+        frame = table_in_holes(frame, self.workspace.table_height)
         knows_centres = model.centre_head is not None
         scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
         heights = height_map_from_frame(frame, self.workspace)

@@ -17,7 +17,7 @@ from utils.geometry import (
     Workspace,
     intersect_lines,
 )
-from utils.height_map import HOLE_RISE, height_map_from_frame, height_map_from_scene, near_side
+from utils.height_map import HOLE_RISE, height_map_from_frame, height_map_from_scene
 from utils.transforms import RGBDFrame, look_at, pose_matrix, project
 
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -162,25 +162,6 @@ def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None
     assert len(x) and x.min() > 0.579 and x.max() < 0.631
     centre_row = heights.index(np.array([0.6, 0.0]))[0]
     assert x[rows == centre_row].min() > 0.618 and x[rows == centre_row].max() > 0.624
-
-
-def test_holes_count_as_the_near_surface_beside_them() -> None:
-    depth = np.full((20, 20), 0.8, np.float32)
-    depth[:, 10:] = 0.7
-    depth[5:8, 8:12] = 0.0  # over the edge
-    depth[15, 2] = np.nan  # within the table
-    filled = near_side(depth, 16)
-    assert (filled[5:8, 8:12] == np.float32(0.7)).all()
-    assert filled[15, 2] == np.float32(0.8)
-    known = depth > 0
-    np.testing.assert_array_equal(filled[known], depth[known])
-    depth[5:8] = 0.0  # a hole takes the nearest surface around it as far as it reaches
-    depth[5:8, 19] = 0.6
-    assert (near_side(depth, reach=9)[5:8, 10:19] == np.float32(0.6)).all()
-    assert near_side(depth, reach=9)[6, 5] == np.float32(0.7)
-    assert (near_side(np.zeros((20, 20), np.float32), 16) == 0).all()
-    clean = np.full((4, 4), 0.5, np.float32)
-    assert near_side(clean, 16) is clean
 
 
 def test_a_hole_at_an_edge_does_not_lower_the_map() -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from utils.depth_holes import depth_of_plane, near_side
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
 
@@ -109,26 +110,6 @@ def height_map_from_frame(
     )
     height = np.where(unknown, height.max() + WALL, height)
     return HeightMap(height, np.maximum(ceiling, height), label, centres, origin, cell, table)
-
-
-def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
-    """(H, W) depth whose unknown pixels take the nearest surface around their hole, up to `reach`
-    pixels away through the hole.
-
-    Depth cameras lose pixels at the edges of whatever stands up, and thin parts whole; a finger
-    that took such a hole for table would come down on them. Wider holes, whose middle is out of
-    reach, stay 0: a black thing may fill them.
-    """
-    unknown = ~known_depth(depth)
-    if not unknown.any():
-        return depth
-    far = np.float32(np.finfo(np.float32).max)
-    known = nearest = np.where(unknown, far, depth).astype(np.float32)
-    for _ in range(reach):
-        nearest = np.where(unknown, cv2.erode(nearest, np.ones((3, 3), np.uint8)), known)
-    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    wide = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-    return np.where((nearest < far) & ~wide, nearest, np.float32(0))
 
 
 def height_map_from_scene(
@@ -258,11 +239,8 @@ def _table_points(
     unknown = ~known_depth(frame.depth)
     if not unknown.any():
         return iter(())
-    v, u = np.mgrid[: unknown.shape[0], : unknown.shape[1]]
-    along = deproject(np.stack([u, v], axis=-1), np.ones(unknown.shape), frame.K, frame.T_WC)
-    with np.errstate(divide="ignore"):
-        reach = (table - frame.T_WC[2, 3]) / (along[..., 2] - frame.T_WC[2, 3])
-    return _surface_points(replace(frame, depth=np.where(unknown, reach, 0)), origin, cell)
+    depth = np.where(unknown, depth_of_plane(frame, table), 0)
+    return _surface_points(replace(frame, depth=depth), origin, cell)
 
 
 def _grazing_points(
