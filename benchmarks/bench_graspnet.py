@@ -23,14 +23,8 @@ from envs.cell import Cell
 from envs.objects import load_object_set
 from envs.scenes import LAYOUTS, make_scene
 from models.backbones import BACKBONES
-from models.graspnet import (
-    GraspNet,
-    PeakSettings,
-    create_model,
-    decode_grasps,
-    find_peaks,
-    to_input,
-)
+from models.grasp_peaks import PeakSettings, decode_grasps, find_peaks
+from models.graspnet import GraspNet, create_model, to_input
 from models.graspnet_io import (
     SHIPPED,
     SavedGraspNet,

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from models.grasp_examples import LabelledImages
-from models.graspnet import GraspNet, PeakSettings, find_peaks
+from models.grasp_peaks import PeakSettings, find_peaks
+from models.graspnet import GraspNet
 from models.graspnet_scores import predict
 from utils.files import write_atomic
 from utils.transforms import known_depth

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from models.grasp_examples import LabelledImages
-from models.graspnet import GraspNet, Peaks, PeakSettings, find_peaks, to_input
+from models.grasp_peaks import Peaks, PeakSettings, find_peaks
+from models.graspnet import GraspNet, to_input
 from utils.augmentation import LabelledImage
 from utils.errors import UserError
 from utils.grasp_labels import LabelSettings

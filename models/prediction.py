@@ -12,19 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from models.graspnet import (
-    INPUT_CHANNELS,
-    LABELS,
-    PANDA_HAND,
-    GraspNet,
-    Peaks,
-    PeakSettings,
-    check_rgbd,
-    fill_holes,
-    find_peaks,
-    surface_grasps,
-    to_input,
-)
+from models.grasp_peaks import LABELS, PANDA_HAND, Peaks, PeakSettings, find_peaks, surface_grasps
+from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, fill_holes, to_input
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings, grasp_below_surface

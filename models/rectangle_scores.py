@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from models.graspnet import GraspNet, PeakSettings, find_peaks, to_input
+from models.grasp_peaks import PeakSettings, find_peaks
+from models.graspnet import GraspNet, to_input
 from models.rectangle_examples import View
 from utils.real_data import RealSample
 from utils.rectangles import GraspRectangle, intersection_over_union, rectangle_match

@@ -14,7 +14,8 @@ import torch
 from torch.utils.data import Dataset
 
 from models.grasp_examples import AtPixelSize, GraspExamples, LabelledImages
-from models.graspnet import PANDA_HAND, GraspNet
+from models.grasp_peaks import PANDA_HAND
+from models.graspnet import GraspNet
 from models.graspnet_scores import score_labels
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config

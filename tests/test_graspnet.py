@@ -6,16 +6,13 @@ import pytest
 import torch
 
 from models.backbones import BACKBONES, GGCNNBackbone, GRConvNetBackbone
+from models.grasp_peaks import PeakSettings, decode_grasps, find_peaks, surface_depth
 from models.graspnet import (
     GraspLoss,
     GraspNet,
-    PeakSettings,
     create_model,
-    decode_grasps,
     fill_holes,
-    find_peaks,
     main,
-    surface_depth,
     targets_from_labels,
     to_input,
 )

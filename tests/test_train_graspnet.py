@@ -21,7 +21,8 @@ from torch import nn
 
 import train_graspnet
 from models.grasp_examples import AtPixelSize, EpochBatches, GraspExamples
-from models.graspnet import Peaks, create_model
+from models.grasp_peaks import Peaks
+from models.graspnet import create_model
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores, check_graspable, score_labels, score_peak
 from models.graspnet_training import (
