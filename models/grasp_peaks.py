@@ -1,4 +1,4 @@
-"""From a network's maps of one image to ranked grasps: peaks of the quality and what belongs to them.
+"""From a network's maps of one image to ranked grasps: peaks of its quality, and what is there.
 
 Angles on the image are those of the closing line from +u (right) towards +v (down), modulo pi; bin
 k of K is centred at k * 180 / K degrees. Widths are metres. This module knows no simulator and not
