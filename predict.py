@@ -87,15 +87,17 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
     )
-    parser.add_argument("--count", type=int, metavar="N", default=20, help="most grasps told")
+    parser.add_argument("--count", type=int, metavar="N", help="most grasps told; 20")
     parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")
     options = parser.parse_args(argv)
     image = [options.rgb, options.depth, options.intrinsics]
-    others = [*image, options.depth_scale, options.camera_pose, options.table_height, options.out]
+    others = [options.depth_scale, options.camera_pose, options.table_height, options.out]
+    others += [*image, options.count]
     if options.export is not None and any(part is not None for part in others):
         raise UserError("--export writes the network and takes only --checkpoint beside it")
     if options.export is None and any(part is None for part in image):
         raise UserError("--rgb, --depth and --intrinsics are needed (or --export FILE.onnx)")
+    options.count = 20 if options.count is None else options.count
     if options.count < 1:
         raise UserError(f"--count: got {options.count}, expected at least 1")
     if options.table_height is not None:
@@ -111,17 +113,13 @@ def check_output(folder: Path, rgb: Path | None) -> None:
     the user did not choose the folder, the results of another image than `rgb` of the same name."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"--out {folder}: exists and is no folder")
-    for path, ours in (
-        (folder / "grasps.json", is_our_json),
-        (folder / "grasps.png", is_prediction_panel),
-    ):
-        if path.exists() and not ours(path):
+    told, drawn = folder / "grasps.json", folder / "grasps.png"
+    before = our_json(told) if told.exists() else None
+    for path, ours in ((told, before is not None), (drawn, is_prediction_panel(drawn))):
+        if path.exists() and not ours:
             raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
-    told = folder / "grasps.json"
-    if rgb is not None and told.exists():
-        before = json.loads(told.read_text(encoding="utf-8"))["rgb"]
-        if before != str(rgb):
-            raise UserError(f"{told}: holds the grasps of {before}; give --out FOLDER for {rgb}")
+    if rgb is not None and before is not None and Path(before["rgb"]).resolve() != rgb.resolve():
+        raise UserError(f"{told}: holds the grasps of {before['rgb']}; give --out FOLDER for {rgb}")
 
 
 def write(path: Path, content: str | bytes) -> None:
@@ -131,12 +129,14 @@ def write(path: Path, content: str | bytes) -> None:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def is_our_json(path: Path) -> bool:
+def our_json(path: Path) -> dict[str, Any] | None:
+    """The content of a grasps.json of this program; None if the file is something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and content.get("format") == FORMAT
+        return None
+    ours = isinstance(content, dict) and content.get("format") == FORMAT
+    return content if ours and isinstance(content.get("rgb"), str) else None
 
 
 def read_image(options: argparse.Namespace) -> RGBDFrame:

@@ -42,8 +42,8 @@ from tqdm import tqdm
 from envs.cell import camera_intrinsics
 from envs.data_generation import generate
 from models.grasp_examples import EpochBatches
-from models.graspnet import create_model
-from models.graspnet_io import KIND, load_graspnet, save_graspnet
+from models.graspnet import GraspNet, create_model
+from models.graspnet_io import load_graspnet, load_initial, save_graspnet
 from models.graspnet_pictures import draw_curves, draw_predictions
 from models.graspnet_scores import check_graspable
 from models.graspnet_training import Team, Trainer, team
@@ -57,7 +57,6 @@ from models.real_training_data import (
 from models.rectangle_pictures import draw_rectangles
 from models.rectangle_scores import Judged
 from models.training_data import TrainingData, simulated_data
-from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
 from utils.grasp_data import read_trials
@@ -118,9 +117,7 @@ def check_resume(config: Config, run: Path | None) -> None:
 
 def check_network(config: Config) -> None:
     """Raise UserError for a network that cannot be made, before work is put into its data."""
-    create_model(name=config.train.backbone)
-    if config.train.initial is not None:
-        load_graspnet(config.train.initial)
+    make_network(config, max_width=1.0)
 
 
 def make_data(config: Config, us: Team) -> TrainingData:
@@ -152,16 +149,22 @@ def open_run(config: Config) -> str:
 def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
     """A new network, or one that starts from train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
-    max_width = config.train.max_width or data.max_width
+    model = make_network(config, config.train.max_width or data.max_width)
+    total_steps = steps_per_epoch(config, data) * config.train.epochs
+    return Trainer(model, config.train, total_steps, us)
+
+
+def make_network(config: Config, max_width: float) -> GraspNet:
+    """The network that the config asks for. Only simulated images tell centres of mass, so only a
+    network that learns from them has a head for these."""
     model = create_model(
         name=config.train.backbone,
         max_width=max_width,
-        centre_head=config.train.centre_weight > 0,
+        centre_head=config.data.kind == "simulated" and config.train.centre_weight > 0,
     )
     if config.train.initial is not None:
-        load_weights(model, load_checkpoint(config.train.initial, KIND), config.train.initial)
-    total_steps = steps_per_epoch(config, data) * config.train.epochs
-    return Trainer(model, config.train, total_steps, us)
+        load_initial(model, config.train.initial)
+    return model
 
 
 def steps_per_epoch(config: Config, data: TrainingData) -> int:

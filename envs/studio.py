@@ -1,16 +1,20 @@
 """Pictures for people: a twin of a cell with detailed meshes, shadows and a scenic camera.
 
-The twin has no physics of its own; it copies the poses of the cell that it shows. To see a scene:
+The twin has no physics of its own; it copies the poses of the cell that it shows. To see a scene,
+and what the cell's camera sees of it:
 
     python -m envs.studio --objects primitives --layout pile --output scene.png seed=3
-    python -m envs.studio --layout packed --rgbd scene      # also what the cell's camera sees
+    python -m envs.studio --layout packed --rgbd runs/scene
 
-`--rgbd` leaves color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py takes them.
+`--rgbd` makes a folder of color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py
+takes them.
 """
 
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +28,7 @@ from envs.objects import load_object_set
 from envs.panda import ARM, FINGERS
 from envs.scenes import LAYOUTS, make_scene
 from utils.config import parse_args, run_script
+from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
@@ -91,8 +96,11 @@ class Film:
 
 
 def write_rgbd(frame: RGBDFrame, folder: Path) -> None:
-    """color.png, depth.png in millimetres and T_WC.txt of a frame."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """color.png, depth.png in millimetres and T_WC.txt of a frame, in a new folder; UserError if
+    there is such a one."""
+    if folder.exists():
+        raise UserError(f"--rgbd {folder}: exists; give a folder that does not")
+    folder.mkdir(parents=True)
     imageio.imwrite(folder / "color.png", frame.rgb)
     imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
     np.savetxt(folder / "T_WC.txt", frame.T_WC)
@@ -120,10 +128,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             frame, folder = cell.frame(), chosen.rgbd
             write_rgbd(frame, folder)
             numbers = " ".join(f"{frame.K[i]:.6g}" for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            print(
-                f"python predict.py --rgb {folder / 'color.png'} --depth {folder / 'depth.png'} "
-                f"--intrinsics {numbers} --camera-pose {folder / 'T_WC.txt'}"
-            )
+            files = {"rgb": "color.png", "depth": "depth.png", "camera-pose": "T_WC.txt"}
+            given = [part for k, name in files.items() for part in (f"--{k}", str(folder / name))]
+            print(f"{shlex.join([sys.executable, 'predict.py', *given])} --intrinsics {numbers}")
 
 
 if __name__ == "__main__":

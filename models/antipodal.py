@@ -36,10 +36,10 @@ class SearchSettings:
     reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again
-    two_things: float = 0.5  # factor on a grasp whose ends lie on different objects, by the map
-    returned: int = 20  # grasps at most, and of them
-    distance: float = 0.01  # no two are closer than this
-    turn: float = np.deg2rad(20)  # and turned by less than this
+    split_factor: float = 0.5  # on a grasp whose ends lie on different objects, by the map
+    returned: int = 20  # grasps at most
+    distinct_distance: float = 0.01  # no two returned ones are both closer than this
+    distinct_turn: float = np.deg2rad(20)  # and turned by less than this
 
     def daring(self) -> SearchSettings:
         """What is given up where nothing meets the margins: room and wedge for things on slopes or
@@ -284,7 +284,7 @@ def measure(
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
     score *= np.exp(-4 * blind)
-    score *= np.where(ends[0] == ends[1], 1.0, settings.two_things)
+    score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
     score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
     feasible = np.zeros(N, bool)
     feasible[left_over] = True

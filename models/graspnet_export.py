@@ -3,7 +3,7 @@
 The graph takes `image`, (B, 4, H, W) float32 as `models.graspnet.to_input` makes it, for any B and
 for H and W that are multiples of the backbone's stride; pad other sizes by repeating the last row
 and column and crop the maps. It gives `quality`, `angle_logits` and `width` as `GraspNet.forward`
-does. The file's metadata say what else has to be known.
+does; a centre head is left out. The file's metadata say what else has to be known.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def export_onnx(saved: SavedGraspNet, path: Path) -> None:
     onnx_model = program.model_proto
     onnx_model.producer_name = PRODUCER
     described = {
-        **model.model_args,
+        **{key: value for key, value in model.model_args.items() if key != "centre_head"},
         "stride": stride,
         "metres_per_pixel": saved.metres_per_pixel,
     }

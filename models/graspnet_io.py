@@ -21,6 +21,7 @@ from utils.errors import UserError
 
 SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
 KIND = "graspnet"  # also of training checkpoints, which hold an optimiser besides
+CENTRE_HEAD = "centre_head."  # how the names of its weights begin
 PIXEL_SIZE = "metres_per_pixel"  # its entry in a checkpoint's `extra`
 
 
@@ -84,6 +85,21 @@ def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") ->
     if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
         raise UserError(f"{path}: does not say the pixel size it was trained at ({PIXEL_SIZE})")
     return SavedGraspNet(model.to(map_location).eval(), pixel_size, checkpoint["config"], extra)
+
+
+def load_initial(model: GraspNet, path: Path | str) -> None:
+    """Put the weights of a saved network into a new one of the same backbone.
+
+    A centre head that only the saved one has is left out; one that only the new one has keeps its
+    random weights. Raises UserError as `load_graspnet` does, and if the weights do not fit.
+    """
+    saved = load_graspnet(path).model
+    weights = saved.state_dict()
+    if model.centre_head is None or saved.centre_head is None:
+        weights = {name: w for name, w in weights.items() if not name.startswith(CENTRE_HEAD)}
+        own = {n: w for n, w in model.state_dict().items() if n.startswith(CENTRE_HEAD)}
+        weights |= own
+    load_weights(model, {"model": weights}, path)
 
 
 def for_inference(model: GraspNet) -> GraspNet:

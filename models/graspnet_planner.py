@@ -3,7 +3,8 @@
 A network names places well to a few millimetres; fingers need better than that beside an object.
 So the antipodal search of the other planners proposes exact poses, and what the network says of
 their places and angles ranks them: before they are measured on the height map, so that few have to
-be, and after. Nothing but the RGB-D image is seen.
+be, and after. Its votes for centres of mass tell the objects apart, and the colours what a hole in
+the depth image is. Nothing but the RGB-D image is seen.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from utils.transforms import Grasp, RGBDFrame, project
 
 # Half the heuristic's angles: turning onto the faces and the network make up for it. What belongs
 # together is known better than by height alone.
-SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, two_things=0.1)
+SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0.1)
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 LEAST = 0.02  # quality that anything has which fits
 
@@ -76,7 +77,9 @@ class GraspNetPlanner:
         if knows_centres:
             heights = labelled_by_centres(heights, frame, scaling, maps[3][0].numpy())
         found = search(heights, self.gripper, self.workspace, self.settings, value)
-        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
+        found = found.distinct(
+            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
+        )
         return found.grasps(self.gripper)
 
 

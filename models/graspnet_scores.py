@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from models.grasp_examples import LabelledImages
+from models.grasp_examples import LabelledImages, offset_to
 from models.grasp_peaks import Peaks, PeakSettings, find_peaks
 from models.graspnet import GraspNet, to_input
 from utils.augmentation import LabelledImage
@@ -51,12 +51,14 @@ def shows_a_grasp(image: LabelledImage) -> bool:
 
 
 @torch.inference_mode()
-def predict(model: GraspNet, image: LabelledImage) -> tuple[torch.Tensor, ...]:
+def predict(
+    model: GraspNet, image: LabelledImage, centres: bool = False
+) -> tuple[torch.Tensor, ...]:
     """The network's maps (1, C, H, W) of one labelled image."""
     device = next(model.parameters()).device
     rgb = np.ascontiguousarray(image.rgb.permute(1, 2, 0).numpy())
     x = to_input(rgb, image.depth.numpy())[None].to(device, memory_format=torch.channels_last)
-    return model(x)
+    return model(x, centres=centres)
 
 
 def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
@@ -76,6 +78,21 @@ def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
         float(quality.mean()), precision, float(angle.mean()), float(width.mean()),
         float(distance.mean()), len(rows),
     )  # fmt: skip
+
+
+@torch.inference_mode()
+def centre_error(model: GraspNet, images: LabelledImages) -> float:
+    """How far from their object's centre of mass the pixels of objects point, in pixels: the median
+    in each image, averaged. The model needs a centre head, the images centres."""
+    model.eval()
+    errors = []
+    for image in (images[index] for index in range(len(images))):
+        on_object = image.centre.isfinite().all(dim=0)
+        if on_object.any():
+            *_, offset = predict(model, image, centres=True)
+            wrong = offset[0].cpu() - offset_to(image.centre)
+            errors.append(float(torch.linalg.norm(wrong[:, on_object], dim=0).median()))
+    return float(np.mean(errors))
 
 
 def score_peak(found: Peaks, image: LabelledImage) -> tuple[float, float, float, float]:

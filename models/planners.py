@@ -89,7 +89,9 @@ class HeuristicPlanner:
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         heights = height_map_from_frame(frame, self.workspace)
         found = search(heights, self.gripper, self.workspace, self.settings)
-        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
+        found = found.distinct(
+            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
+        )
         return found.grasps(self.gripper)
 
 
@@ -129,7 +131,9 @@ class OraclePlanner:
         # Antipodal ones first; if there is none, the best of the rest, by the map's measure.
         found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
         found = found.best(len(found))
-        found = found.distinct(self.settings.returned, self.settings.distance, self.settings.turn)
+        found = found.distinct(
+            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
+        )
         return found.grasps(self.gripper)
 
 

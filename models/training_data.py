@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 from models.grasp_examples import AtPixelSize, GraspExamples, LabelledImages
 from models.grasp_peaks import PANDA_HAND
 from models.graspnet import GraspNet
-from models.graspnet_scores import score_labels
+from models.graspnet_scores import centre_error, score_labels
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
 from utils.depth_noise import KinectNoise
@@ -65,11 +65,19 @@ def simulated_data(config: Config, folder: Path, focal: float, distance: float) 
     return TrainingData(
         examples,
         validation,
-        lambda model: score_labels(model, validation)._asdict(),
+        lambda model: score_simulated(model, validation),
         "label_quality",
         metres_per_pixel,
         PANDA_HAND.max_opening,
     )
+
+
+def score_simulated(model: GraspNet, validation: LabelledImages) -> dict[str, float]:
+    """What the top grasps are worth by the labels, and the error of a centre head, by name."""
+    scores = score_labels(model, validation)._asdict()
+    if model.centre_head is not None:
+        scores["centre_error"] = centre_error(model, validation)
+    return scores
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,10 @@ def joint_batch(step: int) -> Example:
     valid = (torch.rand(BATCH, 1, 36, 24, generator=rng) < 0.5).float()
     valid[1] = 1
     image = torch.rand(BATCH, 4, 36, 24, generator=rng) - 0.5
-    return Example(image, targets_from_labels(quality, width, valid, graspable_from=0.3))
+    offset = 20 * torch.randn(BATCH, 2, 36, 24, generator=rng)
+    offset[1] = torch.nan  # shows no object
+    offset[2, :, 5:] = torch.nan
+    return Example(image, targets_from_labels(quality, width, valid, 0.3, offset))
 
 
 def part_of(batch: Example, rank: int, ranks: int) -> Example:
@@ -39,7 +42,7 @@ def part_of(batch: Example, rank: int, ranks: int) -> Example:
 
 def take_steps(us: Team) -> dict[str, dict[str, torch.Tensor]]:
     torch.manual_seed(us.rank)  # other weights in every process: those of the first have to count
-    model = create_model(name="ggcnn", max_width=0.08)
+    model = create_model(name="ggcnn", max_width=0.08, centre_head=True)
     trainer = Trainer(model, load_config(None, SETTINGS).train, 10, us)
     gradients = {}
     for step in range(3):

@@ -75,6 +75,39 @@ def test_colours_beyond_the_smeared_rim_count() -> None:
     np.testing.assert_allclose(found[lost & ~on_box], clean[lost & ~on_box], atol=1e-5)
 
 
+def test_a_thin_post_of_the_tables_colour_stays_unknown() -> None:
+    """Thinner than the smeared rim that is left out of an object's colour."""
+    frame = boxes_frame([((0.006, 0.006, 0.06), 0.0, (0.5, 0.03)), BOX])
+    post = (frame.points()[..., 2] > 0.01) & (frame.points()[..., 1] > 0.02)
+    green = (frame.points()[..., 2] > 0.001) & ~post
+    rgb = np.where(green[..., None], THING, TABLE).astype(np.uint8)
+    lost = post & (np.arange(224) % 2 == 0)
+    assert lost.sum() >= 4
+    frame = replace(frame, rgb=rgb, depth=np.where(lost, 0, frame.depth))
+    assert (table_in_holes(frame, 0.0).depth[lost] == 0).all()
+
+
+def test_a_wide_hole_of_the_tables_colour_stays_unknown() -> None:
+    """Glass shows the table."""
+    frame, clean, _ = with_a_hole()
+    lost = np.zeros(clean.shape, bool)
+    lost[150:200, 20:70] = True
+    found = table_in_holes(replace(frame, depth=np.where(lost, 0, clean)), 0.0).depth
+    assert (found[155:195, 25:65] == 0).all()
+
+
+@pytest.mark.parametrize("noise", [4, 8])
+def test_noisy_colours_are_told_apart(noise: int) -> None:
+    frame, clean, lost = with_a_hole()
+    on_box = (frame.rgb == THING).all(axis=-1)
+    rng = np.random.default_rng(0)
+    rgb = np.clip(frame.rgb + rng.normal(0, noise, frame.rgb.shape), 0, 255).astype(np.uint8)
+    found = table_in_holes(replace(frame, rgb=rgb), 0.0).depth
+    assert (found[lost & on_box] == 0).mean() > 0.99
+    # The colours of the box's rim are smoothed into the table's.
+    assert (np.abs(found - clean)[lost & ~on_box] < 1e-5).mean() > 0.85
+
+
 def test_images_without_holes_or_without_depth_are_left_alone() -> None:
     frame = boxes_frame([BOX])
     assert table_in_holes(frame, 0.0) is frame

@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from envs import data_generation
 from envs.appearance import Appearance, Texture, draw_camera
@@ -399,6 +400,25 @@ def test_generated_frames_are_whole(tiny_data):
     )
     trials = read_trials(folder)
     assert {0.0} < {t.quality for t in trials} and any(t.success for t in trials)
+
+
+def test_pixels_lie_around_the_centre_of_their_object(tiny_data):
+    """In shards of the real cell: wherever an object is, the pixels that show it are around the
+    place that is stored as its centre of mass, and every object has a place of its own."""
+    folder, _ = tiny_data
+    images = SimulatedDataset(folder, "train")
+    distances = []
+    for image in (images[i] for i in range(len(images))):
+        on = image.centre[0].isfinite()
+        centres = image.centre[:, on].T.unique(dim=0)
+        assert len(centres) <= 2
+        for centre in centres:
+            v, u = torch.nonzero((image.centre == centre[:, None, None]).all(0), as_tuple=True)
+            if len(u) > 20:
+                middle = torch.stack([u.float().mean(), v.float().mean()])
+                distances.append(float(torch.linalg.norm(middle - centre)))
+    assert len(distances) > 32
+    assert np.median(distances) < 1.0 and np.max(distances) < 5.0  # of 64, an object spans 8 to 20
 
 
 def test_validation_keeps_every_tenth_training_object_and_no_test_object(config):

@@ -7,7 +7,13 @@ import torch
 
 from models.backbones import BACKBONES
 from models.graspnet import GraspNet
-from models.graspnet_io import KIND, for_inference, load_graspnet, save_graspnet
+from models.graspnet_io import (
+    KIND,
+    for_inference,
+    load_graspnet,
+    load_initial,
+    save_graspnet,
+)
 from utils.checkpoint import save_checkpoint
 from utils.errors import UserError
 
@@ -43,6 +49,34 @@ def test_a_training_checkpoint_loads_too(tmp_path, model):
         extra={"metres_per_pixel": PIXEL},
     )
     assert load_graspnet(tmp_path / "last.pt").metres_per_pixel == PIXEL
+
+
+@pytest.mark.parametrize("saved_head", [False, True])
+@pytest.mark.parametrize("new_head", [False, True])
+def test_a_network_starts_from_another_with_or_without_a_centre_head(
+    tmp_path, saved_head, new_head
+):
+    torch.manual_seed(0)
+    saved = GraspNet(max_width=0.08, backbone="ggcnn", centre_head=saved_head)
+    save_graspnet(tmp_path / "net.pt", saved, PIXEL)
+    new = GraspNet(max_width=0.2, backbone="ggcnn", centre_head=new_head)
+    before = {name: value.clone() for name, value in new.state_dict().items()}
+    load_initial(new, tmp_path / "net.pt")
+    for name, value in new.state_dict().items():
+        shared = name in saved.state_dict()
+        assert torch.equal(value, saved.state_dict()[name] if shared else before[name]), name
+    assert (new.centre_head is not None) == new_head
+    with pytest.raises(UserError, match="net.pt.*another architecture"):
+        load_initial(GraspNet(backbone="tutorial"), tmp_path / "net.pt")
+
+
+def test_a_folded_network_says_the_same_of_centres():
+    torch.manual_seed(0)
+    model = GraspNet(max_width=0.08, backbone="tutorial_skip", centre_head=True).eval()
+    x = torch.rand(1, 4, 48, 64)
+    with torch.no_grad():
+        for ours, theirs in zip(for_inference(model)(x, centres=True), model(x, centres=True)):
+            torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
 
 
 def spoil_backbone(content):

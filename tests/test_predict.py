@@ -579,6 +579,11 @@ def options(**changes):
     return lambda files: changes
 
 
+def only_a_count_beside_export(files):
+    everything = {name.strip("-").replace("-", "_"): None for name in files.options}
+    return everything | {"export": "x.onnx", "count": 5}
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -628,6 +633,7 @@ def options(**changes):
         (other_picture, "was not written by predict.py"),
         (out_is_a_file, "no folder"),
         (options(export="x.onnx"), "takes only --checkpoint"),
+        (only_a_count_beside_export, "takes only --checkpoint"),
     ],
 )
 def test_bad_input_is_one_sentence_and_writes_nothing(files, capsys, spoil, message):
@@ -678,7 +684,7 @@ def test_a_bad_input_ends_with_status_2():
 @pytest.mark.parametrize("backbone", ["ggcnn", "tutorial_skip"])
 def test_onnx_says_what_pytorch_says(tmp_path, backbone):
     torch.manual_seed(0)
-    model = GraspNet(max_width=0.08, backbone=backbone).eval()
+    model = GraspNet(max_width=0.08, backbone=backbone, centre_head=True).eval()
     for layer in model.modules():  # statistics that are not those of a fresh layer
         if isinstance(layer, nn.BatchNorm2d):
             layer.running_mean.uniform_(-0.2, 0.2)
@@ -689,6 +695,7 @@ def test_onnx_says_what_pytorch_says(tmp_path, backbone):
     described = session.get_modelmeta().custom_metadata_map
     stride = model.backbone.stride
     assert json.loads(described["stride"]) == stride
+    assert "centre_head" not in described, "it is left out of the graph"
     assert json.loads(described["metres_per_pixel"]) == PIXEL
     assert [output.name for output in session.get_outputs()] == list(OUTPUTS)
     for batch, rows, columns in ((1, 5, 3), (3, 2, 7)):

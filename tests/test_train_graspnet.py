@@ -417,7 +417,7 @@ class Always(nn.Module):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
-    def forward(self, x: torch.Tensor):
+    def forward(self, x: torch.Tensor, centres: bool = False):
         rows, columns = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
         quality = torch.exp(-((rows - 10) ** 2 + (columns - 12) ** 2) / 8.0)[None, None]
         circle = 2 * np.pi * (torch.arange(BINS) - 4) / BINS

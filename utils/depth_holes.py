@@ -13,11 +13,13 @@ import numpy as np
 
 from utils.transforms import RGBDFrame, deproject, known_depth
 
+HOLE_REACH = 0.03  # m from a hole's rim to its middle, up to which it can be filled
 TABLE_FLATNESS = 0.006  # m over the table, up to which a measured point is the table
-LIKE_TABLE = (
-    30.0  # most that a colour, 0..255 in three channels, differs from the table's beside it
-)
-UNLIKE_OBJECT = 2.0  # and so many times as much it differs from that of the nearest object
+SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
+# Colours, 0..255 in three channels: most that one may differ from the table's beside it, and so
+# many times as much it has to differ from that of the nearest object.
+LIKE_TABLE = 30.0
+UNLIKE_OBJECT = 2.0
 
 
 def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
@@ -35,9 +37,20 @@ def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
     known = nearest = np.where(unknown, far, depth).astype(np.float32)
     for _ in range(reach):
         nearest = np.where(unknown, cv2.erode(nearest, np.ones((3, 3), np.uint8)), known)
+    return np.where((nearest < far) & ~_wide(unknown, reach), nearest, np.float32(0))
+
+
+def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
+    """(H, W) bool: holes that hold a square of 2 reach + 1 pixels."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    wide = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-    return np.where((nearest < far) & ~wide, nearest, np.float32(0))
+    return cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+
+
+def reach_in_pixels(frame: RGBDFrame, metres: float) -> int:
+    """How many pixels span so many metres at the median known depth; at least 1."""
+    known = known_depth(frame.depth)
+    depth = float(np.median(frame.depth[known])) if known.any() else np.inf
+    return max(1, round(metres * (frame.K[0, 0] + frame.K[1, 1]) / 2 / depth))
 
 
 def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
@@ -45,33 +58,47 @@ def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
 
     A hole beside an object is its shadow or a part of it: by depth alone nobody can tell, by colour
     often. What looks like the table beside it and unlike the nearest object becomes table; all
-    else stays unknown.
+    else stays unknown, and so do wide holes, which may be a thing of that colour, or of glass.
     """
     known = known_depth(frame.depth)
     if known.all() or not known.any():
         return frame
-    plane = depth_of_plane(frame, table_height)
     high = known & (frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS))
-    # Cameras that match windows smear depth over edges: colours are taken from farther inside.
-    inside = cv2.erode(high.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    table, thing = (_colour_distance(frame.rgb, ~known, of) for of in (known & ~high, inside))
+    # Smeared pixels have the colour of what lies behind.
+    inside = _eroded(high, reach_in_pixels(frame, SMEAR))
+    smooth = cv2.medianBlur(frame.rgb, 3)
+    holes = ~known & ~_wide(~known, reach_in_pixels(frame, HOLE_REACH))
+    table, thing = (
+        np.linalg.norm(frame.rgb[holes].astype(float) - _colours_of(smooth, of, holes), axis=-1)
+        for of in (known & ~high, inside)
+    )
     depth = frame.depth.copy()
     like_table = (table < LIKE_TABLE) & (UNLIKE_OBJECT * table < thing)
-    depth[~known] = np.where(like_table, plane[~known], 0)
+    depth[holes] = np.where(like_table, depth_of_plane(frame, table_height)[holes], depth[holes])
     return replace(frame, depth=depth)
 
 
-def _colour_distance(rgb: np.ndarray, where: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(N,) how much the colours of the N pixels `where` differ from that of the nearest pixel `of`;
-    both (H, W) bool."""
+def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
+    """A mask (H, W) without its rim; pieces of which nothing would be left stay whole."""
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    inside = cv2.erode(mask.astype(np.uint8), window) > 0
+    count, piece = cv2.connectedComponents(mask.astype(np.uint8))
+    left = np.zeros(count, bool)
+    left[piece[inside]] = True
+    return inside | (mask & ~left[piece])
+
+
+def _colours_of(rgb: np.ndarray, of: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(N, 3) at the N pixels `where` the colour of the nearest pixel `of`, both (H, W) bool;
+    infinite if there is none."""
     if not of.any():
-        return np.full(where.sum(), np.inf)
+        return np.full((where.sum(), 3), np.inf)
     _, label = cv2.distanceTransformWithLabels(
         (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     nearest = np.zeros((label.max() + 1, 3))
     nearest[label[of]] = rgb[of]
-    return np.linalg.norm(rgb[where] - nearest[label[where]], axis=-1)
+    return nearest[label[where]]
 
 
 def depth_of_plane(frame: RGBDFrame, height: float) -> np.ndarray:

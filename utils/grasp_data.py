@@ -25,9 +25,8 @@ from utils.grasp_labels import GraspLabels
 from utils.label_trials import Trial
 from utils.transforms import RGBDFrame, project
 
-FORMAT_VERSION = (
-    2  # to be raised with the file format, and with what makes scenes, images or labels
-)
+# To be raised with the format of the files, and with what makes scenes, images or labels.
+FORMAT_VERSION = 2
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
 _WIDTH_UNIT = 0.08 / 255  # metres; the Panda hand opens 0.08 m
 _QUALITY_UNIT = 1 / 255
@@ -51,7 +50,8 @@ def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Tr
 
     Depth, quality and width are stored as whole numbers of their attribute `unit`; `instance` is
     the number of the object at each pixel, -1 for none, and `centres` has the objects' centres of
-    mass in W. The frames carry segmentation and truth.
+    mass in W. The frames carry segmentation and truth, of scenes in which nothing was retired: only
+    then do both number the objects alike.
     """
     stacked = {
         "rgb": np.stack([f.frame.rgb for f in frames]),

@@ -13,14 +13,13 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth_holes import depth_of_plane, near_side
+from utils.depth_holes import HOLE_REACH, depth_of_plane, near_side, reach_in_pixels
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
 
 # Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
 # this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
-HOLE_REACH = 0.0285  # m from a hole's rim to its middle, up to which it is filled
 WALL = 0.05  # m, over all that is known: what counts as standing in a hole too wide to fill
 
 
@@ -84,8 +83,7 @@ def height_map_from_frame(
     """
     measured = known_depth(frame.depth)
     if not measured.all():
-        metres_per_pixel = np.median(frame.depth[measured]) / frame.K[0, 0] if measured.any() else 1
-        reach = max(1, round(HOLE_REACH / metres_per_pixel))
+        reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))
     grid, origin = grid_points(workspace, margin, cell)
     seen = _highest(_surface_points(frame, origin, cell), grid.shape[:2])
