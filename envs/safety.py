@@ -72,9 +72,9 @@ class SafetyGate:
         if reason is not None:
             return Verdict(np.zeros(7), reason)
         points, speeds, turn = self._motion(q, wish)
-        wish_share = self._speed_share(wish, speeds, turn)
-        velocity, speeds = wish_share * wish, wish_share * speeds
-        share, reason = self._room_share(velocity, q, points, speeds)
+        slower = self._speed_share(wish, speeds, turn)
+        velocity = slower * wish
+        share, reason = self._room_share(velocity, q, points, slower * speeds)
         if share < _LEAST_SHARE:
             return Verdict(np.zeros(7), reason)
         return Verdict(share * velocity)
@@ -124,4 +124,4 @@ class SafetyGate:
         # The second bound: within the next period the limit is not crossed.
         allowed = np.minimum(np.sqrt(2.0 * deceleration * room), room / self.dt)
         size = np.abs(speed)
-        return np.where(size > allowed, allowed / np.where(size > 0.0, size, 1.0), 1.0)
+        return np.divide(allowed, size, out=np.ones_like(size), where=size > allowed)

@@ -102,7 +102,7 @@ class Board:
         missing = [str(number) for number in range(MARKERS) if number not in found]
         if missing:
             raise TargetLostError(
-                f"target lost: marker {' and '.join(missing)} of {MARKERS} is not seen"
+                f"target lost: of its {MARKERS} markers not seen: {', '.join(missing)}"
             )
         rough = np.concatenate([found[number][0] for number in range(MARKERS)])
         start, _ = cv2.findHomography(_PATTERN_CORNERS, rough)
