@@ -22,6 +22,7 @@ from utils.servo_features import MOUNTINGS
 from utils.transforms import inverse_pose, project, transform_points
 
 BOARD = Board()
+MARKERS = BOARD.points * 4 / 7  # their middles: 4 cells from the board's, the corners are 7
 FACING = np.diag([1.0, -1.0, -1.0])
 INTRINSICS = Intrinsics(640, 480, 60.0)
 
@@ -57,12 +58,13 @@ def empty(cell, *overrides):
 
 
 def test_board_is_as_large_as_it_says():
-    # 16 cells of pattern and one of white on each side; the outermost black is one cell in.
-    np.testing.assert_allclose(BOARD.size, 0.18)
+    # 20 cells; the outermost corners are 14 apart and 7 sqrt(2) from the middle, turned by 8
+    # degrees from the diagonals.
+    np.testing.assert_allclose(BOARD.size, 0.2)
+    angles = np.radians([143, 53, -37, -127])
+    expected = 0.07 * np.sqrt(2) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    np.testing.assert_allclose(BOARD.points[:, :2], expected)
     np.testing.assert_allclose(BOARD.points[:, 2], 0)
-    np.testing.assert_allclose(
-        BOARD.points[:, :2], [[-0.07, 0.07], [0.07, 0.07], [0.07, -0.07], [-0.07, -0.07]]
-    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -72,7 +74,7 @@ def test_corners_and_pose_are_found_to_a_fraction_of_a_pixel(studio, seed):
                 rng.uniform(-1, 1, 3) * [12, 12, 180], FACING)  # fmt: skip
     pixels = BOARD.find(photograph(studio, inverse_pose(T_CO)))
     expected, _ = project(BOARD.points, INTRINSICS.K, inverse_pose(T_CO))
-    np.testing.assert_allclose(pixels, expected, atol=0.25)
+    np.testing.assert_allclose(pixels, expected, atol=0.3)
     assert np.sqrt(np.mean((pixels - expected) ** 2)) < 0.12
     found = BOARD.pose(pixels, INTRINSICS.K)
     np.testing.assert_allclose(found[:3, 3], T_CO[:3, 3], atol=2e-4)
@@ -92,9 +94,17 @@ def test_a_board_that_is_not_all_seen_is_lost(studio):
     with pytest.raises(TargetLostError, match="not seen: 1, 2$"):
         BOARD.find(photograph(studio, inverse_pose(pose([0.15, 0, 0.25], [0, 0, 0], FACING))))
     image = photograph(studio, inverse_pose(straight))
-    (u, v), _ = project(np.array([0.04, -0.04, 0]), INTRINSICS.K, inverse_pose(straight))
+    (u, v), _ = project(MARKERS[2], INTRINSICS.K, inverse_pose(straight))
     cv2.circle(image, (round(u), round(v)), 15, (90, 90, 90), -1)
     with pytest.raises(TargetLostError, match="not seen: 2$"):
+        BOARD.find(image)
+
+
+def test_markers_that_do_not_lie_on_one_board_are_refused(studio):
+    image = photograph(studio, inverse_pose(pose([0, 0, 0.25], [0, 0, 0], FACING)))
+    middle = image.shape[0] // 2
+    image[:middle] = np.roll(image[:middle], 60, axis=1)
+    with pytest.raises(TargetLostError, match="correlate|aligned"):
         BOARD.find(image)
 
 
@@ -143,7 +153,7 @@ def test_a_covered_marker_stops_the_arm(cell, config, mounting):
         poses.append(forward_kinematics(cell.robot.q))
         if len(poses) == 6:
             T_WO = cell.camera_pose(camera.mount) @ task.true_pose()
-            marker = transform_points(T_WO, np.array([-0.04, -0.04, 0.01]))  # number 3
+            marker = transform_points(T_WO, MARKERS[3] + [0, 0, 0.01])
             static_box(cell.client, [0.02, 0.02, 0.001], marker, (0.5, 0.5, 0.5, 1))
         return camera()
 
