@@ -2,7 +2,8 @@
 
 Frame O: origin in the middle of the board's face, x right and y up as the face is looked at, z out
 of it. The pattern is slanted on the board, because an edge along the rows or columns of an image
-without soft edges tells its place to half a pixel only, and one across them much better.
+without soft edges tells its place to half a pixel only, and one across them much better. (A goal at
+which the slanted pattern itself is parallel to the image is the one to avoid: it costs up to 1 mm.)
 
 The markers are those of Garrido-Jurado et al., "Automatic generation and detection of highly
 reliable fiducial markers under occlusion", Pattern Recognition 47(6), 2014. Their corners come from

@@ -118,7 +118,6 @@ def test_the_arm_ends_at_the_goal(cell, config, mounting, law):
     task = make_task(cell, mounting, seed=list(LAWS).index(law))
     history = task.run(law)
     position, angle = task.errors()
-    print(f"{mounting} {law}: {position:.3f} mm, {angle:.3f} degrees, {history.reason}")
     assert history.converged and position < 0.5 and angle < 0.5
     assert history.times[-1] < 5.0
     assert abs(cell.robot.joint_state()[1]).max() < 1e-3  # at rest
