@@ -11,7 +11,7 @@ from benchmarks import bench_servo_cell
 from benchmarks.bench_servo_cell import LAWS, make_task, pose
 from envs.camera import Intrinsics, render
 from envs.cell import Cell
-from envs.kinematics import JOINT_UPPER, forward_kinematics
+from envs.kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.scenes import Scene
 from envs.servo_target import Board, TargetLostError
 from envs.servoing import ArmStoppedError, GuardedArm, Sight, servo_arm, servo_settings, view_of
@@ -218,9 +218,9 @@ def test_nothing_to_see_is_an_error_and_no_motion(cell, config):
     np.testing.assert_allclose(cell.robot.q, before, atol=1e-4)
 
 
-def drive(cell, wish, seconds=3.0):
+def drive(cell, wish, seconds=3.0, carried=None):
     """The reason for which a constant wish (7,) was stopped, and E's path (k, 3)."""
-    arm, path = GuardedArm(cell), []
+    arm, path = GuardedArm(cell, carried), []
     with pytest.raises(ArmStoppedError) as stopped:
         for _ in range(round(seconds / cell.dt)):
             path.append(forward_kinematics(cell.robot.q)[:3, 3])
@@ -252,6 +252,25 @@ def test_contact_stops_the_arm(cell):
     assert reason.startswith("contact with ")
     nearest = pybullet.getClosestPoints(cell.robot.body, wall, 0.1, physicsClientId=cell.client)
     assert min(point[8] for point in nearest) > -0.002  # it did not go on into the wall
+
+
+def test_what_is_carried_counts_as_the_arm(cell, config):
+    cell.config = config
+    task = make_task(cell, "eye_to_hand", seed=0)
+    _, _, height = cell.robot.tip_position()
+    half = [0.05, 0.05, height / 2 - 0.03]
+    block = static_box(cell.client, half, [0.5, 0, half[2]], (0.5, 0.5, 0.5, 1))
+    down = np.linalg.pinv(geometric_jacobian(cell.robot.q)) @ [0, 0, -0.1, 0, 0, 0]
+    reason, path = drive(cell, down, carried=task.carried)
+    assert reason.startswith("contact with ")
+    near = pybullet.getClosestPoints(task.body, block, 0.1, physicsClientId=cell.client)
+    assert abs(min(point[8] for point in near)) < 0.002 and height - path[-1, 2] > 0.02
+    # Without a block the lowest corner of the target ends at the box, and E well above it.
+    task = make_task(cell, "eye_to_hand", seed=0)
+    reason, path = drive(cell, down, carried=task.carried)
+    assert reason.startswith("the workspace ends here (z = 0.02")
+    corners = transform_points(cell.camera_pose("overhead") @ task.true_pose(), BOARD.points)
+    assert corners[:, 2].min() == pytest.approx(0.02, abs=1e-3) and path[-1, 2] > 0.022
 
 
 def test_a_mounting_must_be_known(cell, config):
