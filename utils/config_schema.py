@@ -127,6 +127,32 @@ class ExecutionConfig(Section):
     contact_stop: Positive
 
 
+class SafetyConfig(Section):
+    box_lower: Vector3
+    box_upper: Vector3
+    joint_margin: Annotated[float, Field(ge=0, le=0.3)]
+    linear_speed: Annotated[float, Field(gt=0, le=1.7)]
+    angular_speed: Annotated[float, Field(gt=0, le=2.5)]
+    contact_stop: Positive
+    watchdog: Positive
+
+    @model_validator(mode="after")
+    def _box_has_an_inside(self) -> SafetyConfig:
+        if not all(low < high for low, high in zip(self.box_lower, self.box_upper)):
+            raise ValueError("box_lower must be below box_upper in x, y and z")
+        return self
+
+
+class ServoConfig(Section):
+    rate: Annotated[int, Field(ge=1, le=1000)]
+    width: Pixels
+    height: Pixels
+    seconds: Positive
+    settled_distance: Positive
+    settled_angle: Positive
+    settled_frames: Count
+
+
 class EvaluateConfig(Section):
     policies: Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
     scenarios: Annotated[tuple[Scenario, ...], Several, AfterValidator(_no_repeats)]
@@ -270,6 +296,8 @@ class Config(Section):
     objects: ObjectsConfig
     scene: SceneConfig
     execution: ExecutionConfig
+    safety: SafetyConfig
+    servo: ServoConfig
     data: DataConfig
     train: TrainConfig
     evaluate: EvaluateConfig

@@ -42,12 +42,17 @@ class View(NamedTuple):
 
 
 class ServoStep(NamedTuple):
-    """velocity: (6,) v_C. error: (m,) in the law's units. gain: 1/s."""
+    """velocity: (6,) v_C. error: (m,) in the law's units. gain: 1/s.
+
+    correction: (6,) minus the way still to go, metres and radians in C; velocity is -gain times
+    it, before smooth start and limits.
+    """
 
     velocity: np.ndarray
     error: np.ndarray
     condition_number: float
     gain: float
+    correction: np.ndarray
 
 
 class VisualServo(ABC):
@@ -120,7 +125,7 @@ class VisualServo(ABC):
         self._time += self.dt
         self._velocity = velocity
         self._stalled = correction @ correction < STALLED**2
-        return ServoStep(velocity, error, condition, gain)
+        return ServoStep(velocity, error, condition, gain, correction)
 
     def run(
         self,
@@ -161,7 +166,7 @@ class VisualServo(ABC):
                 move(step.velocity)
         finally:
             move(np.zeros(6))
-        return self._history(views, steps, goal, converged, reason)
+        return self.history(views, steps, goal, converged, reason)
 
     def simulate(
         self,
@@ -228,7 +233,10 @@ class VisualServo(ABC):
             self._goal = content, self.camera.normalise(points)
         return self._goal[1]
 
-    def _history(self, views, steps, goal, converged, reason) -> ServoHistory:
+    def history(
+        self, views: list[View], steps: list[ServoStep], goal: View, converged: bool, reason: str
+    ) -> ServoHistory:
+        """What a run that saw `views` and answered with `steps`, one each, leaves behind."""
         unknown = np.full((4, 4), np.nan)
         no_points = np.empty((0, 2))
         return ServoHistory(
