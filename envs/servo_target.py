@@ -61,6 +61,11 @@ class Board:
         return _SIDE * self.cell
 
     @property
+    def outline(self) -> np.ndarray:
+        """(4, 3) the board's own corners in O, metres, clockwise from the top left."""
+        return self.size / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+
+    @property
     def points(self) -> np.ndarray:
         """(4, 3) the outermost corner of each marker in O, metres, clockwise from the top left."""
         return self._place(_OUTERMOST)

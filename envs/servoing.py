@@ -122,7 +122,7 @@ class CarriedBoard:
             pybullet.setCollisionFilterPair(
                 robot.body, self.body, link, -1, 0, physicsClientId=client
             )
-        self.corners_E = transform_points(T_EO, board.points)
+        self.corners_E = transform_points(T_EO, board.outline)
 
     def contact_force(self) -> float:
         """Sum of the normal forces on the board in newtons."""

@@ -269,7 +269,7 @@ def test_what_is_carried_counts_as_the_arm(cell, config):
     task = make_task(cell, "eye_to_hand", seed=0)
     reason, path = drive(cell, down, carried=task.carried)
     assert reason.startswith("the workspace ends here (z = 0.02")
-    corners = transform_points(cell.camera_pose("overhead") @ task.true_pose(), BOARD.points)
+    corners = transform_points(cell.camera_pose("overhead") @ task.true_pose(), BOARD.outline)
     assert corners[:, 2].min() == pytest.approx(0.02, abs=1e-3) and path[-1, 2] > 0.022
 
 
