@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -18,6 +17,7 @@ from torch import nn
 
 from models.backbones import BACKBONES
 from models.grasp_peaks import decode_grasps
+from utils.depth_holes import fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.transforms import known_depth
 
@@ -79,20 +79,6 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
             f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
         )
     return typical
-
-
-def fill_holes(depth: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth whose unknown pixels take the value of the nearest known one."""
-    depth = np.asarray(depth, np.float32)
-    known = known_depth(depth)
-    if known.all() or not known.any():
-        return depth
-    _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    value = np.zeros(label.max() + 1, np.float32)
-    value[label[known]] = depth[known]
-    return value[label]
 
 
 # --- The network ---------------------------------------------------------------------------

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from models.grasp_peaks import LABELS, PANDA_HAND, Peaks, PeakSettings, find_peaks, surface_grasps
-from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, fill_holes, to_input
+from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, to_input
+from utils.depth_holes import fill_holes
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings, grasp_below_surface

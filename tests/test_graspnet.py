@@ -11,12 +11,12 @@ from models.graspnet import (
     GraspLoss,
     GraspNet,
     create_model,
-    fill_holes,
     main,
     targets_from_labels,
     to_input,
 )
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.depth_holes import fill_holes
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings

@@ -22,6 +22,23 @@ LIKE_TABLE = 30.0
 UNLIKE_OBJECT = 2.0
 
 
+def fill_holes(depth: np.ndarray) -> np.ndarray:
+    """(H, W) float32 depth whose unknown pixels take the value of the nearest known one."""
+    depth = np.asarray(depth, np.float32)
+    known = known_depth(depth)
+    return depth if known.all() or not known.any() else nearest_values(depth, known)
+
+
+def nearest_values(values: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """(H, W, ...) at each pixel the value of the nearest pixel `of` (H, W) bool, which has some."""
+    _, label = cv2.distanceTransformWithLabels(
+        (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    value = np.zeros((label.max() + 1, *values.shape[2:]), values.dtype)
+    value[label[of]] = values[of]
+    return value[label]
+
+
 def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
     """(H, W) depth whose unknown pixels take the nearest surface around their hole, up to `reach`
     pixels away through the hole.
@@ -68,8 +85,9 @@ def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     inside = _eroded(high, reach_in_pixels(frame, SMEAR))
     smooth = cv2.medianBlur(frame.rgb, 3)
     holes = ~known & ~_wide(~known, reach_in_pixels(frame, HOLE_REACH))
+    colours = frame.rgb[holes].astype(float)
     table, thing = (
-        np.linalg.norm(frame.rgb[holes].astype(float) - _colours_of(smooth, of, holes), axis=-1)
+        np.linalg.norm(colours - nearest_values(smooth, of)[holes], axis=-1) if of.any() else np.inf
         for of in (known & ~high, inside)
     )
     depth = frame.depth.copy()
@@ -86,19 +104,6 @@ def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
     left = np.zeros(count, bool)
     left[piece[inside]] = True
     return inside | (mask & ~left[piece])
-
-
-def _colours_of(rgb: np.ndarray, of: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(N, 3) at the N pixels `where` the colour of the nearest pixel `of`, both (H, W) bool;
-    infinite if there is none."""
-    if not of.any():
-        return np.full((where.sum(), 3), np.inf)
-    _, label = cv2.distanceTransformWithLabels(
-        (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    nearest = np.zeros((label.max() + 1, 3))
-    nearest[label[of]] = rgb[of]
-    return nearest[label[where]]
 
 
 def depth_of_plane(frame: RGBDFrame, height: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth_holes import HOLE_REACH, depth_of_plane, near_side, reach_in_pixels
+from utils.depth_holes import HOLE_REACH, depth_of_plane, near_side, nearest_values, reach_in_pixels
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
 
@@ -168,12 +168,7 @@ def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float)
     if not large.any():
         return np.full(height.shape, -1)
     label = (np.cumsum(kept) - 1)[raw]
-    _, nearest = cv2.distanceTransformWithLabels(
-        (~large).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    owner = np.zeros(nearest.max() + 1, dtype=int)
-    owner[nearest[large]] = label[large]
-    return np.where(above, owner[nearest], -1)
+    return np.where(above, nearest_values(label, large), -1)
 
 
 def _column_centroids(
