@@ -16,7 +16,7 @@ import pybullet
 from envs.camera import Intrinsics
 from envs.cell import TABLE_OR_BACKGROUND, Cell, camera_intrinsics
 from utils.config import CameraConfig
-from utils.transforms import RGBDFrame, look_at
+from utils.transforms import RGBDFrame, known_depth, look_at
 
 _PLAIN_SHARE = 0.15  # of the scenes look as the cell does when nothing is randomised
 _ONE_COLOUR_SHARE = 0.2  # of the others: all objects in one colour, now and then the table's
@@ -106,7 +106,7 @@ class Appearance:
         frame = cell.look(intrinsics, T_WC, with_truth=True, light=self.light)
         rgb = frame.rgb.astype(np.float32)
         for index, texture in enumerate(self.textures, start=TABLE_OR_BACKGROUND):
-            seen = (frame.segmentation == index) & (frame.depth > 0)
+            seen = (frame.segmentation == index) & known_depth(frame.depth)
             if texture is None or not seen.any():
                 continue
             points = frame.points()[seen]

@@ -64,13 +64,13 @@ class Candidates:
 
     def distinct(self, count: int, distance: float, angle: float) -> Candidates:
         """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
-        kept: list[int] = []
-        for i in range(len(self)):
-            near = np.linalg.norm(self.xy[kept] - self.xy[i], axis=1) < distance
-            if not (near & (angle_difference(self.angle[kept], self.angle[i]) < angle)).any():
-                kept.append(i)
-                if len(kept) == count:
-                    break
+        apart = np.linalg.norm(self.xy[:, None] - self.xy, axis=2) >= distance
+        apart |= angle_difference(self.angle[:, None], self.angle) >= angle
+        kept, free = [], np.ones(len(self), bool)
+        while free.any() and len(kept) < count:
+            kept.append(int(free.argmax()))
+            free &= apart[kept[-1]]
+            free[kept[-1]] = False
         return self.take(kept)
 
     def grasps(self, gripper: GripperGeometry) -> list[Grasp]:

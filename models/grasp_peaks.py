@@ -16,6 +16,7 @@ import torch
 
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings, grasp_below_surface
+from utils.local_maxima import local_maxima
 from utils.transforms import Grasp, ImageGrasp, known_depth
 
 PANDA_HAND = GripperGeometry()
@@ -96,11 +97,7 @@ def find_peaks(
     score = quality.detach().reshape(shape).float().cpu().numpy()
     if settings.blur > 0:
         score = cv2.GaussianBlur(score, (0, 0), settings.blur)
-    side = 2 * settings.radius + 1
-    highest = cv2.dilate(score, np.ones((side, side), np.uint8))  # a max-pool of stride 1
-    rows, columns = np.nonzero((score > settings.threshold) & (score >= highest))
-    ranked = np.argsort(-score[rows, columns], kind="stable")
-    row, column = _first_apart(rows[ranked], columns[ranked], shape, settings)
+    row, column = local_maxima(score, settings.radius, settings.threshold, settings.count)
     at = (..., torch.from_numpy(row), torch.from_numpy(column))
     probability = angle.detach().reshape(-1, *shape)[at].float().softmax(dim=0).cpu().numpy()
     return Peaks(
@@ -109,23 +106,6 @@ def find_peaks(
         width.detach().reshape(shape)[at].float().cpu().numpy(),
         score[row, column],
     )
-
-
-def _first_apart(
-    rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], settings: PeakSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """The first `count` of ranked pixels that keep `radius` apart; equal neighbours need this."""
-    free = np.ones(shape, bool)
-    chosen = []
-    for row, column in zip(rows, columns):
-        if len(chosen) == settings.count:
-            break
-        if free[row, column]:
-            chosen.append((row, column))
-            top, left = max(row - settings.radius, 0), max(column - settings.radius, 0)
-            free[top : row + settings.radius + 1, left : column + settings.radius + 1] = False
-    row, column = np.array(chosen, int).reshape(-1, 2).T
-    return row, column
 
 
 def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:

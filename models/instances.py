@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from utils.height_map import HeightMap
+from utils.local_maxima import local_maxima
 from utils.pixel_scaling import PixelScaling
 from utils.transforms import RGBDFrame, deproject, project
 
@@ -87,13 +88,8 @@ def vote_centres(
     u, v = place[((place >= 0) & (place < (columns, rows))).all(axis=1)].T
     count = np.bincount(v * columns + u, minlength=rows * columns).reshape(rows, columns)
     density = cv2.GaussianBlur(count.astype(np.float32), (0, 0), settings.blur)
-    window = np.ones((2 * settings.apart + 1,) * 2, np.uint8)
     least = settings.least / cell**2 / (2 * np.pi * settings.blur**2)  # all at one point, blurred
-    v, u = np.nonzero((density >= cv2.dilate(density, window)) & (density >= least))
-    found: list[np.ndarray] = []
-    for peak in np.argsort(-density[v, u], kind="stable"):
-        place = np.array([u[peak], v[peak]]) - settings.margin
-        if all(np.abs(place - other).max() > settings.apart for other in found):
-            found.append(place)
+    peaks = local_maxima(density, settings.apart, least)
+    found = np.column_stack(peaks[::-1]) - settings.margin
     near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
     return np.array([votes[around].mean(axis=0) for around in near]).reshape(-1, 2)

@@ -157,6 +157,7 @@ def run_network(
     depth = scaling.image(fill_holes(frame.depth))
     image = to_input(scaling.image(frame.rgb), depth)
     device = next(model.parameters()).device
-    model.eval()
+    if model.training:  # eval() walks through all modules
+        model.eval()
     maps = model(image[None].to(device), centres=centres)
     return tuple(part.float().cpu() for part in maps)

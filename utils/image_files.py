@@ -17,6 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from utils.errors import UserError
+from utils.transforms import known_depth
 
 MILLIMETRES = 0.001  # what whole numbers in a depth file are, unless the user says otherwise
 SATURATED = 65535  # the other usual value of an unknown pixel in 16 bits, beside 0
@@ -70,7 +71,7 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
         )
     if scale is None:
         scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
-    known = np.isfinite(values) & (values > 0)
+    known = known_depth(values)
     if values.dtype == np.uint16:
         known &= values != SATURATED
     return np.where(known, values * np.float64(scale), 0).astype(np.float32)
