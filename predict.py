@@ -13,9 +13,9 @@ Without --table-height the table is the dominant plane of the depth image; witho
 the gripper descends along that plane's normal. Prints JSON and writes it to OUT/grasps.json,
 with a picture in OUT/grasps.png. Of each grasp: `pixel` (u, v) and `image_angle` (from right
 towards down) on the image; `width` between the fingertips; and in `camera` and `world` the pose of
-the point between the closed fingertips: z along the approach, y along the closing line. Metres and
-radians; quaternions are x, y, z, w. Nothing to grasp is an empty list; a bad input ends with
-one sentence and status 2.
+the middle between the closed finger pads, 7 mm above the tips: z along the approach, y along the
+closing line. Metres and radians; quaternions are x, y, z, w. Nothing to grasp is an empty list; a
+bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations

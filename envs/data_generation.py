@@ -109,6 +109,10 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
             except BaseException:  # Ctrl-C, or an error in a worker such as a full disk
                 progress.write("stopping: finishing the shards under way")
                 pool.shutdown(cancel_futures=True)
+                progress.write(
+                    f"{_frames_kept(config, folder)} frames are kept in {folder}; the same command "
+                    "goes on from there"
+                )
                 raise
     except BrokenProcessPool as error:
         raise UserError(
@@ -131,6 +135,13 @@ def shard_count(config: Config, split: str) -> int:
     """Shards that hold at least the configured number of frames."""
     frames = config.data.frames if split == "train" else config.data.validation_frames
     return -(-frames // (FRAMES_PER_SCENE * SCENES_PER_SHARD))
+
+
+def _frames_kept(config: Config, folder: Path) -> str:
+    """How many frames of how many are there, e.g. "64 of 384"."""
+    shards = sum(shard_count(config, split) for split in SPLITS)
+    kept, each = shards - len(missing_shards(config, folder, 0, 1)), SCENES_PER_SHARD
+    return f"{kept * each * FRAMES_PER_SCENE} of {shards * each * FRAMES_PER_SCENE}"
 
 
 def _claim(folder: Path, config: Config) -> None:

@@ -7,7 +7,7 @@ and what the cell's camera sees of it:
     python -m envs.studio --layout packed --rgbd runs/scene
 
 `--rgbd` makes a folder of color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py
-takes them.
+takes them, and scene.png, which is for people.
 """
 
 from __future__ import annotations
@@ -110,7 +110,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Write a picture of one scene, and what the cell's camera sees of it."""
 
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default="scene.png", help="PNG or JPEG file")
+        parser.add_argument(
+            "--output",
+            type=Path,
+            help="PNG or JPEG file; default: scene.png, in the folder of --rgbd",
+        )
         parser.add_argument("--objects", default="primitives", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
@@ -122,11 +126,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     with Cell(config) as cell:
         cell.load(make_scene(chosen.layout, objects, config.seed, config))
         with Studio(cell) as studio:
-            imageio.imwrite(chosen.output, studio.picture())
-        print(f"wrote {chosen.output}")
+            picture = studio.picture()
         if chosen.rgbd is not None:
             frame, folder = cell.frame(), chosen.rgbd
             write_rgbd(frame, folder)
+        output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
+        imageio.imwrite(output, picture)
+        print(f"wrote {output}")
+        if chosen.rgbd is not None:
             numbers = " ".join(f"{frame.K[i]:.6g}" for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
             files = {"rgb": "color.png", "depth": "depth.png", "camera-pose": "T_WC.txt"}
             given = [part for k, name in files.items() for part in (f"--{k}", str(folder / name))]

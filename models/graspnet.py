@@ -104,7 +104,7 @@ class GraspNet(nn.Module):
     ):
         super().__init__()
         if backbone not in BACKBONES:
-            raise unknown_choice("GraspNet backbone", backbone, BACKBONES)
+            raise unknown_choice("GraspNet backbone (train.backbone)", backbone, BACKBONES)
         self.model_args = {
             "input_channels": input_channels,
             "num_angle_bins": num_angle_bins,

@@ -245,8 +245,11 @@ def test_resume_takes_the_run_s_config(tmp_path):
     write(tmp_path, "seed: 9\n", "config.yaml")
     config, options = parse_args(["--resume", str(tmp_path), "evaluate.rounds=4"], "a script")
     assert (config.seed, config.evaluate.rounds, options.resume) == (9, 4, tmp_path)
-    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+    with pytest.raises(ConfigError, match=r"no such folder"):
         parse_args(["--resume", str(tmp_path / "none")], "a script")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        parse_args(["--resume", str(tmp_path / "empty")], "a script")
 
 
 def test_run_script(monkeypatch, capsys):

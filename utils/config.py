@@ -235,9 +235,10 @@ def parse_args(
     if options.resume is not None:
         path = options.resume / "config.yaml"
         if not path.is_file():
+            lack = "no config.yaml in there" if options.resume.is_dir() else "no such folder"
             raise ConfigError(
-                f"--resume {options.resume}: no config.yaml in there; give the folder of a run, "
-                "such as runs/evaluate/20250131-120000"
+                f"--resume {options.resume}: {lack}; give the folder of a run, such as "
+                f"runs/{Path(parser.prog).stem}/20250131-120000"
             )
     return load_config(path, options.overrides), options
 

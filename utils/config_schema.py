@@ -184,7 +184,10 @@ class DataConfig(Section):
     @model_validator(mode="after")
     def _real_data_have_a_root(self) -> DataConfig:
         if self.kind != "simulated" and self.root is None:
-            raise ValueError(f"kind {self.kind} needs root, the folder that holds the data set")
+            raise ValueError(
+                f"kind {self.kind} needs root, the folder that holds the data set: add "
+                f"data.root=path/to/{self.kind}"
+            )
         if self.fold is not None and self.fold >= self.folds:
             raise ValueError(f"fold {self.fold} is not below folds ({self.folds})")
         return self
@@ -192,7 +195,7 @@ class DataConfig(Section):
 
 class TrainConfig(Section):
     backbone: Name
-    max_width: Positive | None
+    max_width: Annotated[float, Field(gt=0, le=0.5)] | None
     initial: Annotated[Path, Field(strict=False)] | None
     epochs: Count
     batch_size: Count
