@@ -9,6 +9,7 @@ look to that very camera.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,11 +79,15 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
     return replace(frame, T_WC=T_WC)
 
 
+@functools.lru_cache(maxsize=2)
 def teach(cell: Cell) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: the board's pose in one image, taken while
-    the jig holds the board at a known pose in E. Empties the cell."""
+    the jig holds the board at a known pose in E. Empties the cell, the first time: a camera has to
+    be shown something once only."""
     servo, camera = cell.config.servo, cell.config.camera
-    intrinsics = Intrinsics(servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far)
+    intrinsics = Intrinsics(
+        servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far
+    )
     cell.build(Scene("isolated", 0, ()))
     T_EB = np.eye(4)  # how the jig is built: the board's middle before the camera's nominal place
     T_EB[:3, :3] = wrist_mount(camera)[:3, :3] @ _BOARD_TURN

@@ -74,7 +74,7 @@ Motion = Callable[[float], tuple[float, float, float]]
 
 @contextlib.contextmanager
 def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[None]:
-    """Within the block a motion carries the objects of the cell, from now on; None: nothing does."""
+    """Within the block a motion carries the objects of the cell, from now on, unless it is None."""
     if motion is None or not cell.remaining:
         yield
         return
@@ -111,9 +111,7 @@ class _Carrier:
             pybullet.resetBasePositionAndOrientation(
                 body, position, quaternion, physicsClientId=cell.client
             )
-            pybullet.resetBaseVelocity(
-                body, velocity, [0, 0, omega], physicsClientId=cell.client
-            )
+            pybullet.resetBaseVelocity(body, velocity, [0, 0, omega], physicsClientId=cell.client)
 
     def _planar(self, seconds: float) -> np.ndarray:
         """(4, 4) motion in W, about the first object's centre."""

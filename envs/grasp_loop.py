@@ -68,7 +68,7 @@ _BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
 _REACHED = 0.0015  # m from the end of the path that count as there
 _SLACK_SECONDS = 0.35  # beyond what the path takes, for the end of the blind stage
 _SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
-_CHARGE = 1.5  # 1/s: the descent slows in front of the height of commitment
+_NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
 
 _TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are told as they look to the camera
 
@@ -88,7 +88,7 @@ class WristCamera:
         camera, grasp = cell.config.camera, cell.config.grasp
         self.cell, self.latency = cell, latency
         self.intrinsics = Intrinsics(
-            grasp.width, grasp.height, camera.wrist_fov_deg, camera.near, camera.far
+            grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
         )
         self._coming: deque[DepthSight] = deque()
 
@@ -152,7 +152,7 @@ class ClosedLoop:
         self.T_EC, self.latency = beliefs.T_EC, latency
         self.camera = camera or WristCamera(cell, latency)
         grasp = cell.config.grasp
-        intrinsics = Intrinsics(grasp.width, grasp.height, cell.config.camera.wrist_fov_deg)
+        intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
         self.K, self.size = intrinsics.K, (grasp.width, grasp.height)
         period = servo_period(cell) * cell.dt
         self.law = make_law(controller, self.K, self.T_EC, grasp.gain, period)
@@ -232,8 +232,9 @@ class _Run:
     def _lowest_view(self) -> float:
         """The height above the grasp from which the camera still sees the object."""
         heights = np.arange(self.settings.commit_height, self.settings.look_height, 0.01)
+        nearest = self.cell.config.camera.near + _NEAR_PLANE
         for height in heights:
-            if self.tracker.seen_share(self._goal(height)) >= _SEEN_AT_GOAL:
+            if self.tracker.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
                 return float(height)
         return self.settings.look_height
 
@@ -265,9 +266,11 @@ class _Run:
         self.T_WO = T_WC @ found.T_CO
         pose = planar_part(self.T_WO)
         if self.motion is None:
-            self.motion = PlanarMotion(pose, sight.seconds)
+            self.motion = PlanarMotion(pose, sight.seconds, turns=not self.tracker.round)
         else:
-            self.motion.see(pose, found.deviations, sight.seconds)
+            axes = planar(0, 0, pose[2])[:3, :3]
+            covariance = axes @ found.covariance @ axes.T
+            self.motion.see(pose, covariance, sight.seconds)
         self.found_seconds = sight.seconds
         self._spent = time.perf_counter() - start
         return True
@@ -347,13 +350,12 @@ class _Run:
             height < self.lowest + 0.01
             and distance < settings.aligned_distance
             and turn < settings.aligned_angle
-            and self.cell.seconds - self.found_seconds < 0.5 * settings.lost_seconds + (
-                self.loop.latency
-            )
+            and self.cell.seconds - self.found_seconds
+            < 0.5 * settings.lost_seconds + (self.loop.latency)
         )
 
     def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[View, View]:
-        """What is seen and what should be seen: the outline's points and the pose. Of the points
+        """What is seen and what should be seen: the template's points and its pose. Of the points
         those count that lie within the image; raises FeatureCountError where they are too few."""
         views = []
         seen = np.ones(len(self.template.points), bool)
@@ -366,7 +368,7 @@ class _Run:
             seen = (pixels > -0.5).all(axis=1) & (pixels < np.array(self.loop.size) - 0.5).all(1)
             if seen.sum() < MIN_POINTS:
                 raise FeatureCountError(
-                    f"points: {seen.sum()} of the object's outline are in the image, needed are at "
+                    f"points: {seen.sum()} of those on the object are in the image, needed are at "
                     f"least {MIN_POINTS}"
                 )
         return tuple(View(v.points[seen], v.depths[seen], v.T_CO) for v in views)

@@ -162,6 +162,7 @@ class GraspConfig(Section):
     controller: Controller
     width: Pixels
     height: Pixels
+    fov_deg: Annotated[float, Field(ge=1, le=170)]
     gain: Positive
     look_height: Annotated[float, Field(gt=0, le=0.3)]
     commit_height: Annotated[float, Field(gt=0, le=0.3)]

@@ -14,8 +14,8 @@ import numpy as np
 
 from utils.object_tracking import planar
 
-_ACCELERATION = 0.15  # m/s^2, standard deviation of a pause's change of velocity per second
-_ANGULAR_ACCELERATION = 0.6  # rad/s^2
+_ACCELERATION = 0.03  # m/s^2 by root hertz: how fast velocities wander unless something pushes
+_ANGULAR_ACCELERATION = 0.06  # rad/s^2 by root hertz
 _FIRST_RATES = (0.15, 0.15, 0.5)  # m/s, m/s, rad/s: what a first sighting leaves open
 _SURPRISE = 16.0  # squared Mahalanobis distance of 3 numbers; chance gives more once in 900 times
 
@@ -23,10 +23,13 @@ _SURPRISE = 16.0  # squared Mahalanobis distance of 3 numbers; chance gives more
 class PlanarMotion:
     """The filter. Times are seconds of one clock; sightings come in their order."""
 
-    def __init__(self, pose: tuple[float, float, float], seconds: float, moving: bool = True):
-        """pose: x, y, turn at the first sighting. moving: whether it may already be on its way."""
+    def __init__(self, pose: tuple[float, float, float], seconds: float, turns: bool = True):
+        """pose: x, y, turn at the first sighting. turns: False for what is round, whose turning
+        cannot be seen; it is taken to go straight on."""
         self.state = np.array([*pose, 0.0, 0.0, 0.0])
-        rates = np.array(_FIRST_RATES) if moving else np.full(3, 1e-3)
+        self._turns = 1.0 if turns else 1e-3
+        self._rates = np.array(_FIRST_RATES) * [1, 1, self._turns]
+        rates = self._rates
         self.covariance = np.diag(np.concatenate([[0.003, 0.003, 0.05], rates]) ** 2)
         self.seconds = seconds
 
@@ -44,21 +47,20 @@ class PlanarMotion:
         (x0, y0, a0), (x1, y1, a1) = self.at(start)[:3], self.at(end)[:3]
         return planar(x1, y1, a1) @ np.linalg.inv(planar(x0, y0, a0))
 
-    def see(self, pose: tuple[float, float, float], deviations: np.ndarray, seconds: float) -> None:
-        """Take in a sighting of x, y and turn with standard deviations (3,)."""
+    def see(self, pose: tuple[float, float, float], covariance: np.ndarray, seconds: float) -> None:
+        """Take in a sighting of x, y and turn with a covariance (3, 3) in W's axes."""
         dt = seconds - self.seconds
         F = _transition(self.state, dt)
         self.state = _advance(self.state, dt)
-        self.covariance = F @ self.covariance @ F.T + _noise(dt)
+        self.covariance = F @ self.covariance @ F.T + _noise(dt, self._turns)
         self.seconds = seconds
         innovation = np.asarray(pose) - self.state[:3]
         innovation[2] = (innovation[2] + np.pi) % (2 * np.pi) - np.pi
-        R = np.diag(np.asarray(deviations) ** 2)
-        S = self.covariance[:3, :3] + R
+        S = self.covariance[:3, :3] + covariance
         if innovation @ np.linalg.solve(S, innovation) > _SURPRISE:
-            forget = np.diag(np.concatenate([[0.02, 0.02, 0.2], _FIRST_RATES]) ** 2)
+            forget = np.diag(np.concatenate([[0.02, 0.02, 0.2], self._rates]) ** 2)
             self.covariance = self.covariance + forget
-            S = self.covariance[:3, :3] + R
+            S = self.covariance[:3, :3] + covariance
         gain = np.linalg.solve(S, self.covariance[:3]).T
         self.state = self.state + gain @ innovation
         self.covariance = self.covariance - gain @ self.covariance[:3]
@@ -91,10 +93,10 @@ def _transition(state: np.ndarray, dt: float) -> np.ndarray:
     return F
 
 
-def _noise(dt: float) -> np.ndarray:
-    """(6, 6) of white accelerations."""
+def _noise(dt: float, turns: float) -> np.ndarray:
+    """(6, 6) of white accelerations; turns: factor on that of the turn."""
     Q = np.zeros((6, 6))
-    strength = np.array([_ACCELERATION, _ACCELERATION, _ANGULAR_ACCELERATION]) ** 2
+    strength = np.array([_ACCELERATION, _ACCELERATION, turns * _ANGULAR_ACCELERATION]) ** 2
     dt = max(dt, 0.0)
     for k in range(3):
         Q[k, k] = strength[k] * dt**3 / 3

@@ -35,8 +35,10 @@ _HUBER = 0.008  # m of height beyond which a difference counts less
 _ALIGNED = 0.80  # least correlation of template and image
 _RIDGE = 0.02  # of the Hessian's turn: what is round keeps the turn that was expected
 _YAWS = 24  # directions that are tried where the object is not where it was expected
+_RECTANGLE = (0.015, 0.03)  # m, smallest and largest half side of a template's rectangle of points
 _SEEN = 0.6  # share of the object that has to be in the image
 _NOISE = 0.001  # m, standard deviation of a measured place
+_TURN_NOISE = 0.02  # rad, what sides that are seen now and were not then do to a measured turn
 
 
 class TargetLostError(ServoError):
@@ -45,11 +47,11 @@ class TargetLostError(ServoError):
 
 class Found(NamedTuple):
     """T_CO: (4, 4) the object in the camera. correlation: of image and template, at most 1.
-    deviations: (3,) standard deviations of x, y (m) and turn (rad) on the table."""
+    covariance: (3, 3) of x, y (m) and turn (rad) on the table, in O's axes."""
 
     T_CO: np.ndarray
     correlation: float
-    deviations: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ class ObjectTemplate:
 
     height: (N, N) float32 metres over the table in O; the middle of cell [row, col] is at
     x = CELL (col - (N - 1) / 2) and y likewise from the row. seen: (N, N) bool, where the camera
-    saw anything: the rest lay in the object's shadow. points: (n, 3) in O, metres: outermost points
-    of the object's outline, each at its height.
+    saw anything: the rest lay in the object's shadow. points: (8, 3) in O, metres: a rectangle
+    that sticks to the object, see `_rectangle`.
     """
 
     height: np.ndarray
@@ -92,7 +94,7 @@ def make_template(frame: RGBDFrame, grasp: Grasp, table: float = 0.0) -> ObjectT
     _, label = cv2.connectedComponents(above, connectivity=8)
     rows, cols = np.nonzero(label)
     if len(rows) == 0:
-        raise TargetLostError("target lost: nothing stands on the table where the grasp was planned")
+        raise TargetLostError("target lost: nothing stands on the table where it was to be grasped")
     nearest = np.argmin((rows - reach) ** 2 + (cols - reach) ** 2)
     mine = label == label[rows[nearest], cols[nearest]]
     seen = (whole >= 0) & (mine | ~(above > 0))  # what belongs to a neighbour is not known
@@ -102,16 +104,18 @@ def make_template(frame: RGBDFrame, grasp: Grasp, table: float = 0.0) -> ObjectT
     half = min(half, reach)
     cut = slice(reach - half, reach + half + 1)
     return ObjectTemplate(
-        whole[cut, cut].copy(), seen[cut, cut].copy(), _outline(rows, cols, whole, reach)
+        whole[cut, cut].copy(), seen[cut, cut].copy(), _rectangle(rows, cols, whole, reach)
     )
 
 
-def _outline(rows, cols, height, reach, directions: int = 8) -> np.ndarray:
-    """(8, 3) in O: the object's farthest cell in each of so many directions, at its height."""
+def _rectangle(rows, cols, height, reach) -> np.ndarray:
+    """(8, 3) in O: corners and middles of the sides of a rectangle about the object's middle, at
+    its typical height; as large as the object, within bounds that keep it in the image for long."""
     xy = CELL * (np.column_stack([cols, rows]) - reach)
-    angles = 2 * np.pi * (np.arange(directions) + 0.5) / directions
-    farthest = np.argmax(xy @ np.stack([np.cos(angles), np.sin(angles)]), axis=0)
-    return np.column_stack([xy[farthest], height[rows[farthest], cols[farthest]]])
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    middle, half = (low + high) / 2, np.clip((high - low) / 2, *_RECTANGLE)
+    ring = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]])
+    return np.column_stack([middle + ring * half, np.full(8, np.median(height[rows, cols]))])
 
 
 def _patch(depth: np.ndarray, K: np.ndarray, T_OC: np.ndarray, side: int) -> np.ndarray:
@@ -127,9 +131,7 @@ def _patch(depth: np.ndarray, K: np.ndarray, T_OC: np.ndarray, side: int) -> np.
     split = int(np.clip(np.ceil(1.4 * near / K[0, 0] / CELL), 1, 6))
     z = np.repeat(np.repeat(depth[box].astype(float), split, axis=0), split, axis=1)
     sub = (np.arange(split) + 0.5) / split - 0.5
-    v, u = (
-        (np.arange(part.start, part.stop)[:, None] + sub).ravel() for part in box
-    )
+    v, u = ((np.arange(part.start, part.stop)[:, None] + sub).ravel() for part in box)
     x = ((u - K[0, 2]) / K[0, 0])[None, :] * z
     y = ((v - K[1, 2]) / K[1, 1])[:, None] * z
     rise = T_OC[2, 0] * x + T_OC[2, 1] * y + T_OC[2, 2] * z + T_OC[2, 3]
@@ -220,10 +222,9 @@ class ObjectTracker:
         self._xy = CELL * (np.arange(side) - (side - 1) / 2)
         self._levels = [_Level(template, blur, self._xy) for blur in _BLURS]
         rows, cols = np.nonzero(template.height > LOWEST)
-        self._solid = np.column_stack(
-            [self._xy[cols], self._xy[rows], template.height[rows, cols]]
-        )
+        self._solid = np.column_stack([self._xy[cols], self._xy[rows], template.height[rows, cols]])
         self._centre = self._solid[:, :2].mean(axis=0)
+        self.round = self._levels[-1].round
 
     def find(self, depth: np.ndarray, T_CO: np.ndarray, T_CW: np.ndarray, table=0.0) -> Found:
         """The object in a depth image (H, W), metres.
@@ -236,28 +237,31 @@ class ObjectTracker:
         expected = planar(x, y, turn)
         if self.seen_share(inverse_pose(T_PC) @ expected) < _SEEN:
             raise TargetLostError("target lost: it is expected outside the image")
-        T_PO, correlation, deviations = self._align(depth, T_PC, expected)
+        T_PO, correlation, covariance = self._align(depth, T_PC, expected)
         if correlation < _ALIGNED:
             again = self._search(depth, T_PC, expected)
             if again is not None and again[1] > correlation:
-                T_PO, correlation, deviations = again
+                T_PO, correlation, covariance = again
         if correlation < _ALIGNED:
             raise TargetLostError(
                 f"target lost: image and template correlate by {correlation:.2f} only, at least "
                 f"{_ALIGNED} is needed"
             )
-        return Found(inverse_pose(T_PC) @ T_PO, correlation, deviations)
+        return Found(inverse_pose(T_PC) @ T_PO, correlation, covariance)
 
-    def seen_share(self, T_CO: np.ndarray) -> float:
-        """Share of the object's surface that lies within the image, were it at T_CO (4, 4)."""
+    def seen_share(self, T_CO: np.ndarray, nearest: float = 0.0) -> float:
+        """Share of the object's surface that lies within the image, were it at T_CO (4, 4); 0 where
+        any of it is nearer than `nearest` metres, of which a depth camera sees nothing."""
         seen = transform_points(T_CO, self._solid)
+        if seen[:, 2].min() < nearest:
+            return 0.0
         pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-3) * self.K[[0, 1], [0, 1]]
         pixels = pixels + self.K[:2, 2]
         inside = (seen[:, 2] > 0) & (pixels > -0.5).all(axis=1)
         return float(np.mean(inside & (pixels < np.array(self.size) - 0.5).all(axis=1)))
 
     def _align(self, depth, T_PC, T_PO) -> tuple[np.ndarray, float, np.ndarray]:
-        """T_PO refined, the correlation there, and standard deviations (3,)."""
+        """T_PO refined, the correlation there, and the covariance (3, 3)."""
         for attempt in range(2):
             image = _patch(depth, self.K, inverse_pose(T_PO) @ T_PC, self.template.side)
             motion = np.eye(3)
@@ -268,7 +272,7 @@ class ObjectTracker:
             if np.hypot(x, y) < 2 * CELL and abs(turn) < 0.05:
                 break
         level = self._levels[-1]
-        return T_PO, level.correlation(image, motion), level.deviations
+        return T_PO, level.correlation(image, motion), level.covariance()
 
     def _search(self, depth, T_PC, expected) -> tuple[np.ndarray, float, np.ndarray] | None:
         """The best of many places and turns: each thing on the table, in each direction."""
@@ -329,14 +333,20 @@ class _Level:
         hessian = self.J.T @ self.J
         self.ridge = np.diag([0, 0, _RIDGE * 0.02**2 * (hessian[0, 0] + hessian[1, 1])])
         self.ridge += 1e-9 * np.trace(hessian) * np.eye(3)
-        covariance = np.linalg.inv(hessian + self.ridge)
-        scale = _NOISE**2 / max(covariance[0, 0], covariance[1, 1])
-        turn = _NOISE * np.sqrt(covariance[2, 2] / max(covariance[0, 0], covariance[1, 1]))
-        blind = hessian[2, 2] < 4 * self.ridge[2, 2]  # as good as round
-        self.deviations = np.append(
-            np.sqrt(np.maximum(scale * np.diag(covariance)[:2], (0.5 * _NOISE) ** 2)),
-            10.0 if blind else np.clip(turn, 0.01, 10.0),
-        )
+        whole = np.linalg.inv(hessian + self.ridge)
+        self.scale = _NOISE**2 / max(whole[0, 0], whole[1, 1])
+        self.round = bool(hessian[2, 2] < 4 * self.ridge[2, 2])
+        self._hessian = hessian
+
+    def covariance(self) -> np.ndarray:
+        """(3, 3) of the last alignment: a side of the object that was not seen leaves its place
+        along that side open. The turn of what is round is as good as unknown."""
+        covariance = self.scale * np.linalg.inv(self._hessian + self.ridge)
+        covariance += np.diag([0.25 * _NOISE**2, 0.25 * _NOISE**2, _TURN_NOISE**2])
+        if self.round:
+            covariance[2, :] = covariance[:, 2] = 0.0
+            covariance[2, 2] = 100.0
+        return covariance
 
     def _warped(self, image: np.ndarray, motion: np.ndarray) -> np.ndarray:
         matrix = (self._to_cells @ motion @ self._to_metres)[:2]
@@ -350,7 +360,8 @@ class _Level:
             difference = self._warped(smooth, motion) - self.target
             weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(difference), 1e-9))
             weighted = self.J * (weight * (self._warped(known, motion) > 0.99))[:, None]
-            step = np.linalg.solve(weighted.T @ self.J + self.ridge, weighted.T @ difference)
+            self._hessian = weighted.T @ self.J
+            step = np.linalg.solve(self._hessian + self.ridge, weighted.T @ difference)
             motion = motion @ np.linalg.inv(planar(*step)[np.ix_([0, 1, 3], [0, 1, 3])])
             if np.hypot(step[0], step[1]) < 2e-5 and abs(step[2]) < 5e-4:
                 break
