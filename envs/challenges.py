@@ -71,13 +71,11 @@ def displacement(
 def conveyor(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float, turning: bool
 ) -> Conveyor:
-    """Sideways past the robot, from the side on which the object lies to the other, up to 30
-    degrees askew and then rather towards the middle; turning at 0.2 to 0.4 rad/s."""
-    x, y = centre - place
-    askew = rng.uniform(0, np.pi / 6) * np.sign(x or 1.0)
-    side = np.sign(y or 1.0)
-    heading = side * (np.pi / 2 - askew)
-    turn_rate = rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.4) if turning else 0.0
+    """Sideways past the robot, away from the bin (whose walls the hand would hit), up to 30 degrees
+    askew towards the middle of the workspace; turning by 0.2 to 0.4 rad/s that way, too."""
+    inwards = 1.0 if place[0] > centre[0] else -1.0  # left of +y lies -x
+    heading = np.pi / 2 + inwards * rng.uniform(0, np.pi / 6)
+    turn_rate = inwards * rng.uniform(0.2, 0.4) if turning else 0.0
     return Conveyor(speed, heading, turn_rate)
 
 
