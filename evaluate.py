@@ -3,6 +3,7 @@
     python evaluate.py
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
+    python evaluate.py --config configs/servo.yaml     # closed loops on what moves
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
 runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
@@ -27,10 +28,12 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import imageio.v3 as iio
 from tqdm import tqdm
 
 from envs.cell import Cell
+from envs.challenges import CHALLENGES
 from envs.execution import GraspOutcome
 from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
@@ -47,6 +50,7 @@ from utils.results import (
     RoundRecord,
     append_round,
     compare,
+    contestant,
     interruption,
     planned_rounds,
     print_comparisons,
@@ -150,7 +154,8 @@ def worker_count(config: Config) -> int:
 def announce(config: Config, run: Path, device: str) -> None:
     plan = config.evaluate
     print(
-        f"{', '.join(plan.policies)} on {', '.join(plan.scenarios)} scenes of "
+        f"{', '.join(contestant(*pair) for pair in contestants(config))} on "
+        f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
         f"seed {config.seed}, on {device}; results in {run}",
         flush=True,
@@ -162,12 +167,13 @@ def announce(config: Config, run: Path, device: str) -> None:
 
 @dataclass(frozen=True)
 class Task:
-    """One scene, on which every policy that is still to be scored works in turn."""
+    """One scene, on which every policy that is still to be scored works in turn, a policy being a
+    planner's name and a controller's."""
 
     objects: str
     scenario: str
     seed: int
-    policies: tuple[str, ...]
+    policies: tuple[tuple[str, str], ...]
     keep_pictures: bool
     film_folder: Path | None
 
@@ -184,6 +190,14 @@ class Outcome:
     error: UserError | None = None
 
 
+def contestants(config: Config) -> list[tuple[str, str]]:
+    """Every policy with every controller."""
+    controllers = config.evaluate.controllers or (config.grasp.controller,)
+    return [
+        (policy, controller) for policy in config.evaluate.policies for controller in controllers
+    ]
+
+
 def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
     """What is left to do; every policy gets the same seeds."""
     plan = config.evaluate
@@ -193,7 +207,9 @@ def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Ta
         for objects in plan.object_sets:
             for scenario in plan.scenarios:
                 policies = tuple(
-                    p for p in plan.policies if (p, scenario, objects, seed) not in known
+                    pair
+                    for pair in contestants(config)
+                    if (contestant(*pair), scenario, objects, seed) not in known
                 )
                 if policies:
                     filmed = number < plan.videos and scenario == plan.scenarios[-1]
@@ -267,7 +283,7 @@ def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     return (
         plan.object_sets.index(record.objects),
         plan.scenarios.index(record.scenario),
-        plan.policies.index(record.policy),
+        [contestant(*pair) for pair in contestants(config)].index(record.policy),
         record.seed,
     )
 
@@ -297,6 +313,7 @@ _worker_cell: Cell
 def _start_worker(config: Config) -> None:
     global _worker_config, _worker_cell
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    cv2.setNumThreads(1)  # as with OMP_NUM_THREADS
     _worker_config, _worker_cell = config, Cell(config)
 
 
@@ -304,12 +321,14 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     """Let each policy of a task work on its scene. Runs in a worker process."""
     config, cell = _worker_config, _worker_cell
     scene = make_scene(
-        task.scenario, load_objects(task.objects, config), task.seed, config, cell.client
-    )
+        CHALLENGES[task.scenario].layout, load_objects(task.objects, config), task.seed, config,
+        cell.client,
+    )  # fmt: skip
     workspace = workspace_of(config)
     rounds, pictures, films = [], [], []
-    for policy in task.policies:
-        planner = make_planner(policy, GripperGeometry(), workspace, task.seed)
+    for planner_name, controller in task.policies:
+        policy = contestant(planner_name, controller)
+        planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
         privileged = getattr(planner, "needs_truth", False)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
@@ -319,9 +338,9 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
         film = Film(cell) if task.film_folder is not None else None
         rounds.append(
             run_round(
-                cell, scene, planner, policy=policy, objects=task.objects,
-                max_failures=config.evaluate.max_failures, with_truth=privileged,
-                on_attempt=keep,
+                cell, scene, planner, policy=planner_name, objects=task.objects,
+                max_failures=config.evaluate.max_failures, scenario=task.scenario,
+                controller=controller, with_truth=privileged, on_attempt=keep,
             )
         )  # fmt: skip
         if film is not None:

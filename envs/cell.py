@@ -43,7 +43,8 @@ class Cell:
     """A simulated robot cell.
 
     `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_step` is called
-    after every physics step with the cell (used to film). Close it, or use it in a `with` block.
+    after every physics step with the cell (used to film), `before_step` before it (used to disturb
+    the objects). Close it, or use it in a `with` block.
     """
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
@@ -57,6 +58,7 @@ class Cell:
             )
         config.make_cache_folder()
         self.on_step: Callable[[Cell], None] | None = None
+        self.before_step: Callable[[Cell], None] | None = None
         self._gui = gui
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.renderer = load_renderer(self.client, config.sim.renderer)
@@ -91,8 +93,9 @@ class Cell:
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
-        client, on_step = self.client, self.on_step
-        if on_step is None and not self._gui and _divides(self.dt, count):
+        client, on_step, before_step = self.client, self.on_step, self.before_step
+        watched = on_step is not None or before_step is not None or self._gui
+        if not watched and _divides(self.dt, count):
             # The same steps in one call. The time step is set only for that call, because motor
             # commands and contact forces are converted by it.
             pybullet.setPhysicsEngineParameter(
@@ -105,6 +108,8 @@ class Cell:
             self.steps += count
             return
         for _ in range(count):
+            if before_step is not None:
+                before_step(self)
             pybullet.stepSimulation(physicsClientId=client)
             self.steps += 1
             if on_step is not None:

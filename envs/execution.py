@@ -7,7 +7,9 @@ successful grasp is. Knows nothing of how grasps are found.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,54 +36,42 @@ class GraspOutcome:
 
     reason: `success`, or how it failed: `ik` (a pose or the line to it cannot be reached),
     `collision` (a contact stopped the approach), `missed` (the fingers closed on nothing),
-    `slipped` (lost before the lift height), `dropped` (lost after it).
+    `slipped` (lost before the lift height), `dropped` (lost after it); of a closed loop also `lost`
+    (the object was not seen any more) and `stopped` (by the safety gate, or out of time).
     sim_seconds: simulated time from home and back home, at legal joint speeds.
-    object_index: the object that was held, if any.
+    object_index: the object that was held, if any. detail: a sentence on the failure, if there is
+    more to say.
     """
 
     reason: str
     sim_seconds: float
     object_index: int | None = None
+    detail: str = ""
 
     @property
     def success(self) -> bool:
         return self.reason == "success"
 
 
-class _Failure(Exception):
+class GraspFailure(Exception):
     """Ends an attempt early with a reason."""
 
-    def __init__(self, reason: str, object_index: int | None = None):
-        super().__init__(reason)
-        self.reason, self.object_index = reason, object_index
+    def __init__(self, reason: str, object_index: int | None = None, detail: str = ""):
+        super().__init__(detail or reason)
+        self.reason, self.object_index, self.detail = reason, object_index, detail
 
 
-def execute_grasp(cell: Cell, grasp: Grasp) -> GraspOutcome:
-    """Reach, approach, close, lift, hold, carry to the bin, release, go home.
+class Around(NamedTuple):
+    """The open gripper is where it should close. wait: lets a number of physics steps pass while
+    the fingers close. pose: (4, 4) T_WE from which to lift; None: where the arm is by then."""
 
-    Success: one object gripped by both fingers, off the table, its centre of mass above
-    execution.lift_height, for execution.hold_seconds and all the way to the bin (looked at every
-    0.05 s). A picked object is retired. Whatever happens, the arm is home again at the end. Raises
-    PhysicsError when the simulation blows up.
-    """
-    cell.check_physics()
-    start = cell.seconds
-    try:
-        index = _pick(cell, grasp)
-        _carry_to_bin(cell, index)
-        outcome, index = "success", index
-    except UnreachableError:
-        outcome, index = "ik", None
-    except _Failure as failure:
-        outcome, index = failure.reason, failure.object_index
-    _go_home(cell)
-    cell.check_physics()
-    cell.retire_lost_objects()
-    return GraspOutcome(outcome, cell.seconds - start, index)
+    wait: Callable[[int], None]
+    pose: np.ndarray | None
 
 
-def _pick(cell: Cell, grasp: Grasp) -> int:
-    """From home to an object held above the lift height; its number. Raises _Failure."""
+def open_loop(cell: Cell, grasp: Grasp) -> Around:
+    """Bring the open gripper around a grasp as planned, without looking again. Raises
+    GraspFailure on a collision and UnreachableError before anything has moved."""
     settings = cell.config.execution
     pregrasp = grasp.pose.copy()
     pregrasp[2, 3] += settings.pregrasp_height
@@ -92,17 +82,53 @@ def _pick(cell: Cell, grasp: Grasp) -> int:
     cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
     _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
     if not _follow(cell, approach, stop_force=settings.contact_stop):
-        raise _Failure("collision")
-    _close(cell)
+        raise GraspFailure("collision")
+    return Around(cell.step, target)
+
+
+Approach = Callable[[Cell, Grasp], Around]
+
+
+def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
+    """Approach, close, lift, hold, carry to the bin, release, go home.
+
+    Success: one object gripped by both fingers, off the table, its centre of mass above
+    execution.lift_height, for execution.hold_seconds and all the way to the bin (looked at every
+    0.05 s). A picked object is retired. Whatever happens, the arm is home again at the end. Raises
+    PhysicsError when the simulation blows up.
+
+    approach: how the open gripper gets around the object; the rest is the same for all.
+    """
+    cell.check_physics()
+    start, detail = cell.seconds, ""
+    try:
+        index = _pick(cell, grasp, approach)
+        _carry_to_bin(cell, index)
+        outcome, index = "success", index
+    except UnreachableError:
+        outcome, index = "ik", None
+    except GraspFailure as failure:
+        outcome, index, detail = failure.reason, failure.object_index, failure.detail
+    _go_home(cell)
+    cell.check_physics()
+    cell.retire_lost_objects()
+    return GraspOutcome(outcome, cell.seconds - start, index, detail)
+
+
+def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
+    """From home to an object held above the lift height; its number. Raises GraspFailure."""
+    settings = cell.config.execution
+    around = approach(cell, grasp)
+    _close(cell, around.wait)
     index = cell.held_object()
     if index is None:
-        raise _Failure("missed")
+        raise GraspFailure("missed")
 
-    lifted = target.copy()
+    lifted = (forward_kinematics(cell.robot.q) if around.pose is None else around.pose).copy()
     lifted[2, 3] = max(grasp.position[2], 0.0) + settings.lift_height + 0.05
     _follow(cell, _line(cell, cell.robot.q, lifted))
     if not cell.is_lifted(index, settings.lift_height):
-        raise _Failure("slipped", index)
+        raise GraspFailure("slipped", index)
     for _ in range(round(settings.hold_seconds / _LOOK_SECONDS)):
         cell.step(round(_LOOK_SECONDS / cell.dt))
         _still_lifted(cell, index)
@@ -111,7 +137,7 @@ def _pick(cell: Cell, grasp: Grasp) -> int:
 
 def _still_lifted(cell: Cell, index: int) -> None:
     if not cell.is_lifted(index, cell.config.execution.lift_height):
-        raise _Failure("dropped", index)
+        raise GraspFailure("dropped", index)
 
 
 def _carry_to_bin(cell: Cell, index: int) -> None:
@@ -127,12 +153,12 @@ def _carry_to_bin(cell: Cell, index: int) -> None:
     cell.retire(index)
 
 
-def _close(cell: Cell) -> None:
+def _close(cell: Cell, wait: Callable[[int], None]) -> None:
     """Close the fingers until they stop moving."""
     cell.robot.command_gripper(0.0)
     before = cell.robot.opening
     for _ in range(round(_CLOSE_SECONDS / _LOOK_SECONDS)):
-        cell.step(round(_LOOK_SECONDS / cell.dt))
+        wait(round(_LOOK_SECONDS / cell.dt))
         opening = cell.robot.opening
         if abs(opening - before) < 2e-4:
             return

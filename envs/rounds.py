@@ -13,10 +13,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from envs.beliefs import CameraBeliefs, teach
 from envs.cell import Cell, PhysicsError
-from envs.execution import GraspOutcome, execute_grasp
+from envs.challenges import CHALLENGES
+from envs.disturbances import disturbed
+from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
+from envs.grasp_loop import ClosedLoop
+from envs.kinematics import forward_kinematics
 from envs.scenes import Scene
-from utils.results import NO_PLAN, AttemptRecord, RoundRecord
+from utils.object_tracking import TargetLostError
+from utils.results import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.
@@ -32,21 +38,29 @@ def run_round(
     policy: str,
     objects: str,
     max_failures: int,
+    scenario: str | None = None,
+    controller: str = OPEN_LOOP,
     with_truth: bool = False,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
 ) -> RoundRecord:
     """Load a scene and let a planner work on it; the record of what happened.
 
-    policy, objects: names for the record. with_truth: the planner is privileged. on_attempt is
-    called after every executed grasp with the frame it was planned on (for pictures).
+    policy, objects: names for the record. scenario: a key of CHALLENGES, what happens besides;
+    None: the scene's layout. controller: how the arm gets to the grasps. with_truth: the planner is
+    privileged. on_attempt is called after every executed grasp with the frame it was planned on
+    (for pictures).
     """
+    scenario = scenario or scene.layout
+    challenge = CHALLENGES[scenario]
+    taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
+    beliefs = challenge.beliefs(cell)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
     plan_seconds, ended = 0.0, "cleared"
     try:
         while cell.remaining and len(failed) < max_failures:
-            frame = cell.frame(with_truth)
+            frame = believed(cell, beliefs, cell.frame(with_truth))
             start = time.perf_counter()
             grasps = plan(frame if with_truth else frame.without_truth())
             plan_seconds = time.perf_counter() - start
@@ -55,12 +69,22 @@ def run_round(
                 ended = NO_PLAN
                 break
             grasp = first_untried(grasps, failed)
-            outcome = execute_grasp(cell, grasp)
+            approach: Approach = open_loop
+            if controller != OPEN_LOOP:
+                approach = ClosedLoop(cell, controller, frame, beliefs, taught, challenge.latency)
+            with disturbed(cell, challenge.motion(cell, len(attempts))):
+                outcome = execute_grasp(cell, grasp, approach)
             on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
             attempts.append(
                 AttemptRecord(
-                    outcome.success, outcome.reason, plan_seconds, outcome.sim_seconds, on_image
-                )
+                    outcome.success,
+                    outcome.reason,
+                    plan_seconds,
+                    outcome.sim_seconds,
+                    on_image,
+                    _turn_ms(approach),
+                    outcome.detail,
+                )  # fmt: skip
             )
             failed = [] if outcome.success else [*failed, grasp]
             if on_attempt is not None:
@@ -74,9 +98,23 @@ def run_round(
     if ended == "cleared" and cleared < len(scene.placements):
         ended = "lost"
     return RoundRecord(
-        policy, scene.layout, objects, scene.seed, len(scene.placements), cleared,
-        tuple(attempts), ended,
+        contestant(policy, controller), scenario, objects, scene.seed, len(scene.placements),
+        cleared, tuple(attempts), ended, controller,
     )  # fmt: skip
+
+
+def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
+    """A frame of the cell's camera, taken now, with the camera where it is believed to be. An image
+    in which no table is found cannot be levelled and stays as it is."""
+    try:
+        return beliefs.frame(frame, cell.config.camera.mount, forward_kinematics(cell.robot.q))
+    except TargetLostError:
+        return frame
+
+
+def _turn_ms(approach: Approach) -> float | None:
+    turns = approach.record.turn_seconds if isinstance(approach, ClosedLoop) else []
+    return 1000 * float(np.percentile(turns, 95)) if turns else None
 
 
 def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:

@@ -21,7 +21,7 @@ from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geomet
 from envs.panda import ARM
 from envs.safety import SafetyGate
 from envs.servo_target import Board
-from utils.config import ServoConfig
+from utils.config import SafetyConfig, ServoConfig
 from utils.errors import unknown_choice
 from utils.servo_errors import ServoError
 from utils.servo_features import MOUNTINGS, ServoCamera
@@ -137,12 +137,19 @@ class ArmStoppedError(ServoError):
 class GuardedArm:
     """The arm behind the gate: the only way in which a servo's velocities get to the motors."""
 
-    def __init__(self, cell: Cell, carried: CarriedBoard | None = None):
+    def __init__(
+        self,
+        cell: Cell,
+        carried: CarriedBoard | None = None,
+        safety: SafetyConfig | None = None,
+    ):
+        """safety: the gate's limits; None: those of the cell's config."""
         self.cell, self.robot, self.carried = cell, cell.robot, carried
         guarded = np.zeros((1, 3))
         if carried is not None:
             guarded = np.vstack([guarded, carried.corners_E])
-        self.gate = SafetyGate(cell.config.safety, cell.config.robot, cell.dt, guarded)
+        safety = safety or cell.config.safety
+        self.gate = SafetyGate(safety, cell.config.robot, cell.dt, guarded)
         self._reference = cell.robot.q
 
     def move(self, wish: np.ndarray, perception_age: float) -> None:

@@ -20,6 +20,7 @@ from utils.results import (
     AttemptRecord,
     RoundRecord,
     compare,
+    contestant,
     format_table,
     interruption,
     planned_rounds,
@@ -89,8 +90,8 @@ def test_summary_by_hand():
     assert heuristic.sim_seconds_per_pick == pytest.approx(30 / 3)
     assert heuristic.picks_per_hour == pytest.approx(360)
     assert heuristic.failures == {
-        "no_plan": 1, "ik": 0, "collision": 0, "missed": 1, "slipped": 1, "dropped": 1,
-        "physics": 0,
+        "no_plan": 1, "ik": 0, "lost": 0, "stopped": 0, "collision": 0, "missed": 1,
+        "slipped": 1, "dropped": 1, "physics": 0,
     }  # fmt: skip
     assert (random.attempts, random.successes, random.success_rate) == (2, 0, 0.0)
     assert random.sim_seconds_per_pick is None and random.picks_per_hour is None
@@ -171,13 +172,29 @@ def test_results_json_is_strict_and_complete(tmp_path):
     fields = """policy scenario objects seed rounds attempts successes objects_total
         objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
         sim_seconds_per_pick picks_per_hour"""
-    assert set(content["rows"][0]) == {*fields.split(), "failures"}
+    assert set(content["rows"][0]) == {*fields.split(), "failures", "controller", "turn_ms_p95"}
     assert content["rows"][1]["picks_per_hour"] is None
     bad = replace(rows[0], plan_ms_median=math.nan)
     before = path.read_bytes()
     with pytest.raises(ValueError):
         write_results(path, [bad], CONFIG, "abc", "CPU", complete=True)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_closed_loop_is_a_contestant_of_its_own():
+    assert contestant("heuristic", "open_loop") == "heuristic"
+    assert contestant("heuristic", "ibvs") == "heuristic+ibvs"
+    turns = [10.0, 30.0, 20.0]
+    attempts = tuple(replace(attempt("success"), turn_ms=ms) for ms in turns)
+    record = RoundRecord(
+        "heuristic+ibvs", "moved", "box", 0, 3, 3, attempts, "cleared", controller="ibvs"
+    )
+    (row,) = summarise([record], seed=0)
+    assert (row.policy, row.controller, row.turn_ms_p95) == ("heuristic+ibvs", "ibvs", 20.0)
+    assert summarise(ROUNDS, seed=0)[0].turn_ms_p95 is None
+    four = load_config(None, ["evaluate.controllers=open_loop,ibvs", "evaluate.scenarios=moved",
+                              "evaluate.policies=heuristic", "evaluate.rounds=7"])  # fmt: skip
+    assert planned_rounds(four) == 14
 
 
 def test_csv(tmp_path):

@@ -44,6 +44,11 @@ ObjectSet = Annotated[
     Field(description=f"one of {', '.join(OBJECT_SETS)}, or an existing folder"),
 ]
 Scenario = Literal["isolated", "packed", "pile"]
+ScoredScenario = Literal[
+    "isolated", "packed", "pile", "static", "moved", "moving_5cm", "moving_10cm", "turning_5cm",
+    "turning_10cm", "miscalibrated", "latency",
+]  # fmt: skip
+Controller = Literal["open_loop", "pbvs", "ibvs", "hybrid"]
 Mount = Literal["overhead", "wrist"]
 # YAML has lists where frozen objects hold tuples, hence strict=False; the items stay strict.
 Vector2 = Annotated[tuple[float, float], Field(strict=False)]
@@ -153,9 +158,34 @@ class ServoConfig(Section):
     settled_frames: Count
 
 
+class GraspConfig(Section):
+    controller: Controller
+    width: Pixels
+    height: Pixels
+    fov_deg: Annotated[float, Field(ge=1, le=170)]
+    gain: Positive
+    look_height: Annotated[float, Field(gt=0, le=0.3)]
+    commit_height: Annotated[float, Field(gt=0, le=0.3)]
+    descend_speed: Annotated[float, Field(gt=0, le=1.0)]
+    aligned_distance: Positive
+    aligned_angle: Positive
+    floor: Annotated[float, Field(ge=0)]
+    lost_seconds: Positive
+    seconds: Positive
+    camera_shift: Annotated[float, Field(ge=0)]
+    camera_turn_deg: Annotated[float, Field(ge=0, le=45)]
+
+    @model_validator(mode="after")
+    def _commits_below_the_look(self) -> GraspConfig:
+        if self.commit_height > self.look_height:
+            raise ValueError("commit_height must not be above look_height")
+        return self
+
+
 class EvaluateConfig(Section):
     policies: Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
-    scenarios: Annotated[tuple[Scenario, ...], Several, AfterValidator(_no_repeats)]
+    controllers: Annotated[tuple[Controller, ...], Several, AfterValidator(_no_repeats)] | None
+    scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(_no_repeats)]
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
     rounds: Count
     workers: Count | None
@@ -301,6 +331,7 @@ class Config(Section):
     execution: ExecutionConfig
     safety: SafetyConfig
     servo: ServoConfig
+    grasp: GraspConfig
     data: DataConfig
     train: TrainConfig
     evaluate: EvaluateConfig

@@ -24,10 +24,13 @@ from utils.transforms import ImageGrasp
 
 SCHEMA = 1  # version of results.json
 SUCCESS = "success"
+OPEN_LOOP = "open_loop"  # the controller that does not look again
 NO_PLAN = "no_plan"
 FAILURES = {  # reason: what a reader sees, in the order in which a grasp can fail
     NO_PLAN: "no plan",
     "ik": "IK",
+    "lost": "lost from sight",
+    "stopped": "stopped",
     "collision": "collision on approach",
     "missed": "missed",
     "slipped": "slipped",
@@ -43,13 +46,20 @@ ENDINGS = {  # why a round ended
 }
 
 
+def contestant(policy: str, controller: str) -> str:
+    """The name under which a policy is scored with a controller, such as heuristic+ibvs; a policy
+    alone stands for its open loop."""
+    return policy if controller == OPEN_LOOP else f"{policy}+{controller}"
+
+
 @dataclass(frozen=True)
 class AttemptRecord:
     """One call of a planner and, unless it found nothing, the grasp that was executed.
 
     reason: "success" or a key of FAILURES; a "no_plan" is a failure but not an executed grasp.
     plan_seconds: wall-clock time of the planner. sim_seconds: simulated time of the execution.
-    grasp: where it was on the image, for pictures.
+    grasp: where it was on the image, for pictures. turn_ms: 95th percentile of the wall-clock time
+    of a closed loop's turns, rendering left out. detail: a sentence on a failure.
     """
 
     success: bool
@@ -57,6 +67,8 @@ class AttemptRecord:
     plan_seconds: float
     sim_seconds: float
     grasp: ImageGrasp | None = None
+    turn_ms: float | None = None
+    detail: str = ""
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -75,6 +87,8 @@ class RoundRecord:
 
     seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, seed).
     A round that ended with "no_plan" has an attempt with that reason at its end.
+    controller: how the arm got to its grasps; a policy of a closed loop is called by both, see
+    `contestant`.
     """
 
     policy: str
@@ -85,6 +99,7 @@ class RoundRecord:
     objects_cleared: int
     attempts: tuple[AttemptRecord, ...]
     ended: str
+    controller: str = OPEN_LOOP
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:
@@ -111,6 +126,7 @@ class Row:
     attempts: executed grasps. Intervals: Wilson, 95 %, each attempt (object) taken as independent.
     plan_ms_median: over every call of the planner, those that found nothing included.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
+    turn_ms_p95: 95th percentile of a closed loop's turns, the median of all attempts.
     """
 
     policy: str
@@ -130,6 +146,8 @@ class Row:
     sim_seconds_per_pick: float | None
     picks_per_hour: float | None
     failures: dict[str, int]
+    controller: str = OPEN_LOOP
+    turn_ms_p95: float | None = None
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -149,6 +167,7 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
     reasons = Counter(call.reason for call in calls)
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
+    turns = [call.turn_ms for call in calls if call.turn_ms is not None]
     return Row(
         *key,
         seed=seed,
@@ -165,6 +184,8 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
         sim_seconds_per_pick=per_pick,
         picks_per_hour=3600 / per_pick if per_pick else None,
         failures={reason: reasons[reason] for reason in FAILURES},
+        controller=rounds[0].controller,
+        turn_ms_p95=median(turns) if turns else None,
     )
 
 
@@ -221,7 +242,8 @@ def _difference(
 def planned_rounds(config: Config) -> int:
     """How many rounds the whole evaluation has."""
     plan = config.evaluate
-    cells = len(plan.policies) * len(plan.scenarios) * len(plan.object_sets)
+    controllers = plan.controllers or (config.grasp.controller,)
+    cells = len(plan.policies) * len(controllers) * len(plan.scenarios) * len(plan.object_sets)
     return plan.rounds * cells
 
 

@@ -1,0 +1,97 @@
+"""A picture of a closed loop at work: python -m benchmarks.show_grasp_loop [FILE] [SCENARIO]
+
+KEY=VALUE overrides may follow. Above what a bystander sees, below the wrist camera's depth image
+with the points that the law looks at, at four moments of one grasp of the test object that `seed`
+chooses.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+
+from envs import grasp_loop
+from envs.beliefs import teach
+from envs.cell import Cell
+from envs.challenges import CHALLENGES
+from envs.disturbances import disturbed
+from envs.execution import execute_grasp
+from envs.objects import load_object_set
+from envs.scenes import make_scene
+from envs.studio import Studio
+from models.planners import make_planner
+from utils.config import load_config
+from utils.geometry import GripperGeometry, Workspace
+from utils.transforms import inverse_pose, transform_points
+
+MOMENTS = (0.4, 1.4, 2.2, 2.7)  # s after the arm has set out
+_SIZE = (320, 240)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    argv = list(sys.argv[1:] if argv is None else argv)
+    overrides = [a for a in argv if "=" in a]
+    names = [a for a in argv if "=" not in a]
+    file, scenario = [*names, *("servo.png", "turning_5cm")[len(names) :]][:2]
+    config = load_config(None, overrides)
+    objects = load_object_set(
+        "random_urdfs", cache_dir=config.cache_folder, **config.objects.model_dump()
+    )
+    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
+    with Cell(config) as cell:
+        taught, challenge = teach(cell), CHALLENGES[scenario]
+        cell.load(make_scene(challenge.layout, objects, config.seed, config))
+        beliefs, frame = challenge.beliefs(cell), cell.frame()
+        loop = grasp_loop.ClosedLoop(cell, "ibvs", frame, beliefs, taught, challenge.latency)
+        pictures, camera, start = [], loop.camera, cell.seconds
+        with Studio(cell, *_SIZE) as studio:
+
+            def see():
+                sight = camera()
+                passed = len(pictures) < len(MOMENTS) and sight is not None
+                if passed and cell.seconds - start >= MOMENTS[len(pictures)]:
+                    pictures.append(_both(studio.picture(), sight, run[0], loop))
+                return sight
+
+            loop.camera, run = see, []
+            _keep_run(run)
+            with disturbed(cell, challenge.motion(cell, 0)):
+                outcome = execute_grasp(cell, plan(frame)[0], loop)
+    iio.imwrite(Path(file), np.hstack(pictures))
+    print(f"{outcome.reason} {outcome.detail}; wrote {file}")
+
+
+def _keep_run(run: list) -> None:
+    """Let `run` hold the approach that is made next."""
+    make = grasp_loop._Run.__init__
+
+    def keep(self, *arguments):
+        run.append(self)
+        make(self, *arguments)
+
+    grasp_loop._Run.__init__ = keep
+
+
+def _both(picture: np.ndarray, sight, run, loop) -> np.ndarray:
+    depth = sight.depth
+    nearest, farthest = depth[depth > 0].min(), depth.max()
+    grey = (255 * (farthest - depth) / max(farthest - nearest, 1e-3)).clip(0, 255).astype(np.uint8)
+    image = cv2.resize(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), None, fx=2, fy=2)
+    T_WC = grasp_loop.forward_kinematics(sight.q) @ loop.T_EC
+    points = transform_points(inverse_pose(T_WC) @ run.T_WO, run.template.points)
+    for u, v in points[:, :2] / points[:, 2:] * loop.K[[0, 1], [0, 1]] + loop.K[:2, 2]:
+        cv2.circle(image, (round(2 * u + 0.5), round(2 * v + 0.5)), 3, (230, 60, 40), -1)
+    below = np.full((image.shape[0], picture.shape[1], 3), 255, np.uint8)
+    left = (picture.shape[1] - image.shape[1]) // 2
+    below[:, left : left + image.shape[1]] = image
+    return np.vstack([picture, below])
+
+
+if __name__ == "__main__":
+    main()

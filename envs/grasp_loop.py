@@ -1,0 +1,460 @@
+"""Closed-loop grasping: the object is found again in every image of the wrist camera, all the way.
+
+An `Approach` for `envs.execution`, which closes, lifts and judges. Three stages:
+
+far     position-based for every controller, until the object is near the middle of the view: an
+        image-based law backs away where the turn is large (see docs/servo.md).
+near    the controller's own law, towards a goal that sinks along the grasp's axis as far as the
+        camera sees the object. The object's own velocity, as the filter tells it, is added to
+        the law's, which takes away the lag behind what moves.
+blind   the rest of the way, some centimetres, straight down and along with the object's motion as
+        it was foreseen; the same while the fingers close. Images go on being taken: the watchdog
+        stops the arm here too when they stop coming.
+
+All velocities pass the safety gate (`GuardedArm`). Reads depth images and encoders; where the
+cameras are comes from `CameraBeliefs` alone. Frames: W world, E gripper, C camera, O object on the
+table below its grasp.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.beliefs import CameraBeliefs
+from envs.camera import Intrinsics
+from envs.cell import Cell
+from envs.execution import Around, GraspFailure, choose_posture
+from envs.kinematics import (
+    JOINT_LOWER,
+    JOINT_UPPER,
+    forward_kinematics,
+    geometric_jacobian,
+    pose_error,
+)
+from envs.panda import MAX_OPENING
+from envs.servoing import ArmStoppedError, GuardedArm, servo_period
+from utils.object_motion import PlanarMotion
+from utils.object_tracking import (
+    ObjectTemplate,
+    ObjectTracker,
+    TargetLostError,
+    grasp_frame,
+    make_template,
+    planar,
+    planar_part,
+)
+from utils.se3 import pose_exp
+from utils.servo_errors import FeatureCountError, ServoError
+from utils.servo_features import MIN_POINTS
+from utils.servo_laws import joint_limit_avoidance, joint_velocities
+from utils.servo_loop import View, VisualServo
+from utils.transforms import Grasp, RGBDFrame, inverse_pose, top_down_pose, transform_points
+from utils.visual_servo import (
+    HybridVisualServo,
+    ImageBasedVisualServo,
+    PositionBasedVisualServo,
+)
+
+_DAMPING = 0.02  # of the arm's Jacobian
+_AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
+_NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
+_FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
+_BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
+_REACHED = 0.0015  # m from the end of the path that count as there
+_SLACK_SECONDS = 0.35  # beyond what the path takes, for the end of the blind stage
+_SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
+_NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
+
+_TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are told as they look to the camera
+
+
+class DepthSight(NamedTuple):
+    """A depth image (H, W), metres, the joint positions (7,) when it was taken, and that time."""
+
+    depth: np.ndarray
+    q: np.ndarray
+    seconds: float
+
+
+class WristCamera:
+    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken."""
+
+    def __init__(self, cell: Cell, latency: float = 0.0):
+        camera, grasp = cell.config.camera, cell.config.grasp
+        self.cell, self.latency = cell, latency
+        self.intrinsics = Intrinsics(
+            grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
+        )
+        self._coming: deque[DepthSight] = deque()
+
+    def __call__(self) -> DepthSight | None:
+        """Take an image now; the newest that has arrived by now, or None."""
+        cell = self.cell
+        image = cell.look(self.intrinsics, cell.camera_pose("wrist"))
+        self._coming.append(DepthSight(image.depth, cell.robot.q, cell.seconds))
+        arrived = None
+        while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:
+            arrived = self._coming.popleft()
+        return arrived
+
+
+@dataclass
+class LoopRecord:
+    """What a closed loop did, for tests and figures.
+
+    turn_seconds: wall-clock time of every turn, from the image to the joint velocities, rendering
+    left out. seconds, errors: simulated time and the way still to go (6,) in C at every turn of the
+    near stage. stage: the last one that was reached.
+    """
+
+    turn_seconds: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    errors: list[np.ndarray] = field(default_factory=list)
+    stage: str = "far"
+
+
+def make_law(controller: str, K: np.ndarray, T_EC: np.ndarray, gain: float, dt: float):
+    """The visual servo of a controller's near stage; T_EC as it is believed."""
+    config = {"intrinsics": K, "mounting": "eye_in_hand", "T_EC": T_EC}
+    options = {"lambda_": gain, "dt": dt, "damping": 0.0}
+    if controller == "pbvs":
+        return PositionBasedVisualServo(config, **options)
+    if controller == "ibvs":
+        return ImageBasedVisualServo(config, interaction="mean", **options)
+    return HybridVisualServo(config, scheme="2.5d", **options)
+
+
+class ClosedLoop:
+    """The approach of one controller to one grasp, seen in the frame that it was planned on.
+
+    controller: pbvs, ibvs or hybrid. frame: as it is believed to have been taken. taught_T_CE:
+    (4, 4) the gripper in the wrist camera as that camera showed it (`envs.beliefs.teach`), from
+    which ibvs and hybrid have their goal images. camera: gives a DepthSight, or None where no new
+    image has come.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        controller: str,
+        frame: RGBDFrame,
+        beliefs: CameraBeliefs,
+        taught_T_CE: np.ndarray,
+        latency: float = 0.0,
+        camera=None,
+    ):
+        self.cell, self.controller, self.frame = cell, controller, frame
+        self.T_EC, self.latency = beliefs.T_EC, latency
+        self.camera = camera or WristCamera(cell, latency)
+        grasp = cell.config.grasp
+        intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
+        self.K, self.size = intrinsics.K, (grasp.width, grasp.height)
+        period = servo_period(cell) * cell.dt
+        self.law = make_law(controller, self.K, self.T_EC, grasp.gain, period)
+        self.far_law = make_law("pbvs", self.K, self.T_EC, grasp.gain, period)
+        T_CE = taught_T_CE if controller in _TAUGHT else inverse_pose(self.T_EC)
+        self.goal_T_CE = T_CE
+        self.record = LoopRecord()
+
+    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+        """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
+        robot, settings = cell.robot, cell.config.grasp
+        robot.command_gripper(min(grasp.width, MAX_OPENING))
+        arm = self._arm()
+        try:
+            run = _Run(self, arm, grasp)
+            end = cell.seconds + settings.seconds
+            while run.look():
+                if cell.seconds > end:
+                    raise ServoError(f"not at the grasp after {settings.seconds} s")
+                run.go()
+            self.record.stage = "blind"
+            run.go_blind()
+        except ServoError as error:
+            arm.stop()
+            raise GraspFailure(_reason_of(error), detail=f"stopped: {error}") from error
+        self.record.stage = "closing"
+        return Around(run.follow, None)
+
+    def _arm(self) -> GuardedArm:
+        safety, floor = self.cell.config.safety, self.cell.config.grasp.floor
+        lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
+        # Images that are known to come late do not count as a camera that has failed.
+        changes = {"box_lower": lower, "watchdog": safety.watchdog + self.latency}
+        return GuardedArm(self.cell, safety=safety.model_copy(update=changes))
+
+
+def _reason_of(error: ServoError) -> str:
+    if isinstance(error, TargetLostError | FeatureCountError):
+        return "lost"
+    contact = isinstance(error, ArmStoppedError) and str(error).startswith("contact")
+    return "collision" if contact else "stopped"
+
+
+class _Run:
+    """One approach under way."""
+
+    def __init__(self, loop: ClosedLoop, arm: GuardedArm, grasp: Grasp):
+        self.loop, self.cell, self.arm = loop, loop.cell, arm
+        self.settings = loop.cell.config.grasp
+        self.template: ObjectTemplate = make_template(loop.frame, grasp)
+        self.tracker = ObjectTracker(self.template, loop.K, loop.size)
+        self.T_WO = grasp_frame(grasp)  # as last seen
+        self.T_OE = self._grasp_in_object(grasp)
+        self.motion: PlanarMotion | None = None
+        self.image_seconds = self.found_seconds = self.cell.seconds
+        self.near, self.height = False, np.inf
+        self.lowest = self._lowest_view()
+        self.wish = np.zeros(7)
+        self._wait_for_sight()
+
+    def _grasp_in_object(self, grasp: Grasp) -> np.ndarray:
+        """(4, 4) T_OE of the grasp, the way round in which the arm reaches it more easily."""
+        above = grasp.pose.copy()
+        above[2, 3] += self.settings.look_height
+        reached = forward_kinematics(choose_posture(self.cell, above))
+        T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
+        if (self.T_WO @ T_OE)[:3, 1] @ reached[:3, 1] < 0:
+            T_OE = T_OE @ np.diag([-1.0, -1, 1, 1])
+        return T_OE
+
+    def _goal(self, height: float) -> np.ndarray:
+        """(4, 4) T_CO: the object as the camera should see it from `height` above the grasp."""
+        raised = self.T_OE.copy()
+        raised[2, 3] += height
+        return self.loop.goal_T_CE @ inverse_pose(raised)
+
+    def _lowest_view(self) -> float:
+        """The height above the grasp from which the camera still sees the object."""
+        heights = np.arange(self.settings.commit_height, self.settings.look_height, 0.01)
+        nearest = self.cell.config.camera.near + _NEAR_PLANE
+        for height in heights:
+            if self.tracker.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
+                return float(height)
+        return self.settings.look_height
+
+    def _wait_for_sight(self) -> None:
+        """Hold still until a first image has come (it may be late) and shows the object."""
+        while not self._take_in(self.loop.camera()) or self.motion is None:
+            for _ in range(servo_period(self.cell)):
+                self.arm.move(np.zeros(7), self.cell.seconds - self.image_seconds)
+
+    def _take_in(self, sight: DepthSight | None) -> bool:
+        """Find the object in a new image; whether there was one."""
+        if sight is None:
+            return False
+        start = time.perf_counter()
+        self.image_seconds = sight.seconds
+        T_WC = forward_kinematics(sight.q) @ self.loop.T_EC
+        expected = self._object_at(sight.seconds)
+        try:
+            found = self.tracker.find(
+                sight.depth, inverse_pose(T_WC) @ expected, inverse_pose(T_WC)
+            )
+        except TargetLostError as error:
+            if self.motion is None or sight.seconds - self.found_seconds > (
+                self.settings.lost_seconds
+            ):
+                raise TargetLostError(f"{error}, for {self.settings.lost_seconds} s") from error
+            self._spent = time.perf_counter() - start
+            return True
+        self.T_WO = T_WC @ found.T_CO
+        pose = planar_part(self.T_WO)
+        if self.motion is None:
+            self.motion = PlanarMotion(pose, sight.seconds, turns=not self.tracker.round)
+        else:
+            axes = planar(0, 0, pose[2])[:3, :3]
+            covariance = axes @ found.covariance @ axes.T
+            self.motion.see(pose, covariance, sight.seconds)
+        self.found_seconds = sight.seconds
+        self._spent = time.perf_counter() - start
+        return True
+
+    def _object_at(self, seconds: float) -> np.ndarray:
+        """(4, 4) T_WO expected at a time: as last seen, moved to where the filter has it."""
+        if self.motion is None:
+            return self.T_WO
+        x, y, turn = self.motion.at(seconds)[:3]
+        x0, y0, turn0 = planar_part(self.T_WO)
+        return planar(x, y, turn) @ inverse_pose(planar(x0, y0, turn0)) @ self.T_WO
+
+    def look(self) -> bool:
+        """Take in what the camera has, and wish for a velocity; False where the blind stage
+        begins."""
+        new = self._take_in(self.loop.camera())
+        start = time.perf_counter()
+        q, now = self.cell.robot.q, self.cell.seconds
+        T_WE = forward_kinematics(q)
+        T_CO = inverse_pose(T_WE @ self.loop.T_EC) @ self._object_at(now)
+        off = self._off_axis(T_CO)
+        if not self.near:
+            self._choose_stage(off)
+        law, height = (self.loop.law, self.height) if self.near else (
+            self.loop.far_law, self.settings.look_height
+        )  # fmt: skip
+        sink = 0.0
+        if self.near:
+            height, sink = self._sink(off)
+        view, goal = self._views(T_CO, self._goal(height), self.near)
+        step = law.step(view, goal)
+        if self.near:
+            self.loop.record.stage = "near"
+            self.loop.record.seconds.append(now)
+            self.loop.record.errors.append(step.correction)
+            if self._may_commit(off, step.correction):
+                self._commit(T_WE, step.correction, now)
+                return False
+        self.wish = self._joint_wish(q, T_WE, step.velocity, law, sink)
+        if new:
+            self.loop.record.turn_seconds.append(self._spent + time.perf_counter() - start)
+        return True
+
+    def _off_axis(self, T_CO: np.ndarray) -> tuple[float, float, float]:
+        """How far off the grasp's axis (m), how high above the grasp (m) and how far turned (rad)
+        the gripper is, as the controller has it."""
+        T_EO = inverse_pose(self.loop.goal_T_CE) @ T_CO
+        T_GE = inverse_pose(self.T_OE) @ inverse_pose(T_EO)  # G: the gripper at the grasp
+        turn = abs(np.arctan2(T_GE[1, 0], T_GE[0, 0]))
+        return float(np.hypot(*T_GE[:2, 3])), float(-T_GE[2, 3]), float(turn)
+
+    def _choose_stage(self, off: tuple[float, float, float]) -> None:
+        distance, height, turn = off
+        settled = distance < _NEAR_DISTANCE and turn < _NEAR_ANGLE
+        if settled and height < self.settings.look_height + _NEAR_DISTANCE:
+            self.near, self.height = True, max(height, self.lowest)
+            self.loop.law.reset()
+
+    def _sink(self, off: tuple[float, float, float]) -> tuple[float, float]:
+        """The goal's height above the grasp by the next image and the speed (m/s) at which it
+        sinks, as long as the gripper is in the funnel above the grasp."""
+        distance, height, turn = off
+        above = max(height - self.lowest, 0.0)
+        settings = self.settings
+        allowed = settings.aligned_distance + _FUNNEL * above
+        speed = 0.0
+        if distance < 2 * allowed and turn < settings.aligned_angle + 2 * above:
+            speed = min(settings.descend_speed, settings.gain * above)
+        dt = servo_period(self.cell) * self.cell.dt
+        self.height = max(min(self.height, height) - speed * dt, self.lowest)
+        return self.height, speed
+
+    def _may_commit(self, off: tuple[float, float, float], correction: np.ndarray) -> bool:
+        distance, height, turn = off
+        settings = self.settings
+        return bool(
+            height < self.lowest + 0.01
+            and distance < settings.aligned_distance
+            and turn < settings.aligned_angle
+            and self.cell.seconds - self.found_seconds
+            < 0.5 * settings.lost_seconds + (self.loop.latency)
+        )
+
+    def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[View, View]:
+        """What is seen and what should be seen: the template's points and its pose. Of the points
+        those count that lie within the image; raises FeatureCountError where they are too few."""
+        views = []
+        seen = np.ones(len(self.template.points), bool)
+        for T in (T_CO, T_GO):
+            points = transform_points(T, self.template.points)
+            pixels = points[:, :2] / points[:, 2:] * self.loop.K[[0, 1], [0, 1]]
+            views.append(View(pixels + self.loop.K[:2, 2], points[:, 2], T))
+        if near:
+            pixels = views[0].points
+            seen = (pixels > -0.5).all(axis=1) & (pixels < np.array(self.loop.size) - 0.5).all(1)
+            if seen.sum() < MIN_POINTS:
+                raise FeatureCountError(
+                    f"points: {seen.sum()} of those on the object are in the image, needed are at "
+                    f"least {MIN_POINTS}"
+                )
+        return tuple(View(v.points[seen], v.depths[seen], v.T_CO) for v in views)
+
+    def _joint_wish(
+        self, q: np.ndarray, T_WE: np.ndarray, v_C: np.ndarray, law: VisualServo, sink: float
+    ) -> np.ndarray:
+        """(7,) rad/s: the law's velocity, and with it the object's own and the goal's."""
+        J = geometric_jacobian(q)
+        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
+        wish = law.compute_joint_velocities(T_WE, v_C, J, away, _DAMPING)
+        ahead = self._object_twist(T_WE[:3, 3])
+        ahead[2] -= sink
+        return wish + joint_velocities(J, ahead, damping=_DAMPING)[0]
+
+    def _object_twist(self, place: np.ndarray) -> np.ndarray:
+        """(6,) in W of a point at `place` (3,) that is carried along with the object, now."""
+        x, y, _, vx, vy, omega = self.motion.at(self.cell.seconds)
+        arm = place[:2] - (x, y)
+        return np.array([vx - omega * arm[1], vy + omega * arm[0], 0.0, 0.0, 0.0, omega])
+
+    def go(self) -> None:
+        """Send the wish until the next image."""
+        for _ in range(servo_period(self.cell)):
+            self.arm.move(self.wish, self.cell.seconds - self.image_seconds)
+
+    # --- Without looking ---------------------------------------------------------------------
+
+    def _commit(self, T_WE: np.ndarray, correction: np.ndarray, now: float) -> None:
+        """Fix the path that is left: to where the law says that the goal is, then straight on."""
+        T_EC = self.loop.T_EC
+        self.start = T_WE @ T_EC @ pose_exp(-correction) @ inverse_pose(T_EC)
+        self.start_seconds, self.left = now, self.height
+        self.depth_gone = 0.0
+
+    def go_blind(self) -> None:
+        """Down to the grasp along the foreseen path; raises ServoError where the arm is stopped."""
+        speed = self.settings.descend_speed
+        end = self.cell.seconds + self.left / speed + _SLACK_SECONDS
+        while self.cell.seconds < end:
+            rest = self.left - self.depth_gone
+            off = self._follow_period(min(speed, max(6.0 * rest, 0.02)) if rest > 0 else 0.0)
+            if rest <= 0 and off < _REACHED:
+                return
+
+    def _follow_period(self, sink: float) -> float:
+        """Follow the path for the time between two images; metres off it at the end."""
+        sight = self.loop.camera()
+        if sight is not None:
+            self.image_seconds = sight.seconds  # a sign of life; the object is too near to be seen
+        for _ in range(servo_period(self.cell)):
+            off = self._follow_step(sink)
+        return off
+
+    def _follow_step(self, sink: float) -> float:
+        dt, now = self.cell.dt, self.cell.seconds
+        self.depth_gone = min(self.depth_gone + sink * dt, self.left)
+        path = self.motion.motion(self.start_seconds, now) @ self.start
+        path[:3, 3] += self.depth_gone * path[:3, 2]
+        q = self.cell.robot.q
+        T_WE = forward_kinematics(q)
+        error = pose_error(T_WE, path)
+        twist = self._object_twist(path[:3, 3]) + _BLIND_GAIN * error
+        twist[:3] += sink * path[:3, 2] * (self.depth_gone < self.left)
+        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
+        wish = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)[0]
+        self.arm.move(wish, now - self.image_seconds)
+        return float(np.linalg.norm(error[:3]))
+
+    def follow(self, steps: int) -> None:
+        """Let physics steps pass while the fingers close, along with the object; hold still once
+        something presses harder than the gate allows, which is what a grip does."""
+        period = servo_period(self.cell)
+        while steps > 0:
+            try:
+                if self.arm_holds:
+                    self.cell.step(steps)
+                    return
+                if steps >= period:
+                    self._follow_period(0.0)
+                else:
+                    for _ in range(steps):
+                        self._follow_step(0.0)
+            except ArmStoppedError:
+                self.arm_holds = True
+                self.cell.step(min(steps, period))
+            steps -= period
+
+    arm_holds = False

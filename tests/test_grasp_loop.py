@@ -1,0 +1,254 @@
+"""Closed-loop grasping in the cell: who grasps, what stops it, and what disturbs the objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pybullet
+import pytest
+
+from envs import grasp_loop
+from envs.beliefs import level, off, teach, true_beliefs, wrong_beliefs
+from envs.cell import Cell, wrist_mount
+from envs.challenges import CHALLENGES
+from envs.disturbances import Conveyor, Displacement, disturbed
+from envs.execution import execute_grasp
+from envs.grasp_loop import ClosedLoop, WristCamera
+from envs.kinematics import inverse_kinematics
+from envs.rounds import run_round
+from envs.scenes import make_scene
+from utils.config import load_config
+from utils.config_schema import ScoredScenario
+from utils.object_tracking import planar_part, table_plane
+from utils.transforms import Grasp, inverse_pose, top_down_pose
+
+CLOSED = ("pbvs", "ibvs", "hybrid")
+
+
+@pytest.fixture(scope="module")
+def cell(config):
+    with Cell(config) as cell:
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def scene(config, box_set):
+    return make_scene("isolated", box_set, 0, config)
+
+
+def grasp_of_box(cell):
+    """A grasp through the middle of the one box in the cell, along one of its sides."""
+    T = cell.object_pose(0)
+    side = int(np.argmin(np.abs(T[2, :3])))  # an axis of the box that lies level
+    angle = np.arctan2(T[1, side], T[0, side])
+    return Grasp(np.array([*T[:2, 3], 0.03]), angle, 0.07, 1.0)
+
+
+def loop(cell, controller, latency=0.0, camera=None):
+    beliefs = true_beliefs(cell)
+    return ClosedLoop(cell, controller, cell.frame(), beliefs, teach(cell), latency, camera)
+
+
+# Who grasps
+
+
+@pytest.mark.parametrize("controller", CLOSED)
+def test_every_controller_grasps_a_box_at_rest(cell, scene, controller):
+    teach(cell)  # empties the cell, the first time
+    cell.load(scene)
+    approach = loop(cell, controller)
+    outcome = execute_grasp(cell, grasp_of_box(cell), approach)
+    assert outcome.success, outcome
+    assert approach.record.stage == "closing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["moved", "moving_5cm", "turning_5cm", "latency"])
+def test_the_loop_grasps_what_the_open_loop_misses(cell, scene, scenario):
+    results = {}
+    for controller in ("open_loop", "ibvs"):
+        record = run_round(
+            cell, scene, lambda frame: [grasp_of_box(cell)], policy="exact", objects="box",
+            max_failures=1, scenario=scenario, controller=controller,
+        )  # fmt: skip
+        results[controller] = record.successes
+        assert record.scenario == scenario and record.controller == controller
+    assert results == {"open_loop": 0, "ibvs": 1}
+
+
+# What stops it
+
+
+def frozen_after(camera, count):
+    """A camera that gives `count` images and no more."""
+    left = [count]
+
+    def see():
+        left[0] -= 1
+        return camera() if left[0] >= 0 else None
+
+    return see
+
+
+@pytest.mark.parametrize("images", [15, 52])
+def test_a_frozen_camera_stops_the_arm(cell, scene, images):
+    cell.load(scene)
+    grasp = grasp_of_box(cell)
+    approach = loop(cell, "ibvs", camera=frozen_after(WristCamera(cell), images))
+    with pytest.raises(grasp_loop.GraspFailure) as failure:
+        approach(cell, grasp)
+    speeds = np.abs(cell.robot.joint_state()[1])
+    assert failure.value.reason == "stopped"
+    assert "the watchdog allows 100 ms" in failure.value.detail
+    assert speeds.max() < 1e-2, "the arm is at rest"
+    # One period of 8 steps, and the watchdog's 24, after the last image.
+    assert images * 8 + 20 < cell.steps < images * 8 + 24 + 8 + 30
+
+
+def test_a_vanished_object_stops_the_arm(cell, scene):
+    cell.load(scene)
+    grasp, camera, start = grasp_of_box(cell), WristCamera(cell), cell.seconds
+
+    def see():
+        if cell.seconds - start > 0.5:
+            pybullet.resetBasePositionAndOrientation(
+                cell.bodies[0], [2, 2, 0.1], [0, 0, 0, 1], physicsClientId=cell.client
+            )
+        return camera()
+
+    outcome = execute_grasp(cell, grasp, loop(cell, "pbvs", camera=see))
+    assert outcome.reason == "lost" and "target lost" in outcome.detail
+
+
+def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
+    cell.load(scene)
+    make = grasp_loop.make_template
+
+    def far_points(frame, grasp):
+        template = make(frame, grasp)
+        points = template.points.copy()
+        points[2:] += [0.5, 0, 0]  # all but two leave the image
+        return replace(template, points=points)
+
+    monkeypatch.setattr(grasp_loop, "make_template", far_points)
+    outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs"))
+    assert outcome.reason == "lost"
+    assert "2 of those on the object are in the image, needed are at least 3" in outcome.detail
+
+
+def test_an_approach_that_does_not_end_is_stopped(cell, scene):
+    cell.config = load_config(None, ["sim.renderer=tiny", "grasp.seconds=0.3"])
+    cell.load(scene)
+    outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "pbvs"))
+    cell.config = load_config(None, ["sim.renderer=tiny"])
+    assert outcome.reason == "stopped" and "0.3 s" in outcome.detail
+
+
+# What disturbs
+
+
+def test_every_scored_scenario_has_its_challenge():
+    assert set(get_args(ScoredScenario)) == set(CHALLENGES)
+
+
+def test_a_displacement_ends_where_it_says(cell, scene):
+    cell.load(scene)
+    before = cell.object_pose(0)
+    with disturbed(cell, Displacement(np.array([0.04, -0.03]), 0.5, start=0.1)):
+        cell.step(24)
+        np.testing.assert_allclose(cell.object_pose(0)[:3, 3], before[:3, 3], atol=2e-4)
+        cell.step(240)
+    after = cell.object_pose(0)
+    np.testing.assert_allclose(after[:3, 3] - before[:3, 3], [0.04, -0.03, 0], atol=5e-4)
+    R = after[:3, :3] @ before[:3, :3].T
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(0.5, abs=0.01)
+    assert cell.before_step is None
+
+
+@pytest.mark.parametrize("turn_rate", [0.0, 0.4])
+def test_a_conveyor_moves_at_its_speed(cell, scene, turn_rate):
+    cell.load(scene)
+    before = cell.object_pose(0)
+    with disturbed(cell, Conveyor(0.05, np.pi / 2, turn_rate)):
+        cell.step(48)  # up to speed, after half the way that the full speed would have made
+        middle = cell.object_pose(0)
+        assert middle[1, 3] - before[1, 3] == pytest.approx(0.005, abs=5e-4)
+        cell.step(240)
+        after = cell.object_pose(0)
+    chord = 0.05 if turn_rate == 0 else 2 * 0.05 / turn_rate * np.sin(turn_rate / 2)
+    travelled = np.linalg.norm(after[:2, 3] - middle[:2, 3])
+    assert travelled == pytest.approx(chord, abs=5e-4)
+    R = after[:3, :3] @ middle[:3, :3].T
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(turn_rate, abs=5e-3)
+    assert after[2, 3] == pytest.approx(before[2, 3], abs=5e-4)
+
+
+def test_the_robots_touch_ends_a_disturbance(cell, scene):
+    cell.load(scene)
+    start = cell.object_position(0)
+    # The fingers wait 7 cm ahead of the middle of the box, whose half diagonal is 4.2 cm.
+    in_the_way = top_down_pose(start + [0.07, 0.0, 0.0], 0.0)
+    cell.robot.place(inverse_kinematics(in_the_way, cell.home), opening=0.0)
+    with disturbed(cell, Conveyor(0.05, 0.0)):
+        cell.step(480)
+        assert cell.before_step.over
+    assert 0.005 < cell.object_position(0)[0] - start[0] < 0.05, "2 s would have made 9.5 cm"
+
+
+def test_a_miscalibration_is_as_large_as_it_says(cell, scene):
+    T = cell.camera_pose("overhead")
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        wrong = off(T, rng, 0.01, np.radians(2))
+        assert np.linalg.norm(wrong[:3, 3] - T[:3, 3]) == pytest.approx(0.01)
+        cosine = (np.trace(wrong[:3, :3] @ T[:3, :3].T) - 1) / 2
+        assert np.degrees(np.arccos(cosine)) == pytest.approx(2.0, abs=1e-6)
+    cell.load(scene)
+    challenge = CHALLENGES["miscalibrated"]
+    first, again = challenge.beliefs(cell), challenge.beliefs(cell)
+    np.testing.assert_array_equal(first.T_WC, again.T_WC)
+    for T, true in zip((first.T_WC, first.T_EC), (cell.camera_pose(), wrist_mount(CONFIG))):
+        assert np.linalg.norm(T[:3, 3] - true[:3, 3]) == pytest.approx(0.01)
+
+
+CONFIG = load_config().camera
+
+
+def test_levelling_finds_the_table_and_leaves_the_place(cell, scene):
+    cell.load(scene)
+    frame = cell.frame()
+    wrong = wrong_beliefs(cell, np.random.default_rng(0), 0.01, np.radians(2)).T_WC
+    levelled = level(replace(frame, T_WC=wrong))
+    normal, offset = table_plane(frame.depth, frame.K, inverse_pose(levelled.T_WC))
+    np.testing.assert_allclose(levelled.T_WC[:3, :3] @ normal, [0, 0, 1], atol=1e-9)
+    assert levelled.T_WC[2, 3] == pytest.approx(0.8, abs=1e-3)  # as high as it truly is
+    np.testing.assert_allclose(levelled.T_WC[:2, 3], wrong[:2, 3])  # as far off as it was
+
+
+def test_what_is_taught_is_true_whatever_is_believed(cell):
+    T = teach(cell) @ wrist_mount(CONFIG)  # identity
+    assert np.linalg.norm(T[:3, 3]) < 3e-4
+    assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 0.2
+
+
+def test_images_arrive_late(cell, scene):
+    cell.load(scene)
+    camera, seen = WristCamera(cell, latency=0.1), []
+    for _ in range(6):
+        sight = camera()
+        seen.append(None if sight is None else round(cell.seconds - sight.seconds, 6))
+        cell.step(8)
+    assert seen == [None, None, None, 0.1, 0.1, 0.1]
+
+
+def test_the_object_is_found_by_the_real_camera(cell, scene):
+    cell.load(scene)
+    run = grasp_loop._Run(loop(cell, "pbvs"), grasp_loop.GuardedArm(cell), grasp_of_box(cell))
+    x, y, turn = np.subtract(
+        planar_part(run.T_WO),
+        [*cell.object_pose(0)[:2, 3], grasp_of_box(cell).angle],
+    )
+    assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
+    assert abs(np.degrees((turn + np.pi / 2) % np.pi - np.pi / 2)) < 4
