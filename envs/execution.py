@@ -27,7 +27,7 @@ from utils.transforms import Grasp, top_down_pose
 _LOOK_SECONDS = 0.05  # between two looks at the fingers or at the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _RELEASE_SECONDS = 0.35  # for the fingers to open and the object to fall into the bin
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp, other finger
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp, other finger
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
     """Joint positions (7,) for a gripper pose or the same grasp turned by half a turn, whichever
     is nearer to home. Raises UnreachableError if neither can be reached."""
     found, error = [], None
-    for candidate in (pose, pose @ _HALF_TURN):
+    for candidate in (pose, pose @ HALF_TURN):
         try:
             found.append(inverse_kinematics(candidate, cell.home, cell.home))
         except UnreachableError as unreachable:
@@ -196,7 +196,7 @@ def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
 
 def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """`pose`, turned by half a turn if the arm chose that way round."""
-    return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ _HALF_TURN
+    return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ HALF_TURN
 
 
 def _line(cell: Cell, q: np.ndarray, pose: np.ndarray) -> Trajectory:

@@ -18,6 +18,7 @@ table below its grasp.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -28,12 +29,14 @@ import numpy as np
 from envs.beliefs import CameraBeliefs
 from envs.camera import Intrinsics
 from envs.cell import Cell
-from envs.execution import Around, GraspFailure, choose_posture
+from envs.execution import HALF_TURN, Around, GraspFailure
 from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
+    UnreachableError,
     forward_kinematics,
     geometric_jacobian,
+    inverse_kinematics,
     pose_error,
 )
 from envs.panda import MAX_OPENING
@@ -53,7 +56,14 @@ from utils.servo_errors import FeatureCountError, ServoError
 from utils.servo_features import MIN_POINTS
 from utils.servo_laws import joint_limit_avoidance, joint_velocities
 from utils.servo_loop import View, VisualServo
-from utils.transforms import Grasp, RGBDFrame, inverse_pose, top_down_pose, transform_points
+from utils.transforms import (
+    Grasp,
+    RGBDFrame,
+    angle_difference,
+    inverse_pose,
+    top_down_pose,
+    transform_points,
+)
 from utils.visual_servo import (
     HybridVisualServo,
     ImageBasedVisualServo,
@@ -62,6 +72,8 @@ from utils.visual_servo import (
 
 _DAMPING = 0.02  # of the arm's Jacobian
 _AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
+_FORESIGHT = 1.5  # s, about what is left of the way in the far stage
+_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for the other way round to be tried
 _NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
 _FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
 _BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
@@ -205,23 +217,46 @@ class _Run:
         self.template: ObjectTemplate = make_template(loop.frame, grasp)
         self.tracker = ObjectTracker(self.template, loop.K, loop.size)
         self.T_WO = grasp_frame(grasp)  # as last seen
-        self.T_OE = self._grasp_in_object(grasp)
+        self.T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
         self.motion: PlanarMotion | None = None
+        self._choose_way_round()
         self.image_seconds = self.found_seconds = self.cell.seconds
         self.near, self.height = False, np.inf
         self.lowest = self._lowest_view()
         self.wish = np.zeros(7)
         self._wait_for_sight()
 
-    def _grasp_in_object(self, grasp: Grasp) -> np.ndarray:
-        """(4, 4) T_OE of the grasp, the way round in which the arm reaches it more easily."""
-        above = grasp.pose.copy()
-        above[2, 3] += self.settings.look_height
-        reached = forward_kinematics(choose_posture(self.cell, above))
-        T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
-        if (self.T_WO @ T_OE)[:3, 1] @ reached[:3, 1] < 0:
-            T_OE = T_OE @ np.diag([-1.0, -1, 1, 1])
-        return T_OE
+    def _choose_way_round(self) -> None:
+        """Take the grasp or the same one turned by half a turn: that which leaves the wrist more
+        room to turn with the object. Raises UnreachableError if neither can be reached."""
+        T_WE = self._foreseen() @ self.T_OE
+        self.chosen_at = np.arctan2(T_WE[1, 0], T_WE[0, 0])  # modulo pi
+        T_WE[2, 3] += self.settings.look_height
+        room, error = {}, None
+        for turned in (False, True):
+            try:
+                pose = T_WE @ HALF_TURN if turned else T_WE
+                q = inverse_kinematics(pose, self.cell.home, self.cell.home)
+                room[turned] = min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1])
+            except UnreachableError as unreachable:
+                error = unreachable
+        if not room:
+            raise error
+        if max(room, key=room.get):
+            self.T_OE = self.T_OE @ HALF_TURN
+
+    def _reconsider_way_round(self) -> None:
+        """Choose again where the object turns: a wrist that must follow may meet its limit."""
+        T_WE = self._foreseen() @ self.T_OE
+        direction = np.arctan2(T_WE[1, 0], T_WE[0, 0])
+        if angle_difference(direction, self.chosen_at) > _RECONSIDER_ANGLE:
+            # Out of reach at this moment is no reason to change anything.
+            with contextlib.suppress(UnreachableError):
+                self._choose_way_round()
+
+    def _foreseen(self) -> np.ndarray:
+        """(4, 4) T_WO where the object is expected a little before the fingers close."""
+        return self._object_at(self.cell.seconds + _FORESIGHT)
 
     def _goal(self, height: float) -> np.ndarray:
         """(4, 4) T_CO: the object as the camera should see it from `height` above the grasp."""
@@ -288,6 +323,8 @@ class _Run:
         begins."""
         new = self._take_in(self.loop.camera())
         start = time.perf_counter()
+        if not self.near:
+            self._reconsider_way_round()
         q, now = self.cell.robot.q, self.cell.seconds
         T_WE = forward_kinematics(q)
         T_CO = inverse_pose(T_WE @ self.loop.T_EC) @ self._object_at(now)
