@@ -140,9 +140,7 @@ class DomainAdaptationNetwork(nn.Module):
             nn.Linear(feature_dim, 128), nn.ReLU(), nn.Linear(128, 1)
         )
 
-    def forward(
-        self, images: torch.Tensor, domain: int = TARGET, reversal: float = 1.0
-    ) -> Outputs:
+    def forward(self, images: torch.Tensor, domain: int = TARGET, reversal: float = 1.0) -> Outputs:
         """images (B, ...) that all come from one domain, SOURCE or TARGET."""
         select_domain(self.feature_extractor, domain)
         features = self.feature_extractor(images)
