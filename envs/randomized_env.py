@@ -7,6 +7,7 @@ the config's section `randomization`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         options = dict(options or {})
         self._recorded = options.pop("randomization", None)
         observation, info = super().reset(seed=seed, options=options)
-        return observation, info | {"randomization": self.randomizer.sample}
+        return observation, info | {"randomization": deepcopy(self.randomizer.sample)}
 
     def step(
         self, action: np.ndarray
@@ -51,5 +52,5 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         observation, reward, terminated, truncated, info = super().step(self.randomizer.act(action))
         if terminated or truncated:
             self.randomizer.record_result(info["is_success"])
-            info["randomization"] = self.randomizer.sample
+            info["randomization"] = deepcopy(self.randomizer.sample)
         return observation, reward, terminated, truncated, info
