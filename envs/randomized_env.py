@@ -7,7 +7,6 @@ the config's section `randomization`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from utils.domain_randomization import DomainRandomizer
 class RandomizedGraspingEnv(RobotGraspingEnv):
     """`RobotGraspingEnv` whose every episode has physics and looks of its own.
 
-    info has the episode's sample as `randomization` (at reset, and when an episode has ended).
+    info at reset has the episode's sample as `randomization`.
     `reset(options={"randomization": sample})` replays it; together with the scene's seed and the
     same actions that gives the same episode bit for bit.
     """
@@ -43,7 +42,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         options = dict(options or {})
         self._recorded = options.pop("randomization", None)
         observation, info = super().reset(seed=seed, options=options)
-        return observation, info | {"randomization": deepcopy(self.randomizer.sample)}
+        return observation, info | {"randomization": self.randomizer.sample}
 
     def step(
         self, action: np.ndarray
@@ -52,5 +51,4 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         observation, reward, terminated, truncated, info = super().step(self.randomizer.act(action))
         if terminated or truncated:
             self.randomizer.record_result(info["is_success"])
-            info["randomization"] = deepcopy(self.randomizer.sample)
         return observation, reward, terminated, truncated, info

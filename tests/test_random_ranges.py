@@ -124,9 +124,9 @@ def test_episodes_are_played_at_bounds():
     # 3.3 standard deviations of a binomial
     assert len(bounds) == pytest.approx(500, abs=3.3 * np.sqrt(2000 * 0.25 * 0.75))
     # noise has no room below its nominal 0, so it has one bound only.
-    assert {(b, pytest.approx(value)) for b, value in bounds} == {
-        (Bound("mass", "low"), 0.9), (Bound("mass", "high"), 1.2), (Bound("noise", "high"), 0.2),
-    }  # fmt: skip
+    assert dict(bounds) == pytest.approx(
+        {Bound("mass", "low"): 0.9, Bound("mass", "high"): 1.2, Bound("noise", "high"): 0.2}
+    )
 
 
 def test_state_goes_on_where_it_was():

@@ -259,7 +259,8 @@ def train_domain_adaptation(
         chosen_s, chosen_t = next(batches)
         weight = settings.adversarial * reversal_weight(progress)
         ours = model(images[chosen_s], SOURCE, weight)
-        theirs = model(target[chosen_t], TARGET, weight)
+        with torch.set_grad_enabled(bool(settings.adversarial)):
+            theirs = model(target[chosen_t], TARGET, weight)
         loss = task_loss(ours.task, labels[chosen_s])
         if settings.adversarial:
             loss = loss + (_domain_loss(ours.domain, 0.0) + _domain_loss(theirs.domain, 1.0)) / 2
