@@ -37,7 +37,7 @@ RESETS = 10
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each pair of digit sets")
-    parser.add_argument("--steps", type=int, default=500, help="of each training")
+    parser.add_argument("--steps", type=int, default=400, help="of each training")
     parser.add_argument("--parts", default="speed,digits", help="any of speed,digits")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)

@@ -169,13 +169,13 @@ class AdaptationSettings:
     over the training the network is looked at for that.
     """
 
-    steps: int = 1500
+    steps: int = 1000
     batch_size: int = 64
     lr: float = 2e-3
     weight_decay: float = 1e-4
     adversarial: float = 1.0
     held_out: float = 0.2
-    checks: int = 15
+    checks: int = 10
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "checks"):
