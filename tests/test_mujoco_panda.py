@@ -65,7 +65,7 @@ def test_forward_kinematics_agree_with_pybullet_and_with_ours(panda, stock):
 
 
 def test_masses_and_inertias_are_the_identified_ones(panda):
-    # Franka's data sheet: about 18 kg with the base, of which the base has 3 (arm: 16.06 identified)
+    # Franka's data sheet says about 18 kg with the base; the moving links are 16.06 of them.
     assert sum(INERTIALS[f"panda_link{i}"].mass for i in range(1, 8)) == pytest.approx(
         16.06, abs=0.01
     )
