@@ -1,13 +1,11 @@
 """How a scene looks: colours, solid textures, light and camera poses, drawn from a generator.
 
-Textures are functions of a point on the object ("solid textures", Peachey 1985): they stick to
-it, need no texture coordinates and are laid over the rendered image, so every renderer shows the
-same. Physics never changes here, and depth only with the camera's pose.
+Textures are laid over the rendered image, see `utils.textures`. Physics never changes here, and
+depth only with the camera's pose.
 """
 
 from __future__ import annotations
 
-import colorsys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,44 +14,12 @@ import pybullet
 from envs.camera import Intrinsics
 from envs.cell import TABLE_OR_BACKGROUND, Cell, camera_intrinsics
 from utils.config import CameraConfig
+from utils.textures import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at
 
 _PLAIN_SHARE = 0.15  # of the scenes look as the cell does when nothing is randomised
 _ONE_COLOUR_SHARE = 0.2  # of the others: all objects in one colour, now and then the table's
 _OBLIQUE_SHARE = 0.2  # of the camera poses are far from the configured one
-
-
-@dataclass(frozen=True)
-class Texture:
-    """A sum of waves through space that brightens and darkens a colour.
-
-    waves: (M, 3) wave vectors, rad/m. phases: (M,). strength: (3,) per colour channel, in 0..1.
-    hard: two tones (stripes, checks) instead of smooth changes.
-    """
-
-    waves: np.ndarray
-    phases: np.ndarray
-    strength: np.ndarray
-    hard: bool
-
-    @staticmethod
-    def draw(rng: np.random.Generator) -> Texture:
-        count = int(rng.integers(1, 4))
-        direction = rng.normal(size=(count, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        length = np.exp(rng.uniform(np.log(0.006), np.log(0.08), size=(count, 1)))  # metres
-        return Texture(
-            2 * np.pi / length * direction,
-            rng.uniform(0, 2 * np.pi, count),
-            rng.uniform(0, 0.5) * rng.uniform(0.4, 1.0, 3),
-            bool(rng.random() < 0.4),
-        )
-
-    def factor(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) what the colours at points (N, 3) are multiplied by."""
-        wave = np.sin(points @ self.waves.T + self.phases).mean(axis=1)
-        wave = np.sign(wave) if self.hard else wave
-        return 1 + wave[:, None] * self.strength
 
 
 @dataclass(frozen=True)
@@ -75,8 +41,8 @@ class Appearance:
         if rng.random() < _PLAIN_SHARE:
             return Appearance()
         grey = np.full(3, rng.uniform(0.15, 0.95))
-        table = grey if rng.random() < 0.5 else _colour(rng)
-        objects = np.stack([_colour(rng) for _ in range(count)])
+        table = grey if rng.random() < 0.5 else random_colour(rng)
+        objects = np.stack([random_colour(rng) for _ in range(count)])
         if rng.random() < _ONE_COLOUR_SHARE:
             objects[:] = table if rng.random() < 0.25 else objects[0]
         textures = tuple(Texture.draw(rng) if rng.random() < 0.4 else None for _ in range(count))
@@ -139,11 +105,6 @@ def draw_camera(rng: np.random.Generator, camera: CameraConfig) -> tuple[Intrins
     intrinsics = camera_intrinsics(camera)
     wider = replace(intrinsics, fov_deg=intrinsics.fov_deg * rng.uniform(0.92, 1.08))
     return wider, look_at(target + shift + length * away, target + shift, up)
-
-
-def _colour(rng: np.random.Generator) -> np.ndarray:
-    hue, saturation, value = rng.random(), rng.uniform(0, 1), rng.uniform(0.1, 1)
-    return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
 
 
 def _light(rng: np.random.Generator) -> dict:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pybullet
 
-from envs.camera import Image, Intrinsics, load_renderer, render
+from envs.camera import DEFAULT_LIGHT, Image, Intrinsics, load_renderer, render
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
@@ -23,6 +23,7 @@ from utils.config import CameraConfig, Config
 from utils.depth_noise import KinectNoise
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
+from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at, pose_matrix
 
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
@@ -44,7 +45,8 @@ class Cell:
 
     `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_step` is called
     after every physics step with the cell (used to film), `before_step` before it (used to disturb
-    the objects). Close it, or use it in a `with` block.
+    the objects), `on_build` when a scene has been built and nothing has moved yet; `view` changes
+    what cameras see. Close it, or use it in a `with` block.
     """
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
@@ -59,6 +61,8 @@ class Cell:
         config.make_cache_folder()
         self.on_step: Callable[[Cell], None] | None = None
         self.before_step: Callable[[Cell], None] | None = None
+        self.on_build: Callable[[Cell], None] | None = None
+        self.view: RandomView | None = None
         self._gui = gui
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.renderer = load_renderer(self.client, config.sim.renderer)
@@ -90,9 +94,17 @@ class Cell:
         self.remaining = set(range(len(self.bodies)))
         self.steps = 0
         self.frames = 0
+        if self.on_build is not None:
+            self.on_build(self)
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
+        while count > 0:
+            part = self.robot.receive(count)
+            self._advance(part)
+            count -= part
+
+    def _advance(self, count: int) -> None:
         client, on_step, before_step = self.client, self.on_step, self.before_step
         watched = on_step is not None or before_step is not None or self._gui
         if not watched and _divides(self.dt, count):
@@ -234,11 +246,25 @@ class Cell:
     ) -> RGBDFrame:
         """What a camera at T_WC (4, 4) sees now, without noise; `light` as in
         `envs.camera.render`."""
-        image = render(self.client, intrinsics, T_WC, self.renderer, light)
+        image = self.image(intrinsics, T_WC, light)
         truth = self.truth() if with_truth else None
         return RGBDFrame(
             image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
         )
+
+    def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
+        """What `look` sees, without a frame around it. With a `view`, the camera is really where
+        that has it, and what is reported of it stays as it is here: it was calibrated so."""
+        view = self.view
+        if view is None:
+            return render(self.client, intrinsics, T_WC, self.renderer, light)
+        view.begin_frame()
+        intrinsics = replace(intrinsics, fov_deg=intrinsics.fov_deg * view.fov_scale)
+        T_WC = T_WC @ view.T_CC
+        light = DEFAULT_LIGHT | (light or {})
+        image = render(self.client, intrinsics, T_WC, self.renderer, view.lit(light))
+        rgb, depth = view.develop(image.rgb, image.depth, image.bodies, intrinsics.K, T_WC)
+        return replace(image, rgb=rgb, depth=depth)
 
     def _segmentation(self, image: Image) -> np.ndarray:
         segmentation = np.full(image.bodies.shape, TABLE_OR_BACKGROUND, dtype=np.int32)

@@ -17,7 +17,6 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
-from envs.camera import render
 from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.kinematics import (
     JOINT_LOWER,
@@ -361,8 +360,7 @@ class RobotGraspingEnv(gymnasium.Env):
     def _observation(self) -> dict[str, np.ndarray]:
         observation = {}
         if "rgb" in self.settings.observations or "depth" in self.settings.observations:
-            cell = self.cell
-            image = render(cell.client, self._intrinsics, cell.camera_pose(), cell.renderer)
+            image = self.cell.image(self._intrinsics, self.cell.camera_pose())
             observation = {"rgb": image.rgb, "depth": image.depth[..., None]}
         observation["state"] = np.minimum(
             np.maximum(self._state, self._state_low), self._state_high

@@ -6,6 +6,9 @@ Knows nothing of objects, cameras or grasps; where to move is worked out in `env
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,10 +41,18 @@ LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
 
 class Panda:
-    """The robot's body in one physics client."""
+    """The robot's body in one physics client.
+
+    position_gain, velocity_gain, gripper_gain: factors on the motors' gains. latency: physics steps
+    after which a motor command arrives. All are as good as the motors can be unless changed.
+    """
 
     def __init__(self, client: int, dt: float, urdf: Path, grip_force: float):
         self.client, self.dt, self.grip_force = client, dt, grip_force
+        self.position_gain = self.velocity_gain = self.gripper_gain = 1.0
+        self.latency = 0
+        self._clock = 0  # physics steps
+        self._underway: deque[tuple[int, Callable[[], object]]] = deque()  # by time of arrival
         self.body = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
         )
@@ -78,15 +89,37 @@ class Panda:
         """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""
         for joint, value in zip([*ARM, *FINGERS], [*q, opening / 2, opening / 2]):
             pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
+        self._underway.clear()
+        latency, self.latency = self.latency, 0
         self.command_arm(q, np.zeros(7))
         self.command_gripper(opening)
+        self.latency = latency
+
+    def _send(self, command: Callable[..., object], *args, **kwargs) -> None:
+        """Give a motor command, or put it on its way; commands arrive in the order given."""
+        if self.latency or self._underway:
+            due = self._clock + self.latency
+            self._underway.append((due, partial(command, *args, **kwargs)))
+        else:
+            command(*args, **kwargs)
+
+    def receive(self, count: int) -> int:
+        """Carry out the commands that have arrived, and let the motors' clock run on for up to
+        `count` physics steps; for how many, because none arrives in between."""
+        while self._underway and self._underway[0][0] <= self._clock:
+            self._underway.popleft()[1]()
+        if self._underway:
+            count = min(count, self._underway[0][0] - self._clock)
+        self._clock += count
+        return count
 
     def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s."""
-        pybullet.setJointMotorControlArray(
-            self.body, ARM, pybullet.POSITION_CONTROL,
+        self._send(
+            pybullet.setJointMotorControlArray, self.body, ARM, pybullet.POSITION_CONTROL,
             targetPositions=q, targetVelocities=velocity, forces=JOINT_TORQUE,
-            positionGains=_POSITION_GAINS, velocityGains=_VELOCITY_GAINS,
+            positionGains=[self.position_gain * _POSITION_GAIN] * 7,
+            velocityGains=[self.velocity_gain] * 7,
             physicsClientId=self.client,
         )  # fmt: skip
 
@@ -94,21 +127,23 @@ class Panda:
         """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
         nor than `speed` rad/s."""
         speeds = np.minimum(JOINT_VELOCITY, speed).tolist()
+        gain = self.position_gain * _DRIVE_GAIN
         for joint, position, torque, limit in zip(ARM, q.tolist(), _TORQUES, speeds):
-            pybullet.setJointMotorControl2(
-                self.body, joint, pybullet.POSITION_CONTROL,
+            self._send(
+                pybullet.setJointMotorControl2, self.body, joint, pybullet.POSITION_CONTROL,
                 targetPosition=position, targetVelocity=0.0, force=torque,
-                positionGain=_DRIVE_GAIN, velocityGain=1.0, maxVelocity=limit,
+                positionGain=gain, velocityGain=self.velocity_gain, maxVelocity=limit,
                 physicsClientId=self.client,
             )  # fmt: skip
 
     def command_gripper(self, opening: float, force: float | None = None) -> None:
         """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
         opening = min(max(float(opening), 0.0), MAX_OPENING)
-        pybullet.setJointMotorControl2(
-            self.body, LEFT_FINGER, pybullet.POSITION_CONTROL,
+        self._send(
+            pybullet.setJointMotorControl2, self.body, LEFT_FINGER, pybullet.POSITION_CONTROL,
             targetPosition=opening / 2, force=2 * (self.grip_force if force is None else force),
-            positionGain=0.2, velocityGain=1.0, maxVelocity=FINGER_SPEED,
+            positionGain=self.gripper_gain * _GRIPPER_GAIN, velocityGain=1.0,
+            maxVelocity=FINGER_SPEED,
             physicsClientId=self.client,
         )  # fmt: skip
 
@@ -225,9 +260,7 @@ class Panda:
 
 
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
-_POSITION_GAINS = [0.3] * 7
-_VELOCITY_GAINS = [1.0] * 7
-_DRIVE_GAIN = 0.1
+_POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _GRIP_COSINE = np.cos(np.radians(70))
 _STATE_JOINTS = [*ARM, *FINGERS]

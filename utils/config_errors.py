@@ -77,7 +77,8 @@ def allowed(schema: dict[str, Any]) -> str:
     if schema.get("type") == "array":
         fixed = schema.get("prefixItems")
         if fixed:
-            return f"a list of {len(fixed)} {_NOUNS[fixed[0]['type']]}s"
+            same = f"a list of {len(fixed)} {_NOUNS[fixed[0]['type']]}s"
+            return schema.get("description", same)
         return f"a list of at least one, each {allowed(schema['items'])}"
     if schema.get("type") == "null":
         return "null"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
@@ -317,6 +317,124 @@ class RLConfig(Section):
         return self
 
 
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class Range(NamedTuple):
+    """A parameter's range, see `utils.random_ranges`."""
+
+    low: float
+    high: float
+    distribution: str
+    operation: str
+    every: str
+
+
+def _range(values: tuple) -> Range:
+    value = Range(*values)
+    if value.low > value.high:
+        raise ValueError(f"low ({value.low}) must not be greater than high ({value.high})")
+    if value.low <= 0 and value.distribution == "log_uniform":
+        raise ValueError(f"log_uniform needs low > 0, got {value.low}")
+    if value.low <= 0 and value.operation == "scale":
+        raise ValueError(f"a factor (scale) needs low > 0, got {value.low}")
+    return value
+
+
+def _unsigned(value: Range) -> Range:
+    if value.low < 0:
+        raise ValueError(f"low ({value.low}) must not be negative")
+    return value
+
+
+RangeOf = Annotated[
+    tuple[
+        float,
+        float,
+        Literal["uniform", "log_uniform", "normal"],
+        Literal["scale", "add", "set"],
+        Literal["episode", "step"],
+    ],
+    Field(
+        strict=False,
+        description="a list of low, high, uniform | log_uniform | normal, scale | add | set, "
+        "episode | step",
+    ),
+    AfterValidator(_range),
+]
+UnsignedRange = Annotated[RangeOf, AfterValidator(_unsigned)]
+
+
+class PhysicsRangesConfig(Section):
+    object_mass: RangeOf
+    object_friction: RangeOf
+    rolling_friction: RangeOf
+    spinning_friction: RangeOf
+    table_friction: RangeOf
+    finger_friction: RangeOf
+    restitution: UnsignedRange
+    contact_stiffness: RangeOf
+    contact_damping: RangeOf
+    robot_mass: RangeOf
+    joint_damping: UnsignedRange
+    arm_position_gain: RangeOf
+    arm_velocity_gain: RangeOf
+    gripper_gain: RangeOf
+    gravity: RangeOf
+    action_noise: UnsignedRange
+    action_bias: RangeOf
+    latency: UnsignedRange
+
+
+class VisionRangesConfig(Section):
+    light_tilt: UnsignedRange
+    light_heading: RangeOf
+    light_colour: UnsignedRange
+    light_ambient: UnsignedRange
+    light_diffuse: UnsignedRange
+    light_specular: UnsignedRange
+    camera_shift: RangeOf
+    camera_turn: RangeOf
+    camera_fov: RangeOf
+    brightness: RangeOf
+    contrast: RangeOf
+    saturation: RangeOf
+    white_balance: RangeOf
+    colour_noise: UnsignedRange
+    depth_shift: RangeOf
+    depth_jitter: RangeOf
+    depth_step: RangeOf
+
+
+class AdaptiveConfig(Section):
+    enabled: bool
+    initial: Fraction
+    step: Share
+    boundary_share: Share
+    episodes: Count
+    widen_at: Share
+    narrow_at: Fraction
+
+    @model_validator(mode="after")
+    def _narrow_below_widen(self) -> AdaptiveConfig:
+        if self.narrow_at >= self.widen_at:
+            raise ValueError(
+                f"narrow_at ({self.narrow_at}) must be smaller than widen_at ({self.widen_at})"
+            )
+        return self
+
+
+class RandomizationConfig(Section):
+    physics: PhysicsRangesConfig
+    vision: VisionRangesConfig
+    colour_share: Fraction
+    texture_share: Fraction
+    texture_folder: Annotated[Path, Field(strict=False)] | None
+    shadow_share: Fraction
+    depth_noise_share: Fraction
+    adaptive: AdaptiveConfig
+
+
 class Config(Section):
     """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
 
@@ -337,6 +455,7 @@ class Config(Section):
     evaluate: EvaluateConfig
     env: EnvConfig
     rl: RLConfig
+    randomization: RandomizationConfig
 
     @property
     def cache_folder(self) -> Path:

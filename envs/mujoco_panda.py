@@ -1,0 +1,206 @@
+"""The Franka Panda in MuJoCo, a second world beside PyBullet's: same kinematics, other physics.
+
+Made from the same file, pybullet_data's `franka_panda/panda.urdf`, whose inertias are placeholders
+and are replaced by identified ones. Knows nothing of scenes and tasks. MuJoCo is optional:
+pip install "mujoco>=3.3,<4".
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pybullet_data
+
+from envs.kinematics import JOINT_LOWER, JOINT_TORQUE, JOINT_UPPER
+from utils.errors import UserError
+
+if TYPE_CHECKING:
+    import mujoco
+
+ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+HAND, GRASP_TARGET = "panda_hand", "panda_grasptarget"
+FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
+
+
+class Inertial(NamedTuple):
+    """mass: kg. centre: (3,) m in the link's frame. inertia: kg m2 about the centre, along the
+    link's axes: xx, yy, zz, xy, xz, yz."""
+
+    mass: float
+    centre: tuple[float, float, float]
+    inertia: tuple[float, float, float, float, float, float]
+
+
+# Arm: Gaz, Cognetti, Oliva, Robuffo Giordano and De Luca, "Dynamic identification of the Franka
+# Emika Panda robot with retrieval of feasible parameters using penalty-based optimization" (RA-L
+# 2019), in the links' frames as Franka's description of the robot and MuJoCo Menagerie carry them.
+# Hand: the same two.
+INERTIALS = {
+    "panda_link1": Inertial(
+        4.970684, (0.003875, 0.002081, -0.04762),
+        (0.70337, 0.70661, 0.0091170, -0.000139, 0.006772, 0.019169),
+    ),
+    "panda_link2": Inertial(
+        0.646926, (-0.003141, -0.02872, 0.003495),
+        (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704),
+    ),
+    "panda_link3": Inertial(
+        3.228604, (0.027518, 0.039252, -0.066502),
+        (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805),
+    ),
+    "panda_link4": Inertial(
+        3.587895, (-0.05317, 0.104419, 0.027454),
+        (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
+    ),
+    "panda_link5": Inertial(
+        1.225946, (-0.011953, 0.041065, -0.038437),
+        (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
+    ),
+    "panda_link6": Inertial(
+        1.666555, (0.060149, -0.014117, -0.010517),
+        (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
+    ),
+    "panda_link7": Inertial(
+        0.735522, (0.010517, -0.004252, 0.061597),
+        (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
+    ),
+    "panda_hand": Inertial(0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0)),
+    "panda_leftfinger": Inertial(0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0, 0, 0)),
+    "panda_rightfinger": Inertial(0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0, 0, 0)),
+}  # fmt: skip
+
+# Servos: N m/rad and N m s/rad, near critical damping with the reflected inertia of the motors,
+# about 0.1 kg m2 (the gears' ratio squared times the rotor's), which the identified links lack.
+_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
+_DAMPING_RATIO_OF_STIFFNESS = 0.1  # s
+_ARMATURE = 0.1
+_FINGER_STIFFNESS, _FINGER_DAMPING = 4000.0, 100.0  # N/m, N s/m
+_FINGER_ARMATURE = 0.1  # kg
+
+
+def load_mujoco():
+    """The `mujoco` module. Raises UserError where it is not installed."""
+    try:
+        import mujoco
+    except ImportError as error:
+        raise UserError(
+            'MuJoCo is not installed: pip install "mujoco>=3.3,<4" (4.0.0 is another package)'
+        ) from error
+    return mujoco
+
+
+def panda_spec() -> mujoco.MjSpec:
+    """A model of the Panda alone, to which a scene can be added, with its base at W's origin.
+
+    Actuators: seven position servos in radians, and the distance between the fingertips in metres.
+    One motor drives both fingers, as in the real hand. Raises UserError without MuJoCo.
+    """
+    mujoco = load_mujoco()
+    spec = mujoco.MjSpec.from_string(_urdf())
+    for name, inertial in INERTIALS.items():
+        body = spec.body(name)
+        body.mass, body.ipos, body.fullinertia = inertial
+        body.iquat = [1, 0, 0, 0]
+        body.explicitinertial = True
+    for i, name in enumerate(ARM_JOINTS):
+        joint = spec.joint(name)
+        joint.range = [JOINT_LOWER[i], JOINT_UPPER[i]]  # the URDF's are wider
+        joint.armature = _ARMATURE
+        stiffness, torque = _STIFFNESS[i], JOINT_TORQUE[i]
+        _servo(mujoco, spec, name, mujoco.mjtTrn.mjTRN_JOINT, (
+            stiffness, -stiffness, -_DAMPING_RATIO_OF_STIFFNESS * stiffness,
+        ), torque, joint.range)  # fmt: skip
+    for name in FINGER_JOINTS:
+        spec.joint(name).armature = _FINGER_ARMATURE
+    equal = spec.add_equality()
+    equal.type, equal.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
+    equal.name, (equal.name1, equal.name2) = "fingers", FINGER_JOINTS
+    equal.data[:5] = [0, 1, 0, 0, 0]  # the first finger's place is the second's
+    opening = spec.add_tendon(name="opening")
+    for name in FINGER_JOINTS:
+        opening.wrap_joint(name, 1.0)
+    # The tendon's force acts on both fingers alike, so this one is a finger's.
+    _servo(mujoco, spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, (
+        _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
+    ), FINGER_FORCE, [0.0, 0.08])  # fmt: skip
+    for one, other in (("panda_link7", HAND), ("panda_link5", "panda_link7")):
+        exclude = spec.add_exclude()
+        exclude.bodyname1, exclude.bodyname2 = one, other
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return spec
+
+
+def _servo(mujoco, spec, target: str, kind, gains, force: float, span) -> None:
+    """force = gain x control + position gain x position + velocity gain x velocity, limited."""
+    actuator = spec.add_actuator(name=target, target=target, trntype=kind)
+    actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+    actuator.gainprm[0] = gains[0]
+    actuator.biasprm[:3] = [0.0, *gains[1:]]
+    actuator.forcerange, actuator.ctrlrange = [-force, force], list(span)
+    actuator.forcelimited = actuator.ctrllimited = True
+
+
+def _urdf() -> str:
+    """PyBullet's URDF with paths and settings that MuJoCo takes, and the coarse meshes.
+
+    The fine ones have the coarse ones' names, and would be taken for the same.
+    """
+    stock = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
+    robot = ElementTree.parse(stock).getroot()
+    for mesh in robot.iter("mesh"):
+        name = mesh.attrib["filename"].replace("package://", "")
+        mesh.set("filename", str(stock.parent / name.replace("/visual/", "/collision/")))
+    settings = ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler")
+    # Links without shapes are frames that are asked for; none of the shapes is only for show.
+    for name, value in {
+        "discardvisual": "false", "fusestatic": "false", "strippath": "false",
+        "balanceinertia": "true",
+    }.items():  # fmt: skip
+        settings.set(name, value)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+class MujocoPanda:
+    """The Panda alone in MuJoCo: `model` and `data` are MuJoCo's own."""
+
+    def __init__(self, spec: mujoco.MjSpec | None = None):
+        self._mujoco = load_mujoco()
+        self.model = (spec or panda_spec()).compile()
+        self.data = self._mujoco.MjData(self.model)
+        self._arm = [self.model.joint(name).qposadr[0] for name in ARM_JOINTS]
+        self._fingers = [self.model.joint(name).qposadr[0] for name in FINGER_JOINTS]
+
+    @property
+    def q(self) -> np.ndarray:
+        """(7,) joint positions, rad."""
+        return self.data.qpos[self._arm].copy()
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingertips, m."""
+        return float(self.data.qpos[self._fingers].sum())
+
+    def place(self, q: np.ndarray, opening: float = 0.08) -> None:
+        """Put the robot at joint positions q (7,) and an opening in metres, at rest."""
+        self.data.qpos[self._arm], self.data.qpos[self._fingers] = q, opening / 2
+        self.data.qvel[:] = 0
+        self.command(q, opening)
+        self._mujoco.mj_forward(self.model, self.data)
+
+    def command(self, q: np.ndarray, opening: float) -> None:
+        """Targets of the servos: q (7,) rad, opening in metres."""
+        self.data.ctrl[:7], self.data.ctrl[7] = q, opening
+
+    def step(self, count: int = 1) -> None:
+        """Advance by so many of the model's time steps."""
+        self._mujoco.mj_step(self.model, self.data, count)
+
+    def pose(self, body: str) -> np.ndarray:
+        """(4, 4) pose in W of a link's frame, by its name in the URDF."""
+        T, found = np.eye(4), self.data.body(body)
+        T[:3, :3], T[:3, 3] = found.xmat.reshape(3, 3), found.xpos
+        return T

@@ -1,0 +1,115 @@
+"""A scene of the cell in MuJoCo: table, bin, objects and Panda where PyBullet's cell has them.
+
+Same sizes, masses, inertias and friction; contacts are MuJoCo's own. Camera poses and intrinsics
+are the cell's, see `camera_of`. Knows nothing of policies.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from envs.camera import Intrinsics
+from envs.mujoco_panda import MujocoPanda, load_mujoco, panda_spec
+from envs.objects import ObjectModel
+from envs.scenes import Scene
+from envs.world import BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, GRAVITY, TABLE_CENTRE, TABLE_SIZE
+from utils.transforms import pose_matrix
+
+if TYPE_CHECKING:
+    import mujoco
+
+_TABLE_THICKNESS, _WALL = 0.04, 0.005  # m
+_TABLE_COLOUR, _BIN_COLOUR = (0.62, 0.60, 0.57, 1.0), (0.25, 0.35, 0.45, 1.0)
+# MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
+# fingers: with nothing on these here, the object's own coefficient counts in both.
+_NO_FRICTION = 1e-5
+# m and dimensionless lengths of torsional and rolling friction, MuJoCo's defaults.
+_TORSION, _ROLLING = 0.005, 1e-4
+
+
+class MujocoScene(MujocoPanda):
+    """The Panda with a scene around it; `frequency` in Hz is that of the physics steps.
+
+    Objects start at the scene's resting poses, the robot at `home` (7,) rad with an open hand.
+    Raises UserError without MuJoCo.
+    """
+
+    def __init__(self, scene: Scene, home: np.ndarray, frequency: int = 500):
+        mujoco = load_mujoco()
+        spec = panda_spec()
+        spec.option.timestep = 1 / frequency
+        spec.option.gravity = [0, 0, -GRAVITY]
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10  # of friction's stiffness: grasped objects creep less
+        for name in ("panda_leftfinger", "panda_rightfinger"):
+            for geom in spec.body(name).geoms:
+                geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
+        _box(
+            mujoco, spec, "table", [*(TABLE_SIZE / 2), _TABLE_THICKNESS / 2],
+            [*TABLE_CENTRE, -_TABLE_THICKNESS / 2], _TABLE_COLOUR,
+        )  # fmt: skip
+        for i, (size, position) in enumerate(_bin_walls()):
+            _box(mujoco, spec, f"bin{i}", size, position, _BIN_COLOUR)
+        for i, placed in enumerate(scene.placements):
+            _add_object(mujoco, spec, f"object{i}", placed.model, placed.position,
+                        placed.quaternion)  # fmt: skip
+        # The base stands on the table.
+        exclude = spec.add_exclude()
+        exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
+        super().__init__(spec)
+        self.count = len(scene.placements)
+        self.place(np.asarray(home, dtype=float))
+
+    def object_pose(self, index: int) -> np.ndarray:
+        """(4, 4) pose in W of an object's body frame, whose origin is its centre of mass."""
+        found = self.data.body(f"object{index}")
+        x, y, z, w = np.roll(found.xquat, -1)
+        return pose_matrix(found.xpos, (x, y, z, w))
+
+
+def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
+    """What MuJoCo calls the cell's camera: fovy in degrees, pos (3,) and mat (3, 3) in W, whose
+    columns are right, up and backwards."""
+    return {
+        "fovy": intrinsics.fov_deg,
+        "pos": T_WC[:3, 3].copy(),
+        "mat": T_WC[:3, :3] @ np.diag([1.0, -1.0, -1.0]),
+    }
+
+
+def _box(mujoco, spec: mujoco.MjSpec, name: str, half_size, position, colour) -> None:
+    body = spec.worldbody.add_body(name=name, pos=list(position))
+    geom = body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=list(half_size), rgba=list(colour)
+    )
+    geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
+
+
+def _bin_walls():
+    """Half sizes and positions (3,) of the bin's walls, as `envs.world.add_walls` puts them."""
+    outer = BIN_HALF_SIZE + _WALL / 2
+    for sign in (-1, 1):
+        for axis in (0, 1):
+            size = np.array([BIN_HALF_SIZE + _WALL, BIN_HALF_SIZE + _WALL, BIN_HEIGHT / 2])
+            size[axis] = _WALL / 2
+            position = np.array([*BIN_CENTRE, BIN_HEIGHT / 2])
+            position[axis] += sign * outer
+            yield size, position
+
+
+def _add_object(mujoco, spec, name: str, model: ObjectModel, position, quaternion) -> None:
+    body = spec.worldbody.add_body(
+        name=name, pos=list(position), quat=np.roll(quaternion, 1).tolist()
+    )
+    body.add_freejoint(name=name)
+    body.mass, body.inertia, body.ipos = model.mass, model.inertia, [0, 0, 0]
+    body.explicitinertial = True
+    for i, part in enumerate(model.parts):
+        mesh = spec.add_mesh(name=f"{name}_{i}")
+        mesh.uservert = np.asarray(part, dtype=np.float32).ravel()
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+        geom.rgba = list(model.color)
+        geom.friction = [model.friction, _TORSION, max(model.rolling_friction, _ROLLING)]
+        geom.condim = 6 if model.rolling_friction else 4

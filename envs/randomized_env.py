@@ -1,0 +1,54 @@
+"""`RandomizedGraspingEnv`: the grasping task in a world that changes with every episode.
+
+Registered as `RandomizedGrasping-v0`. What changes is drawn in `utils.domain_randomization` from
+the config's section `randomization`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from envs.grasping_env import RobotGraspingEnv
+from envs.panda import ARM, FINGERS
+from utils.domain_randomization import DomainRandomizer
+
+
+class RandomizedGraspingEnv(RobotGraspingEnv):
+    """`RobotGraspingEnv` whose every episode has physics and looks of its own.
+
+    info at reset has the episode's sample as `randomization`.
+    `reset(options={"randomization": sample})` replays it; together with the scene's seed and the
+    same actions that gives the same episode bit for bit.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.randomizer = DomainRandomizer(self.cell, self.config.randomization, ARM, FINGERS)
+        self._recorded: Mapping[str, Any] | None = None
+        self.cell.on_build = self._change_world
+
+    def _change_world(self, cell: Any) -> None:
+        if self._recorded is None:
+            self.randomizer.randomize(int(self.np_random.integers(2**31)))
+        else:
+            self.randomizer.replay(self._recorded)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        options = dict(options or {})
+        self._recorded = options.pop("randomization", None)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info | {"randomization": self.randomizer.sample}
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        action = self._checked(action) if self._running else action
+        observation, reward, terminated, truncated, info = super().step(self.randomizer.act(action))
+        if terminated or truncated:
+            self.randomizer.record_result(info["is_success"])
+        return observation, reward, terminated, truncated, info

@@ -1,0 +1,510 @@
+"""Randomised episodes: replayed bit for bit, taken back exactly, and with the effect they say."""
+
+import json
+from functools import cache
+
+import gymnasium
+import numpy as np
+import pybullet
+import pytest
+
+import envs  # noqa: F401 - registers the environments
+from envs.cell import Cell
+from envs.objects import load_object_set
+from envs.panda import ARM, FINGERS
+from envs.scenes import make_scene
+from utils.config import load_config
+from utils.config_schema import PhysicsRangesConfig, Range, VisionRangesConfig
+from utils.domain_randomization import DomainRandomizer
+from utils.errors import UserError
+
+PHYSICS, VISION = PhysicsRangesConfig.model_fields, VisionRangesConfig.model_fields
+EXTREME = [
+    "sim.renderer=tiny", "camera.width=96", "camera.height=96", "randomization.colour_share=1",
+    "randomization.texture_share=1", "randomization.depth_noise_share=1",
+    "randomization.shadow_share=1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def wild():
+    return load_config(None, EXTREME)
+
+
+@pytest.fixture(scope="module")
+def scene(wild):
+    objects = load_object_set("primitives", cache_dir=wild.cache_folder)
+    return make_scene("pile", objects, 1, wild)
+
+
+@pytest.fixture
+def cell(wild, scene):
+    with Cell(wild) as cell:
+        cell.build(scene)
+        yield cell
+
+
+@cache
+def idle():
+    """A config in which every range holds nothing but what changes nothing."""
+    config = load_config(None, EXTREME[:3])
+    changed = {}
+    for part in ("physics", "vision"):
+        ranges = getattr(config.randomization, part)
+        specs = {name: getattr(ranges, name) for name in type(ranges).model_fields}
+        still = {
+            name: Range(1.0, 1.0, "uniform", "scale", "episode")
+            if spec.operation == "scale"
+            else Range(0.0, 0.0, "uniform", "add", "episode")
+            for name, spec in specs.items()
+        }
+        changed[part] = ranges.model_copy(update=still)
+    shares = ["colour_share", "texture_share", "shadow_share", "depth_noise_share"]
+    changed |= dict.fromkeys(shares, 0.0)
+    return config, config.randomization.model_copy(update=changed)
+
+
+def only(**changes):
+    """A config that randomises these parameters, given as in YAML, and nothing else."""
+    config, still = idle()
+    for name, value in changes.items():
+        part = next((p for p in ("physics", "vision") if hasattr(getattr(still, p), name)), None)
+        if part is None:
+            still = still.model_copy(update={name: value})
+        else:
+            low, high, *rest = value.split(",")
+            ranges = getattr(still, part)
+            ranges = ranges.model_copy(update={name: Range(float(low), float(high), *rest)})
+            still = still.model_copy(update={part: ranges})
+    return config.model_copy(update={"randomization": still})
+
+
+def everything(cell: Cell) -> list:
+    """All that PyBullet says of the world, joint damping apart, and what the camera sees."""
+    client, robot = cell.client, cell.robot
+    links = [(body, -1) for body in (*cell.bodies, cell.table, *cell.bin)]
+    links += [(robot.body, link) for link in (-1, *ARM, *FINGERS)]
+    image = cell.frame()
+    return [
+        [pybullet.getDynamicsInfo(*link, physicsClientId=client) for link in links],
+        pybullet.getPhysicsEngineParameters(physicsClientId=client),
+        [
+            pybullet.getVisualShapeData(body, physicsClientId=client)
+            for body in (*cell.bodies, cell.table, robot.body)
+        ],
+        (robot.position_gain, robot.velocity_gain, robot.gripper_gain, robot.latency),
+        image.rgb.tolist(), image.depth.tolist(), image.T_WC.tolist(),
+    ]  # fmt: skip
+
+
+def states(cell: Cell) -> list:
+    """Where everything is and goes after some motion of the arm, as exact numbers."""
+    seen = []
+    for i in range(4):
+        cell.robot.drive_arm_to(cell.home + 0.1 * (i % 2))
+        cell.robot.command_gripper(0.02 * i)
+        cell.step(15)
+        seen.append(cell.robot.joint_state()[0].tolist())
+        seen.append(cell.robot.joint_state()[1].tolist())
+        seen += [
+            pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
+            for body in cell.bodies
+        ]
+    return seen
+
+
+def randomizer_of(cell: Cell, config=None) -> DomainRandomizer:
+    return DomainRandomizer(cell, (config or cell.config).randomization, ARM, FINGERS)
+
+
+def test_restore_brings_the_nominal_cell_back(cell, scene):
+    """By reading back, by rendering, and by moving on exactly as a cell that never changed."""
+    nominal = everything(cell)
+    randomizer = randomizer_of(cell)
+    for seed in range(3):
+        randomizer.randomize(seed)
+        changed = everything(cell)
+        # Dynamics, engine, colours, motors, colours seen and depth: all of it differs.
+        assert [a == b for a, b in zip(nominal, changed)] == [False] * 6 + [True]
+    randomizer.restore()
+    assert everything(cell) == nominal
+    moved = states(cell)
+    cell.build(scene)
+    assert states(cell) == moved
+
+
+def test_restore_spares_what_was_retired(cell):
+    randomizer = randomizer_of(cell)
+    randomizer.randomize(0)
+    cell.retire(2)
+    randomizer.restore()
+    mass = pybullet.getDynamicsInfo(cell.bodies[2], -1, physicsClientId=cell.client)[0]
+    assert mass == 0
+    assert pybullet.getDynamicsInfo(cell.bodies[1], -1, physicsClientId=cell.client)[0] > 0
+
+
+def test_restore_after_a_rebuild_does_nothing(cell, scene):
+    randomizer = randomizer_of(cell)
+    randomizer.randomize(0)
+    cell.build(scene)
+    randomizer.restore()
+    assert randomizer.sample is None and cell.view is None
+    nominal = everything(cell)
+    cell.build(scene)
+    assert everything(cell) == nominal
+
+
+def test_replay_gives_the_same_world(cell, scene):
+    randomizer = randomizer_of(cell)
+    sample = randomizer.randomize()
+    first, moved = everything(cell), states(cell)
+    assert randomizer.randomize() != sample
+    cell.build(scene)
+    another = randomizer_of(cell, load_config())  # ranges do not matter any more
+    another.replay(json.loads(json.dumps(sample)))
+    assert everything(cell) == first
+    assert states(cell) == moved
+    assert another.sample == sample
+
+
+def test_samples_of_another_scene_or_version_are_refused(cell):
+    randomizer = randomizer_of(cell)
+    sample = randomizer.randomize(0)
+    with pytest.raises(UserError, match="version 7"):
+        randomizer.replay(sample | {"version": 7})
+    with pytest.raises(UserError, match="recorded with 1 objects, the scene has 5"):
+        randomizer.replay(sample | {"textures": sample["textures"][:2]})
+
+
+def test_the_sample_tells_every_parameter(cell):
+    sample = randomizer_of(cell).randomize(3)
+    assert set(sample["physics"]) == set(PHYSICS) and set(sample["vision"]) == set(VISION)
+    assert len(sample["physics"]["object_mass"][1]) == 5  # one for each object
+    for part, section in (("physics", cell.config.randomization.physics),
+                          ("vision", cell.config.randomization.vision)):  # fmt: skip
+        for name, (operation, values) in sample[part].items():
+            spec = getattr(section, name)
+            assert operation == spec.operation
+            assert all(spec.low <= v <= spec.high for v in np.atleast_1d(values))
+
+
+def dynamics(cell: Cell, body: int, link: int = -1) -> dict:
+    info = pybullet.getDynamicsInfo(body, link, physicsClientId=cell.client)
+    places = {"mass": 0, "friction": 1, "inertia": 2, "restitution": 5, "rolling": 6,
+              "spinning": 7, "damping": 8, "stiffness": 9}  # fmt: skip
+    return {name: info[place] for name, place in places.items()}
+
+
+def test_mass_takes_inertia_with_it(scene):
+    config = only(object_mass="2,2,uniform,scale,episode")
+    with Cell(config) as cell:
+        cell.build(scene)
+        before = [dynamics(cell, body) for body in cell.bodies]
+        randomizer_of(cell).randomize(0)
+        for body, old in zip(cell.bodies, before):
+            new = dynamics(cell, body)
+            assert new["mass"] == 2 * old["mass"]
+            np.testing.assert_allclose(new["inertia"], 2 * np.array(old["inertia"]), rtol=1e-12)
+            assert {k: v for k, v in new.items() if k not in ("mass", "inertia")} == {
+                k: v for k, v in old.items() if k not in ("mass", "inertia")
+            }
+
+
+def test_fingers_table_and_gravity(scene):
+    config = only(
+        contact_stiffness="0.5,0.5,uniform,scale,episode",
+        contact_damping="2,2,uniform,scale,episode",
+        finger_friction="1.25,1.25,uniform,scale,episode",
+        spinning_friction="3,3,uniform,scale,episode",
+        table_friction="0.75,0.75,uniform,scale,episode",
+        gravity="-0.19,-0.19,uniform,add,episode",
+        restitution="0.1,0.1,uniform,set,episode",
+    )
+    with Cell(config) as cell:
+        cell.build(scene)
+        randomizer_of(cell).randomize(0)
+        for finger in FINGERS:  # panda.urdf: friction 1, spinning 0.1, 30000 N/m, 1000 N s/m
+            found = dynamics(cell, cell.robot.body, finger)
+            assert (found["stiffness"], found["damping"]) == (15000, 2000)
+            assert found["friction"] == 1.25 and found["spinning"] == pytest.approx(0.3)
+        assert dynamics(cell, cell.table)["friction"] == 0.75
+        assert {dynamics(cell, body)["restitution"] for body in cell.bodies} == {0.1}
+        parameters = pybullet.getPhysicsEngineParameters(physicsClientId=cell.client)
+        assert parameters["gravityAccelerationZ"] == pytest.approx(-10.0)
+
+
+def test_restitution_makes_an_object_bounce(box_set, wild):
+    """What bounces with e rises to e^2 of the height it fell from (Newton), about: it falls 8 mm
+    in a physics step, and is pushed out of the table it sank into."""
+    heights = {}
+    for value in (0.0, 0.6):
+        config = only(restitution=f"{value},{value},uniform,set,episode")
+        with Cell(config) as cell:
+            cell.build(make_scene("isolated", box_set, 0, config))
+            randomizer_of(cell).randomize(0)
+            body = cell.bodies[0]
+            at = [0.5, 0.0, 0.03 + 0.2]
+            pybullet.resetBasePositionAndOrientation(
+                body, at, [0, 0, 0, 1], physicsClientId=cell.client
+            )
+            cell.step(int(np.sqrt(2 * 0.2 / 9.81) * 240) + 2)
+            heights[value] = max(_height_after_a_step(cell) for _ in range(120)) - 0.03
+    assert heights[0.0] < 0.005
+    assert heights[0.6] == pytest.approx(0.36 * 0.2, rel=0.3)
+
+
+def _height_after_a_step(cell: Cell) -> float:
+    cell.step()
+    return float(cell.object_position(0)[2])
+
+
+def test_joint_damping_slows_a_free_joint(scene):
+    """PyBullet cannot be asked for it, so let the last joint spin: w falls as exp(-b t / I)."""
+    speeds = {}
+    for damping in (0.0, 0.01):
+        config = only(joint_damping=f"{damping},{damping},uniform,add,episode")
+        with Cell(config) as cell:
+            cell.build(scene)
+            randomizer = randomizer_of(cell)
+            randomizer.randomize(0)
+            speeds[damping] = _speed_after_spin(cell)
+            randomizer.restore()
+            speeds[damping, "restored"] = _speed_after_spin(cell)
+    assert speeds[0.01] < 0.9 * speeds[0.0]
+    assert speeds[0.01, "restored"] == pytest.approx(speeds[0.0], rel=1e-6)
+
+
+def _speed_after_spin(cell: Cell) -> float:
+    robot, client = cell.robot, cell.client
+    robot.place(cell.home)
+    pybullet.setJointMotorControl2(
+        robot.body, 6, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client
+    )
+    pybullet.resetJointState(robot.body, 6, cell.home[6], 1.0, physicsClientId=client)
+    cell.step(24)
+    return float(robot.joint_state()[1][6])
+
+
+def test_latency_delays_commands_by_whole_steps(scene):
+    config = only(latency=f"{5 / 240},{5 / 240},uniform,set,episode")
+    with Cell(config) as cell:
+        runs = {}
+        for name in ("late", "prompt"):
+            cell.build(scene)
+            if name == "late":
+                randomizer_of(cell).randomize(0)
+                assert cell.robot.latency == 5
+            cell.robot.drive_arm_to(cell.home + 0.2)
+            runs[name] = []
+            for _ in range(20):
+                cell.step()
+                runs[name].append(cell.robot.q)
+            runs[name] = np.array(runs[name])
+        still = abs(runs["late"][:5] - cell.home).max()
+        assert still < 1e-3 < abs(runs["prompt"][:5] - cell.home).max()
+        np.testing.assert_allclose(runs["late"][5:], runs["prompt"][:15], atol=2e-3)
+
+
+def test_latency_is_the_same_in_one_call_and_in_many(scene, wild):
+    with Cell(wild) as cell:
+        seen = []
+        for parts in ([40], [1] * 40, [7, 13, 20]):
+            cell.build(scene)
+            cell.robot.latency = 6
+            cell.robot.drive_arm_to(cell.home + 0.1)
+            for part in parts:
+                cell.step(part)
+            seen.append(cell.robot.q.tolist())
+            assert cell.steps == 40
+        assert seen[0] == seen[1] == seen[2]
+
+
+def test_actions_get_bias_and_noise(scene):
+    config = only(
+        action_noise="0.05,0.05,uniform,set,episode",
+        action_bias="0.1,0.1,uniform,set,episode",
+    )
+    with Cell(config) as cell:
+        cell.build(scene)
+        randomizer = randomizer_of(cell)
+        assert randomizer.act(np.ones(7)).tolist() == [1.0] * 7  # before any sample
+        randomizer.randomize(0)
+        actions = np.array([randomizer.act(np.zeros(7, np.float32)) for _ in range(600)])
+    assert actions.dtype == np.float32
+    # 4,200 draws: standard errors 0.0008 and 0.0005.
+    assert actions.mean() == pytest.approx(0.1, abs=0.003)
+    assert actions.std() == pytest.approx(0.05, abs=0.002)
+    assert abs(np.corrcoef(actions[1:].ravel(), actions[:-1].ravel())[0, 1]) < 0.06
+
+
+def test_parameters_drawn_at_every_step(scene):
+    config = only(
+        gravity="-1,1,uniform,add,step",
+        brightness="0.5,1.5,uniform,scale,step",
+    )
+    runs = []
+    with Cell(config) as cell:
+        for _ in range(2):
+            cell.build(scene)
+            randomizer = randomizer_of(cell)
+            sample = randomizer.randomize(4)
+            assert (
+                "gravity" not in sample["physics"] and "gravity" in sample["each_step"]["physics"]
+            )
+            seen = []
+            for _ in range(4):
+                randomizer.act(np.zeros(7))
+                parameters = pybullet.getPhysicsEngineParameters(physicsClientId=cell.client)
+                seen.append((parameters["gravityAccelerationZ"], float(cell.frame().rgb.mean())))
+            runs.append(seen)
+    assert runs[0] == runs[1]
+    assert len({g for g, _ in runs[0]}) == 4 and len({b for _, b in runs[0]}) == 4
+
+
+# --- Vision -----------------------------------------------------------------------------------
+
+
+def test_the_view_alone_is_what_the_cell_sees(scene):
+    """With every parameter idle the picture is the nominal one, up to the light's rounding."""
+    config = only(camera_fov="1,1,uniform,scale,episode")
+    with Cell(config) as cell:
+        cell.build(scene)
+        nominal = cell.frame()
+        randomizer_of(cell).randomize(0)
+        seen = cell.frame()
+    np.testing.assert_array_equal(seen.depth, nominal.depth)
+    assert abs(seen.rgb.astype(int) - nominal.rgb).max() <= 1
+
+
+def test_camera_error_is_not_reported(scene):
+    """1 cm nearer: the depth of the table falls from 0.8 to 0.79 m, and T_WC says nothing of it."""
+    config = only(camera_shift="0.01,0.01,uniform,add,episode")
+    with Cell(config) as cell:
+        cell.build(scene)
+        nominal = cell.frame()
+        randomizer_of(cell).randomize(0)
+        seen = cell.frame()
+    assert nominal.depth[0, 0] == pytest.approx(0.8, abs=1e-4)
+    assert seen.depth[0, 0] == pytest.approx(0.79, abs=1e-4)
+    np.testing.assert_array_equal(seen.T_WC, nominal.T_WC)
+    np.testing.assert_array_equal(seen.K, nominal.K)
+
+
+def test_field_of_view(scene):
+    """Twice the tangent of half the angle: everything is half as large, the objects cover a
+    quarter of the pixels."""
+    wide = np.degrees(2 * np.arctan(2 * np.tan(np.radians(14)))) / 28
+    config = only(camera_fov=f"{wide},{wide},uniform,scale,episode")
+    with Cell(config) as cell:
+        cell.build(scene)
+        nominal = (cell.frame().segmentation >= 0).sum()
+        randomizer_of(cell).randomize(0)
+        seen = (cell.frame().segmentation >= 0).sum()
+    assert seen == pytest.approx(nominal / 4, rel=0.1)
+
+
+def test_brightness_and_saturation(scene):
+    config = only(
+        brightness="0.5,0.5,uniform,scale,episode",
+        saturation="1e-9,1e-9,uniform,scale,episode",
+    )
+    with Cell(config) as cell:
+        cell.build(scene)
+        nominal = cell.frame().rgb.astype(float)
+        randomizer_of(cell).randomize(0)
+        seen = cell.frame().rgb
+    assert np.ptp(seen.astype(int), axis=2).max() <= 1  # grey
+    grey = nominal @ [0.299, 0.587, 0.114]
+    np.testing.assert_allclose(seen[..., 0], grey / 2, atol=2)
+
+
+def test_depth_noise_comes_and_goes(scene):
+    config = only(camera_fov="1,1,uniform,scale,episode", depth_noise_share=1.0)
+    with Cell(config) as cell:
+        cell.build(scene)
+        randomizer = randomizer_of(cell)
+        randomizer.randomize(0)
+        depth = cell.frame().depth
+        assert (depth == 0).mean() > 0.01 and len(np.unique(depth)) < 60  # holes, steps
+        again = cell.frame().depth
+        assert (again != depth).any()  # anew in each frame
+        randomizer.restore()
+        assert (cell.frame().depth > 0).all()
+
+
+def test_textures_stick_to_a_moved_object(scene):
+    config = only(camera_fov="1,1,uniform,scale,episode", colour_share=1.0, texture_share=1.0)
+    with Cell(config) as cell:
+        cell.build(scene)
+        plain = cell.frame()
+        randomizer = randomizer_of(cell)
+        sample = randomizer.randomize(2)
+        assert all(texture is not None for texture in sample["textures"])
+        seen = cell.frame()
+        on_table = seen.segmentation == -1
+        assert seen.rgb[on_table].std(axis=0).max() > plain.rgb[on_table].std(axis=0).max()
+
+
+# --- The environment --------------------------------------------------------------------------
+
+
+def episode(env, seed=None, options=None, steps=6):
+    """All observations and rewards of an episode, as bytes, and the last info."""
+    rng = np.random.default_rng(0)
+    observation, info = env.reset(seed=seed, options=options)
+    seen = [value.tobytes() for value in observation.values()]
+    for _ in range(steps):
+        observation, reward, *_, last = env.step(rng.uniform(-1, 1, 5).astype(np.float32))
+        seen += [value.tobytes() for value in observation.values()] + [reward]
+    return seen, info, last
+
+
+@pytest.fixture(scope="module")
+def env():
+    config = load_config(
+        None,
+        [*EXTREME, "randomization.physics.arm_velocity_gain=0.9,1,uniform,scale,step",
+         "randomization.vision.camera_shift=-0.01,0.01,normal,add,step"],
+    )  # fmt: skip
+    env = gymnasium.make(
+        "RandomizedGrasping-v0", config=config, resolution=48, control="ee_planar", max_steps=6
+    )
+    yield env
+    env.close()
+
+
+def test_an_episode_is_replayed_bit_for_bit(env):
+    first, info, last = episode(env, seed=3)
+    other, *_ = episode(env)
+    assert other != first
+    sample = json.loads(json.dumps(info["randomization"]))
+    options = {"scene_seed": info["scene_seed"], "randomization": sample}
+    again, *_ = episode(env, options=options)
+    assert again == first
+    assert sample == info["randomization"] and "randomization" not in last
+    seeded, *_ = episode(env, seed=3)
+    assert seeded == first
+
+
+def test_env_keeps_gymnasiums_rules(env):
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_automatic_ranges_learn_from_episodes():
+    config = load_config(
+        None,
+        ["sim.renderer=tiny", "randomization.adaptive.enabled=true",
+         "randomization.adaptive.boundary_share=1", "randomization.adaptive.episodes=1"],
+    )  # fmt: skip
+    env = gymnasium.make(
+        "RandomizedGrasping-v0", config=config, observations=["state"], control="ee_planar",
+        max_steps=1,
+    )  # fmt: skip
+    adaptive = env.unwrapped.randomizer.adaptive
+    width = adaptive.width
+    _, info, last = episode(env, seed=0, steps=1)
+    assert info["randomization"]["bound"] is not None
+    assert not last["is_success"] and adaptive.width < width
+    env.close()

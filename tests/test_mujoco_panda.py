@@ -1,0 +1,103 @@
+"""The Panda in MuJoCo beside PyBullet's; skipped where MuJoCo, which is optional, is missing."""
+
+import numpy as np
+import pybullet
+import pybullet_data
+import pytest
+
+pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
+
+from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
+from envs.mujoco_panda import FINGER_JOINTS, GRASP_TARGET, HAND, INERTIALS, MujocoPanda
+
+READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+
+
+@pytest.fixture(scope="module")
+def panda() -> MujocoPanda:
+    return MujocoPanda()
+
+
+@pytest.fixture(scope="module")
+def stock():
+    """PyBullet's own Panda: joint positions (7,) to the pose of its hand and grasp target."""
+    client = pybullet.connect(pybullet.DIRECT)
+    body = pybullet.loadURDF(
+        f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf", useFixedBase=True,
+        physicsClientId=client,
+    )  # fmt: skip
+    links = {
+        pybullet.getJointInfo(body, i, physicsClientId=client)[12].decode(): i
+        for i in range(pybullet.getNumJoints(body, physicsClientId=client))
+    }
+
+    def positions(q):
+        for joint, value in enumerate(q):
+            pybullet.resetJointState(body, joint, value, physicsClientId=client)
+        states = [
+            pybullet.getLinkState(
+                body, links[name], computeForwardKinematics=True, physicsClientId=client
+            )
+            for name in (HAND, GRASP_TARGET)
+        ]
+        return [(np.array(s[4]), np.array(s[5])) for s in states]
+
+    yield positions
+    pybullet.disconnect(physicsClientId=client)
+
+
+def test_the_hand_where_franka_and_pybullet_have_it(panda):
+    panda.place(READY)
+    np.testing.assert_allclose(panda.pose(HAND)[:3, 3], [0.306891, 0, 0.590282], atol=1e-6)
+    np.testing.assert_allclose(panda.pose(GRASP_TARGET)[:3, 3], [0.306891, 0, 0.485282], atol=1e-6)
+
+
+def test_forward_kinematics_agree_with_pybullet_and_with_ours(panda, stock):
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(JOINT_LOWER, JOINT_UPPER, (50, 7)):
+        panda.place(q)
+        for name, (position, (x, y, z, w)) in zip((HAND, GRASP_TARGET), stock(q)):
+            T = panda.pose(name)
+            np.testing.assert_allclose(T[:3, 3], position, atol=1e-6)
+            quaternion = panda.data.body(name).xquat
+            assert abs(quaternion @ [w, x, y, z]) == pytest.approx(1, abs=1e-6)
+        np.testing.assert_allclose(panda.pose(GRASP_TARGET), forward_kinematics(q), atol=1e-6)
+
+
+def test_masses_and_inertias_are_the_identified_ones(panda):
+    # Franka's data sheet says about 18 kg with the base; the moving links are 16.06 of them.
+    assert sum(INERTIALS[f"panda_link{i}"].mass for i in range(1, 8)) == pytest.approx(
+        16.06, abs=0.01
+    )
+    for name, inertial in INERTIALS.items():
+        body = panda.model.body(name)
+        assert body.mass[0] == inertial.mass
+        xx, yy, zz, xy, xz, yz = inertial.inertia
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        np.testing.assert_allclose(np.sort(body.inertia), moments, rtol=1e-6)
+        assert moments[2] <= moments[0] + moments[1] + 1e-12  # of any real body
+
+
+def test_gravity_torques(panda):
+    """Static torques of a horizontal arm, from centres of mass by hand: sum of m g x lever arm."""
+    q = np.array([0, np.pi / 2, 0, -0.07, 0, 0.5, 0])
+    panda.place(q)
+    total = 0.0
+    for name, inertial in INERTIALS.items():
+        if name == "panda_link1":
+            continue
+        centre = panda.pose(name) @ [*inertial.centre, 1.0]
+        total += inertial.mass * 9.81 * centre[0]
+    assert panda.data.qfrc_bias[1] == pytest.approx(-total, rel=1e-6)
+
+
+def test_servos_hold_and_move_the_arm(panda):
+    panda.place(READY)
+    goal = READY + 0.2
+    panda.command(goal, 0.03)
+    panda.step(int(2.0 / panda.model.opt.timestep))
+    # Gravity pulls a servo off by torque / stiffness: 30 N m / 4500 N m.
+    np.testing.assert_allclose(panda.q, goal, atol=0.01)
+    assert panda.opening == pytest.approx(0.03, abs=1e-3)
+    left, right = (panda.data.joint(name).qpos[0] for name in FINGER_JOINTS)
+    assert left == pytest.approx(right, abs=1e-4)

@@ -1,0 +1,359 @@
+"""Unsupervised domain adaptation: a network that works on unlabelled images of another domain.
+
+Domain-adversarial training after Ganin et al., "Domain-adversarial training of neural networks"
+(JMLR 2016): a classifier tells source from target features, and the feature extractor is trained
+against it through a gradient reversal. Labels of the target are never asked for. Knows no data set,
+no robot and no task: networks and the task's loss are given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from utils.errors import UserError
+
+SOURCE, TARGET = 0, 1
+_SHARPNESS = 10.0  # gamma of Ganin et al.'s schedules of the reversal and of the learning rate
+# A checkpoint may be chosen only if it still does its own domain's task this nearly as well as the
+# best one: what is confident but wrong everywhere is out.
+_SOURCE_SLACK = 0.02
+
+Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+
+
+class GradientReversal(torch.autograd.Function):
+    """The identity forwards; backwards the gradient times -weight."""
+
+    @staticmethod
+    def forward(ctx, values: torch.Tensor, weight: float) -> torch.Tensor:
+        ctx.weight = weight
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return -ctx.weight * gradient, None
+
+
+def reverse_gradient(values: torch.Tensor, weight: float) -> torch.Tensor:
+    """`values` (any shape) as they are, whose gradient is reversed and scaled by `weight`."""
+    return GradientReversal.apply(values, weight)
+
+
+def reversal_weight(progress: float) -> float:
+    """2 / (1 + exp(-10 p)) - 1 for p from 0 (start) to 1 (end of all training): Ganin et al. 5.2.2.
+
+    From 0, while the domain classifier still knows nothing, to nearly 1.
+    """
+    if not 0 <= progress <= 1:
+        raise ValueError(f"reversal_weight: progress must be within 0..1, got {progress}")
+    return 2 / (1 + math.exp(-_SHARPNESS * progress)) - 1
+
+
+class DomainBatchNorm(nn.Module):
+    """Batch normalisation of (B, C, ...) with statistics for each domain and one weight and bias.
+
+    Statistics of a mixture fit neither domain (Li et al., "Revisiting batch normalization for
+    practical domain adaptation", 2016). Which ones count is set by `select_domain`.
+    """
+
+    def __init__(self, channels: int, eps: float = 1e-5, momentum: float = 0.1):
+        super().__init__()
+        self.eps, self.momentum, self.domain = eps, momentum, SOURCE
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(2, channels))
+        self.register_buffer("running_var", torch.ones(2, channels))
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        return F.batch_norm(
+            values, self.running_mean[self.domain], self.running_var[self.domain],
+            self.weight, self.bias, self.training, self.momentum, self.eps,
+        )  # fmt: skip
+
+
+def per_domain_norms(module: nn.Module) -> nn.Module:
+    """The module with every BatchNorm1d and 2d in it turned into a DomainBatchNorm.
+
+    Weights are kept, and running statistics become those of both domains. Changes the module it is
+    given (unless that is a BatchNorm itself) and returns it.
+    """
+    if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+        if not (module.affine and module.track_running_stats and module.momentum is not None):
+            raise ValueError("per_domain_norms: needs affine norms with running averages")
+        norm = DomainBatchNorm(module.num_features, module.eps, module.momentum)
+        with torch.no_grad():
+            for name in ("weight", "bias", "running_mean", "running_var"):
+                getattr(norm, name).copy_(getattr(module, name))
+        return norm.to(module.weight.device)
+    for name, child in module.named_children():
+        setattr(module, name, per_domain_norms(child))
+    return module
+
+
+def select_domain(module: nn.Module, domain: int) -> None:
+    """From now on every DomainBatchNorm in the module uses this domain's statistics."""
+    for part in module.modules():
+        if isinstance(part, DomainBatchNorm):
+            part.domain = domain
+
+
+class Outputs(NamedTuple):
+    """task: whatever the task head makes. domain: (B,) logits of coming from the target.
+    features: what the extractor makes."""
+
+    task: torch.Tensor
+    domain: torch.Tensor
+    features: torch.Tensor
+
+
+class DomainAdaptationNetwork(nn.Module):
+    """A feature extractor with a task head and, behind a gradient reversal, a domain classifier.
+
+    feature_extractor: images (B, ...) to features (B, F, ...). task_head: features to whatever the
+    task's loss takes. domain_classifier: features to (B,) or (B, 1) logits. Each None makes the
+    default for small images (B, 3, H, W) and `classes` classes: features (B, feature_dim).
+    Batch norms of the extractor are made per domain; the heads should have none.
+    """
+
+    def __init__(
+        self,
+        feature_dim: int = 128,
+        classes: int = 10,
+        *,
+        feature_extractor: nn.Module | None = None,
+        task_head: nn.Module | None = None,
+        domain_classifier: nn.Module | None = None,
+    ):
+        super().__init__()
+        self.feature_extractor = per_domain_norms(feature_extractor or _small_cnn(feature_dim))
+        self.task_head = task_head or nn.Linear(feature_dim, classes)
+        self.domain_classifier = domain_classifier or nn.Sequential(
+            nn.Linear(feature_dim, 128), nn.ReLU(), nn.Linear(128, 1)
+        )
+
+    def forward(self, images: torch.Tensor, domain: int = TARGET, reversal: float = 1.0) -> Outputs:
+        """images (B, ...) that all come from one domain, SOURCE or TARGET."""
+        select_domain(self.feature_extractor, domain)
+        features = self.feature_extractor(images)
+        logits = self.domain_classifier(reverse_gradient(features, reversal))
+        return Outputs(self.task_head(features), logits.reshape(len(images)), features)
+
+
+def _small_cnn(feature_dim: int) -> nn.Module:
+    return nn.Sequential(
+        nn.Conv2d(3, 24, 5, stride=2, padding=2, bias=False), nn.BatchNorm2d(24), nn.ReLU(),
+        nn.Conv2d(24, 48, 3, stride=2, padding=1, bias=False), nn.BatchNorm2d(48), nn.ReLU(),
+        nn.AdaptiveAvgPool2d(5), nn.Flatten(),
+        nn.Linear(48 * 25, feature_dim, bias=False), nn.BatchNorm1d(feature_dim), nn.ReLU(),
+    )  # fmt: skip
+
+
+# --- Training ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class AdaptationSettings:
+    """steps: of the optimiser. batch_size: images of each domain in a step. lr, weight_decay: of
+    AdamW, the rate falling as lr / (1 + 10 p)^0.75 (Ganin et al.). adversarial: weight of the
+    domain loss in the features, times `reversal_weight`; 0 trains on the source alone.
+    held_out: share of either domain that is kept for choosing the checkpoint. checks: how often
+    over the training the network is looked at for that.
+    """
+
+    steps: int = 1000
+    batch_size: int = 64
+    lr: float = 2e-3
+    weight_decay: float = 1e-4
+    adversarial: float = 1.0
+    held_out: float = 0.2
+    checks: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "checks"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"AdaptationSettings.{name} must be >= 1")
+        if not 0 < self.held_out < 1:
+            raise ValueError("AdaptationSettings.held_out must be within 0..1")
+        if not (self.lr > 0 and self.adversarial >= 0 and self.weight_decay >= 0):
+            raise ValueError("AdaptationSettings: lr must be > 0, the other weights >= 0")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A look at the network during training, without one target label.
+
+    source_score: of the held-out source. information: nats, see `mutual_information`, of the
+    held-out target. domain_accuracy: of the domain classifier on what is held out; 0.5 is chance.
+    """
+
+    step: int
+    source_score: float
+    information: float
+    domain_accuracy: float
+
+
+@dataclass
+class AdaptationHistory:
+    """checks, in order. chosen: the one whose weights the network has in the end."""
+
+    checks: list[Check] = field(default_factory=list)
+    chosen: Check | None = None
+
+
+def train_domain_adaptation(
+    source: tuple[torch.Tensor, torch.Tensor],
+    target: torch.Tensor,
+    model: DomainAdaptationNetwork,
+    settings: AdaptationSettings | None = None,
+    *,
+    seed: int = 0,
+    task_loss: Loss = F.cross_entropy,
+    source_score: Loss | None = None,
+    on_check: Callable[[Check], None] | None = None,
+) -> AdaptationHistory:
+    """Train the network in place on labelled source and unlabelled target images.
+
+    source: images (N, ...) and labels (N, ...). target: images (M, ...), of which there may be more
+    or fewer; each step takes equally many of both, and each domain starts over when it is used up.
+    task_loss: (task head's output, labels) to a scalar. source_score: the same to what should be
+    high; None takes the share of right classes.
+
+    The weights that are kept are those of the check with the most `mutual_information` on
+    held-out target images, among the checks whose source score is within 0.02 of the best. No
+    target label is used: confidence alone would prefer a network that calls everything a 1, source
+    accuracy alone cannot see the target, and the information of the predictions is high only where
+    they are sure and differ. Every task head whose output is (B, classes, ...) logits has one.
+
+    Without an adversary (`settings.adversarial` 0) the target's images are only shown for its
+    batch-norm statistics, and the source score alone chooses.
+    Raises UserError where a domain has too few images.
+    """
+    settings = settings or AdaptationSettings()
+    rng = np.random.default_rng(seed)
+    score = source_score or _accuracy
+    images, labels = source
+    if len(images) != len(labels):
+        raise UserError(f"source has {len(images)} images and {len(labels)} labels")
+    train_s, held_s = _split(rng, len(images), settings, "source")
+    train_t, held_t = _split(rng, len(target), settings, "target")
+    batches = zip(_batches(rng, train_s, settings), _batches(rng, train_t, settings))
+    optimiser = torch.optim.AdamW(
+        model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
+    )
+    history, best = AdaptationHistory(), []
+    looks = set(np.linspace(0, settings.steps, settings.checks + 1).round().astype(int)[1:])
+    model.train()
+    for step in range(1, settings.steps + 1):
+        progress = (step - 1) / max(settings.steps - 1, 1)
+        for group in optimiser.param_groups:
+            group["lr"] = settings.lr / (1 + _SHARPNESS * progress) ** 0.75
+        chosen_s, chosen_t = next(batches)
+        weight = settings.adversarial * reversal_weight(progress)
+        ours = model(images[chosen_s], SOURCE, weight)
+        with torch.set_grad_enabled(bool(settings.adversarial)):
+            theirs = model(target[chosen_t], TARGET, weight)
+        loss = task_loss(ours.task, labels[chosen_s])
+        if settings.adversarial:
+            loss = loss + (_domain_loss(ours.domain, 0.0) + _domain_loss(theirs.domain, 1.0)) / 2
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        if step in looks:
+            check = _look(model, step, images[held_s], labels[held_s], target[held_t], score)
+            history.checks.append(check)
+            best.append(deepcopy(model.state_dict()))
+            if on_check is not None:
+                on_check(check)
+    adversarial = bool(settings.adversarial)
+    history.chosen = choose_check(history.checks, with_information=adversarial)
+    model.load_state_dict(best[history.checks.index(history.chosen)])
+    model.eval()
+    return history
+
+
+def choose_check(checks: list[Check], with_information: bool = True) -> Check:
+    """The check whose weights to keep, see `train_domain_adaptation`; of equals the last."""
+    if not with_information:
+        return max(checks, key=lambda check: (check.source_score, check.step))
+    enough = max(check.source_score for check in checks) - _SOURCE_SLACK
+    able = [check for check in checks if check.source_score >= enough]
+    return max(able, key=lambda check: (check.information, check.step))
+
+
+def mutual_information(logits: torch.Tensor) -> float:
+    """Nats that images' predicted classes tell of them: H(mean p) - mean H(p), 0 .. log(classes).
+
+    logits: (B, classes, ...), anything behind the classes counts as further images. From Bridle,
+    Heading and MacKay, "Unsupervised classifiers, mutual information and phantom targets" (1991).
+    """
+    log_p = F.log_softmax(logits.double(), dim=1).transpose(0, 1).flatten(1)
+    p = log_p.exp()
+    mean = p.mean(1)
+    return float(torch.special.entr(mean).sum() + (p * log_p).sum(0).mean())
+
+
+@torch.no_grad()
+def predict(
+    model: DomainAdaptationNetwork, images: torch.Tensor, domain: int = TARGET, batch: int = 512
+) -> Outputs:
+    """Outputs of the network, in evaluation mode, for images (N, ...) of one domain."""
+    was_training = model.training
+    model.eval()
+    parts = [model(images[i : i + batch], domain) for i in range(0, len(images), batch)]
+    model.train(was_training)
+    return Outputs(*(torch.cat(values) for values in zip(*parts)))
+
+
+def _look(model, step, images, labels, target, score) -> Check:
+    ours, theirs = predict(model, images, SOURCE), predict(model, target, TARGET)
+    right = torch.cat([ours.domain <= 0, theirs.domain > 0]).double()
+    # Both domains count alike, however many images are held out.
+    sizes = len(ours.domain), len(theirs.domain)
+    weights = torch.cat([torch.full((n,), 0.5 / n, dtype=torch.double) for n in sizes])
+    return Check(
+        step,
+        float(score(ours.task, labels)),
+        mutual_information(theirs.task),
+        float((right * weights).sum()),
+    )
+
+
+def _accuracy(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    return (logits.argmax(1) == labels).double().mean()
+
+
+def _domain_loss(logits: torch.Tensor, domain: float) -> torch.Tensor:
+    return F.binary_cross_entropy_with_logits(logits, torch.full_like(logits, domain))
+
+
+def _split(
+    rng: np.random.Generator, count: int, settings: AdaptationSettings, domain: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the images to train on and of those held out."""
+    held_out = max(1, round(settings.held_out * count))
+    if count - held_out < settings.batch_size:
+        raise UserError(
+            f"the {domain} has {count} images, too few for batches of {settings.batch_size} "
+            f"when {held_out} are held out; give more images or a smaller batch_size"
+        )
+    order = rng.permutation(count)
+    return order[held_out:], order[:held_out]
+
+
+def _batches(
+    rng: np.random.Generator, numbers: np.ndarray, settings: AdaptationSettings
+) -> Iterator[torch.Tensor]:
+    """For ever, full batches of shuffled numbers."""
+    while True:
+        order = rng.permutation(numbers)
+        for i in range(0, len(order) - settings.batch_size + 1, settings.batch_size):
+            yield torch.from_numpy(order[i : i + settings.batch_size])
