@@ -431,6 +431,23 @@ def test_an_outline_by_hand():
     np.testing.assert_allclose(view.offset, [0, 0, 0.05], atol=1e-12)
 
 
+def test_episodes_can_begin_near_an_object(make):
+    env = make(control="ee_planar", near_share=1.0)
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        x, y, z = info["end_effector_position"] - info["object_position"]
+        # The cube's top is 0.03 m over its centre.
+        assert max(abs(x), abs(y)) < 0.041 and 0.035 < z < 0.135
+        assert not info["grasped"] and info["gripper"][0] == pytest.approx(0.08, abs=1e-3)
+        before = env.cell.robot.q
+        env.step(np.array([0, 0, 0, 0, 1.0]))
+        np.testing.assert_allclose(env.cell.robot.q, before, atol=0.02)
+    _, at_home = env.reset(seed=0, options={"start": "home"})
+    assert at_home["end_effector_position"][2] > 0.4
+    with pytest.raises(UserError, match="start must be 'home' or 'near', got 'here'"):
+        env.reset(options={"start": "here"})
+
+
 def test_moves_along_the_axes_of_the_hand(make):
     """At home x of the hand is x of the world, the other two are turned over."""
     ends = []
