@@ -113,9 +113,11 @@ def envs_of(config: Config, us: Team) -> int:
 def make_ppo(config: Config, envs: VectorEnvs, us: Team) -> GraspPPO:
     """A new policy, or one with the weights of rl.initial, fitted to the environments."""
     settings = config.rl
-    layout = ObservationLayout.of(
-        envs.observation_space, settings.policy_observations, settings.privileged_observations
+    hidden = (
+        *(settings.estimated_observations or ()),  # first: this is how the network knows them
+        *(settings.privileged_observations or ()),
     )
+    layout = ObservationLayout.of(envs.observation_space, settings.policy_observations, hidden)
     torch.manual_seed(config.seed)
     network = policy_for(layout, envs.action_space, settings)
     if settings.initial is not None:
@@ -138,12 +140,15 @@ def announce(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO) -> None
         layout = ppo.layout
         seen = ", ".join(part.key for part in (*layout.images, *layout.state))
         hidden = ", ".join(part.key for part in layout.privileged)
+        estimated = ", ".join(settings.estimated_observations or ())
         print(
             f"PPO on {settings.env_id}: {settings.envs} environments, {updates(config)} updates of "
             f"{settings.envs * settings.rollout_steps:,} steps each, "
-            f"{ppo.weights.numel():,} parameters, {us.ranks} process(es), "
+            f"{sum(p.numel() for p in ppo.network.parameters()):,} parameters, "
+            f"{us.ranks} process(es), "
             f"{us.device}, seed {config.seed}; the policy sees {seen}"
-            f"{f', only the critic {hidden}' if hidden else ''}; results in {run}",
+            f"{f', only the critic {hidden}' if hidden else ''}"
+            f"{f'; it estimates {estimated}' if estimated else ''}; results in {run}",
             flush=True,
         )
 
@@ -212,9 +217,12 @@ def evaluate(
     """Deterministic episodes on seeds that stay the same and are never trained on."""
     seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
     own = seeds[ppo.team.rank :: ppo.team.ranks]
-    episodes = (
-        evaluate_policy(ppo.network, envs, ppo.layout, own, ppo.team.device, watch) if own else []
-    )
+    with envs.at_full_difficulty():
+        episodes = (
+            evaluate_policy(ppo.network, envs, ppo.layout, own, ppo.team.device, watch)
+            if own
+            else []
+        )
     return {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
 
 

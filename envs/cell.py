@@ -24,7 +24,7 @@ from utils.depth_noise import KinectNoise
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.random_view import RandomView
-from utils.transforms import RGBDFrame, look_at, pose_matrix
+from utils.transforms import RGBDFrame, look_at
 
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the game.
@@ -166,9 +166,14 @@ class Cell:
 
     def object_pose(self, index: int) -> np.ndarray:
         """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""
-        return pose_matrix(
-            *pybullet.getBasePositionAndOrientation(self.bodies[index], physicsClientId=self.client)
+        position, quaternion = pybullet.getBasePositionAndOrientation(
+            self.bodies[index], physicsClientId=self.client
         )
+        T = np.eye(4)
+        # A tenth of the time that SciPy takes: the Gymnasium env asks at every step.
+        T[:3, :3] = np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))
+        T[:3, 3] = position
+        return T
 
     def object_position(self, index: int) -> np.ndarray:
         """(3,) centre of mass in W. Raises PhysicsError when it is not finite."""

@@ -17,13 +17,16 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
-from envs.cell import Cell, PhysicsError, camera_intrinsics
+from envs.approach import Outline
+from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     JOINT_VELOCITY,
     ServoStep,
+    UnreachableError,
     forward_kinematics,
+    inverse_kinematics,
     moved,
     pose_error,
     rotation_matrix,
@@ -49,6 +52,9 @@ _FASTEST = float(JOINT_VELOCITY.min())  # rad/s
 # motor asks for (3 % in free motion).
 _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
+_NEAR_SIDE, _NEAR_HEIGHT = 0.04, (0.01, 0.10)  # m, of episodes that begin near an object
+_NEAR = 0.03  # m, see `object_offset`
+_GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
 
@@ -59,9 +65,13 @@ class RobotGraspingEnv(gymnasium.Env):
     unknown; `state` (15,) float32: joint positions (7, rad), joint velocities (7, rad/s), gripper
     opening (m).
 
-    Action: a Box in [-1, 1], its last entry the gripper's target opening (-1 closed, 1 open).
+    Action: a Box in [-1, 1]. Its last entry is the gripper's: with `gripper` "opening" the target
+    opening itself (-1 closed, 1 open); with "change" a change of the commanded opening in units of
+    `gripper_step` metres, so that what the hand does lasts and noise does not make it flutter. The
+    command is held within 20 mm of the true opening. The other entries are the arm's.
     `ee`: dx, dy, dz in units of `position_step` metres, and a rotation vector in units of
-    `rotation_step` radians, both in W. `ee_planar`: dx, dy, dz, dyaw. `joint`: seven changes in
+    `rotation_step` radians, both along the axes of W, or with `frame` "hand" along those of the
+    commanded E, whose z is the approach. `ee_planar`: dx, dy, dz, dyaw. `joint`: seven changes in
     units of `joint_step` radians. Changes add up on the *commanded* pose, are held within the
     workspace and the joint limits, and are scaled down as a whole where a joint would have to
     exceed its velocity limit. The command stays where it is when the arm cannot reach the new
@@ -75,11 +85,12 @@ class RobotGraspingEnv(gymnasium.Env):
     and Russell's shaping, ICML 1999, but without their discount and with Phi(end) paid out, so
     their proof of policy invariance does not apply.)
 
-        Phi = ( (1 - tanh 5 d) + g + 2 g h ) / 4
+        Phi = (1 - tanh(3 w) / 2 - tanh(20 w) / 2) / 4    while nothing is gripped
+        Phi = (1 + h) / 2                                 while both fingers grip the object
 
-    where d is the distance from the point between the fingertips to the nearest object's centre in
-    metres, g is 1 while both fingers grip it, and h in [0, 1] is how far it has risen from where it
-    rested at reset towards `lift_height`.
+    where w is the way in metres that the hand has to go to be around the nearest object, see
+    `envs.approach`, and h in [0, 1] is how far the object has risen from where it rested at reset
+    towards `lift_height`. The two tanh pay for coming near from afar, and for the last centimetre.
 
     `sparse`: 1 at success, else 0.
 
@@ -87,14 +98,19 @@ class RobotGraspingEnv(gymnasium.Env):
     `hold_seconds` in a row. Termination: success; or failure, when every object has left the table
     (`off_table`) or the physics has blown up (`physics`). Truncation: `max_steps` actions.
 
-    info: `is_success`, `reason` (why the episode ended, or None), `object_position` (3,),
-    `end_effector_position` (3,), `grasped`, `reachable` (False where the action was
-    refused), `scene_seed`.
+    info: `is_success`, `reason` (why the episode ended, or None), `end_effector_position` (3,),
+    `gripper` (2,), its opening and what is commanded (m), `reachable` (False where the action was
+    refused), `scene_seed`; and what no robot is told: `grasped`, `object_position` (3,), and of the
+    same nearest object `object_offset` (6,), from E to its centre along E's axes, in metres and as
+    tanh(metres / 0.03), which tells the last centimetres finely, and `object_outline` (9,), see
+    `envs.approach`.
 
     Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
     file, or None for the defaults. Any key of the config's `env` section can be given by name:
     `gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")`.
-    `reset(options={"scene_seed": n})` asks for one scene.
+    `reset(options={"scene_seed": n})` asks for one scene; the option "start" says where the hand
+    begins: "home", or "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is
+    easier. Without it a share `near_share` of the episodes begins near.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
@@ -132,6 +148,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._running = False
         self._closed = False
         self._intrinsics = camera_intrinsics(self.config.camera)
+        self._T_EC = wrist_mount(self.config.camera)
         self.observation_space = spaces.Dict(self._observation_spaces())
         size = {"ee": 7, "ee_planar": 5, "joint": 8}[self.settings.control]
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
@@ -168,15 +185,24 @@ class RobotGraspingEnv(gymnasium.Env):
             raise ClosedEnvironmentError("reset() after close(): make a new environment")
         self._running = False
         super().reset(seed=seed)
-        self._scene_seed = _checked_options(options, int(self.np_random.integers(2**31)))
+        drawn = int(self.np_random.integers(2**31))
+        self._scene_seed, start = _checked_options(options, drawn)
+        if start is None and self.settings.near_share > 0:
+            start = "near" if self.np_random.random() < self.settings.near_share else "home"
         scene = make_scene(
             self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
         )
         self.cell.load(scene)
+        self._outlines = [Outline(placement.model.parts) for placement in scene.placements]
+        q = self.cell.home.copy()
+        if start == "near":
+            q = self._near_an_object()
+            self.cell.robot.place(q)
         self.cell.robot.limit_speed(_FASTEST)
         self._calm = self.cell.calm()  # until the robot first touches something, see `_look`
-        self._servo = ServoStep(self.cell.home.copy())  # at the commanded joint positions
+        self._servo = ServoStep(q)  # at the commanded joint positions
         self._T_command = self._servo.reached
+        self._opening_command = MAX_OPENING
         self._reachable = True
         self._steps = 0
         self._held_steps = 0
@@ -187,6 +213,21 @@ class RobotGraspingEnv(gymnasium.Env):
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info(None)
+
+    def _near_an_object(self) -> np.ndarray:
+        """Joint positions (7,) for the hand a little over one of the objects, turned at random."""
+        T = forward_kinematics(self.cell.home)
+        index = int(self.np_random.integers(len(self._outlines)))
+        T_WO = self.cell.object_pose(index)
+        top = self._outlines[index].seen_from(T_WO, T).top + T[2, 3]
+        T[:2, 3] = T_WO[:2, 3] + self.np_random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
+        T[2, 3] = top + self.np_random.uniform(*_NEAR_HEIGHT)
+        turn = self.np_random.uniform(-np.pi / 4, np.pi / 4)
+        T[:3, :3] = rotation_matrix(np.array([0.0, 0.0, turn])) @ T[:3, :3]
+        try:
+            return inverse_kinematics(T, self.cell.home, self.cell.home)
+        except UnreachableError:
+            return self.cell.home.copy()
 
     def step(
         self, action: np.ndarray
@@ -278,14 +319,27 @@ class RobotGraspingEnv(gymnasium.Env):
         else:
             self._follow(self._moved_pose(action))
         self.cell.robot.drive_arm_to(self._servo.q, self._speed)
-        self.cell.robot.command_gripper(MAX_OPENING * (action[-1] + 1) / 2)
+        self._opening_command = self._new_opening(float(action[-1]))
+        self.cell.robot.command_gripper(self._opening_command)
+
+    def _new_opening(self, action: float) -> float:
+        """What the gripper is told, in metres."""
+        if self.settings.gripper == "opening":
+            return MAX_OPENING * (action + 1) / 2
+        opening = self._opening_command + self.settings.gripper_step * action
+        now = float(self._state[14])
+        opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
+        return min(max(opening, 0.0), MAX_OPENING)
 
     def _moved_pose(self, action: np.ndarray) -> np.ndarray:
         """(4, 4) the commanded pose of E moved by an action, within the workspace."""
         settings, T = self.settings, self._T_command.copy()
-        position = T[:3, 3] + settings.position_step * action[:3]
-        T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
+        move = action[:3]
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
+        if settings.frame == "hand":
+            move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
+        position = T[:3, 3] + settings.position_step * move
+        T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
         if any(turn.tolist()):
             T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
         return T
@@ -327,7 +381,8 @@ class RobotGraspingEnv(gymnasium.Env):
         """Read the robot and the nearest object. Raises PhysicsError on a non-finite number."""
         cell = self.cell
         state = np.empty(15, np.float32)
-        state[:7], state[7:14], state[14] = cell.robot.joint_state()
+        q, state[7:14], state[14] = cell.robot.joint_state()
+        state[:7] = q
         self._state = state
         if not np.isfinite(self._state).all():
             raise PhysicsError("the robot's state is not finite")
@@ -338,6 +393,8 @@ class RobotGraspingEnv(gymnasium.Env):
         nearest = distances.index(self._distance)
         self._object_positions, self._object_position = positions, positions[nearest]
         self._nearest = nearest
+        self._T_WE = forward_kinematics(q)
+        self._view = self._outlines[nearest].seen_from(cell.object_pose(nearest), self._T_WE)
         touches = cell.robot.touches()
         if touches and self._calm:
             cell.wake()
@@ -346,13 +403,13 @@ class RobotGraspingEnv(gymnasium.Env):
 
     def _progress(self) -> float:
         """The potential Phi in [0, 1]; see the class."""
-        reach = 1.0 - math.tanh(5.0 * self._distance)
         if not self._grasped:
-            return float(reach / 4)
+            way = self._view.way_to_grasp(float(self._state[14]))
+            return 0.25 - (math.tanh(3.0 * way) + math.tanh(20.0 * way)) / 8
         rest = self._resting_heights[self._nearest]
         way = max(self.settings.lift_height - rest, _SHORTEST_LIFT)
         lift = min(max((self._object_position[2] - rest) / way, 0.0), 1.0)
-        return float((reach + 1.0 + 2.0 * lift) / 4)
+        return float((1.0 + lift) / 2)
 
     def _any_on_table(self) -> bool:
         return any(on_table(position) for position in self._object_positions)
@@ -360,7 +417,9 @@ class RobotGraspingEnv(gymnasium.Env):
     def _observation(self) -> dict[str, np.ndarray]:
         observation = {}
         if "rgb" in self.settings.observations or "depth" in self.settings.observations:
-            image = self.cell.image(self._intrinsics, self.cell.camera_pose())
+            wrist = self.settings.camera == "wrist"
+            T_WC = self._T_WE @ self._T_EC if wrist else self.cell.camera_pose()
+            image = self.cell.image(self._intrinsics, T_WC)
             observation = {"rgb": image.rgb, "depth": image.depth[..., None]}
         observation["state"] = np.minimum(
             np.maximum(self._state, self._state_low), self._state_high
@@ -379,6 +438,9 @@ class RobotGraspingEnv(gymnasium.Env):
             "is_success": reason == "success",
             "reason": reason,
             "object_position": self._object_position.copy(),
+            "object_offset": np.append(self._view.offset, np.tanh(self._view.offset / _NEAR)),
+            "object_outline": self._view.outline(),
+            "gripper": np.array([self._state[14], self._opening_command]),
             "end_effector_position": self._tip.copy(),
             "grasped": self._grasped,
             "reachable": bool(self._reachable),
@@ -386,15 +448,20 @@ class RobotGraspingEnv(gymnasium.Env):
         }
 
 
-def _checked_options(options: dict[str, Any] | None, drawn: int) -> int:
-    """The scene's seed that reset's options ask for, else the one drawn. Raises UserError."""
+def _checked_options(options: dict[str, Any] | None, drawn: int) -> tuple[int, str | None]:
+    """The scene's seed that reset's options ask for, else the one drawn; and where to start, None
+    if they leave it open. Raises UserError."""
     options = dict(options or {})
-    seed = options.pop("scene_seed", drawn)
+    seed, start = options.pop("scene_seed", drawn), options.pop("start", None)
     if options:
-        raise UserError(f"reset: unknown option {next(iter(options))!r}; allowed is 'scene_seed'")
+        raise UserError(
+            f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start'"
+        )
+    if start not in (None, "home", "near"):
+        raise UserError(f"reset: start must be 'home' or 'near', got {start!r}")
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
         raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
-    return int(seed)
+    return int(seed), start
 
 
 def _camera_of_env(config: Config) -> Config:

@@ -89,6 +89,12 @@ class GraspPolicyNetwork(nn.Module):
     conv_channels: of the encoder's 3x3 convolutions with stride 2. squash: see ActionDistribution.
     normalise: by running statistics, see `observe`.
 
+    estimated_dim: of the privileged numbers, the first so many are estimated from image and state
+    by layers of their own, the `eyes`: encoder and estimator. Policy and critic then see these
+    estimates in the image's place, as given numbers: what the eyes learn they learn from
+    `estimate` alone, which is to be brought close to the truth while there is a simulator to tell
+    it. The policy never sees the truth.
+
     Weights start orthogonal, with gain sqrt 2, or 0.01 for the mean and 1 for the value, so that a
     new policy acts around 0 (Huang et al., "The 37 implementation details of PPO", 2022).
     The deviation does not depend on the observation.
@@ -108,6 +114,7 @@ class GraspPolicyNetwork(nn.Module):
         squash: bool = False,
         normalise: bool = True,
         initial_log_std: float = 0.0,
+        estimated_dim: int = 0,
     ):
         super().__init__()
         self.model_args = {
@@ -116,8 +123,9 @@ class GraspPolicyNetwork(nn.Module):
             "privileged_dim": privileged_dim, "conv_channels": list(conv_channels),
             "hidden_layers": hidden_layers, "activation": activation, "squash": squash,
             "normalise": normalise, "initial_log_std": initial_log_std,
+            "estimated_dim": estimated_dim,
         }  # fmt: skip
-        self.squash, self.normalise = squash, normalise
+        self.squash, self.normalise, self.estimated_dim = squash, normalise, estimated_dim
         self.image_norm = ObservationNormaliser(image_channels)
         self.state_norm = ObservationNormaliser(state_dim)
         self.privileged_norm = ObservationNormaliser(privileged_dim)
@@ -126,6 +134,11 @@ class GraspPolicyNetwork(nn.Module):
             self.encoder = encoder(image_channels, conv_channels, image_feature_dim)
         seen = state_dim + (image_feature_dim if image_channels else 0)
         widths, kind = [hidden_dim] * hidden_layers, ACTIVATIONS[activation]
+        self.estimator = None
+        if estimated_dim:
+            last = initialised(nn.Linear(hidden_dim, estimated_dim), 1.0)
+            self.estimator = nn.Sequential(*layers([seen, hidden_dim], nn.ReLU), last)
+            seen = state_dim + estimated_dim
         self.actor = layers([seen, *widths], kind)
         self.mean_head = initialised(nn.Linear(hidden_dim, action_dim), 0.01)
         self.log_std = nn.Parameter(torch.full((action_dim,), initial_log_std))
@@ -137,20 +150,47 @@ class GraspPolicyNetwork(nn.Module):
     def forward(self, image: torch.Tensor | None, state: torch.Tensor) -> ActionDistribution:
         """What to do. image: (B, C, H, W) colours in 0..1 and depth in metres, or None where there
         are no image channels; state: (B, S), both as observed: normalising is done in here."""
-        return self._distribution(self._features(image, state))
+        return self._distribution(self.features(image, state))
 
     def value(
         self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
     ) -> torch.Tensor:
         """(B,) the expected return; privileged: (B, P), P may be 0."""
-        return self._value(self._features(image, state), privileged)
+        return self._value(self.features(image, state), privileged)
 
     def policy_and_value(
         self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
     ) -> tuple[ActionDistribution, torch.Tensor]:
         """Both at the price of one image encoding."""
-        features = self._features(image, state)
+        return self.judged(self.features(image, state), privileged)
+
+    def judged(
+        self, features: torch.Tensor, privileged: torch.Tensor
+    ) -> tuple[ActionDistribution, torch.Tensor]:
+        """Policy and value for features (B, F) of `features`."""
         return self._distribution(features), self._value(features, privileged)
+
+    def features(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
+        """(B, F) what policy and critic go by: the encoded image, or estimates in its place that
+        pass no gradient on, and the normalised state."""
+        if self.estimator is None:
+            return self._seen(image, state)
+        with torch.no_grad():
+            return torch.cat([self.estimate(image, state), self._normalised_state(state)], -1)
+
+    def estimate(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
+        """(B, E) estimates of the first privileged numbers, in the scale of `truth`."""
+        return self.estimator(self._seen(image, state))
+
+    def truth(self, privileged: torch.Tensor) -> torch.Tensor:
+        """(B, E) what `estimate` should say where the privileged numbers are (B, P)."""
+        scaled = self.privileged_norm(privileged) if self.normalise else privileged
+        return scaled[:, : self.estimated_dim]
+
+    def eyes(self) -> list[nn.Parameter]:
+        """The weights that only `estimate` depends on; none where nothing is estimated."""
+        parts = [self.encoder, self.estimator] if self.estimator is not None else []
+        return [p for part in parts if part is not None for p in part.parameters()]
 
     def action(self, latent: torch.Tensor) -> torch.Tensor:
         """(B, A) what the robot is told for latents: squashed and stretched to the bounds of the
@@ -173,9 +213,11 @@ class GraspPolicyNetwork(nn.Module):
         if observations.privileged.shape[-1]:
             self.privileged_norm.update(observations.privileged, team)
 
-    def _features(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
-        if self.normalise:
-            state = self.state_norm(state)
+    def _normalised_state(self, state: torch.Tensor) -> torch.Tensor:
+        return self.state_norm(state) if self.normalise else state
+
+    def _seen(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
+        state = self._normalised_state(state)
         if self.encoder is None:
             return state
         if self.normalise:
@@ -242,6 +284,7 @@ def policy_for(
             f"rl.squash: the actions of {settings.env_id} have no bounds to be squashed between; "
             "use rl.squash=false"
         )
+    estimated = layout.privileged[: len(settings.estimated_observations or ())]
     network = GraspPolicyNetwork(
         settings.image_feature_dim,
         layout.state_dim,
@@ -255,6 +298,7 @@ def policy_for(
         settings.squash,
         settings.normalise_observations,
         settings.initial_log_std,
+        sum(int(np.prod(part.shape)) for part in estimated),
     )
     network.action_low.copy_(low)
     network.action_high.copy_(high)

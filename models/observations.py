@@ -45,6 +45,9 @@ class Observations(NamedTuple):
             tuple(map(change, self.images)), change(self.state), change(self.privileged)
         )
 
+    def rows(self, index: torch.Tensor | slice) -> Observations:
+        return self.map(lambda part: part[index])
+
 
 class Part(NamedTuple):
     """An entry of the observation: its key, the shape of one, and its NumPy dtype's name."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -28,20 +28,27 @@ from utils.errors import UserError
 KIND = "grasp_policy"
 ADAM_EPSILON = 1e-5  # Huang et al., "The 37 implementation details of PPO" (2022), detail 3
 SMALLEST_DEVIATION = 1e-8  # of advantages, so that equal ones do not divide by zero
+ESTIMATE_BETA = 0.1  # of the normalised error, from which on the estimates' loss is linear
 KL_SLACK = 1.5  # an update stops beyond this many times the target, as in OpenAI's baselines
 
 
 class Batch(NamedTuple):
-    """B steps to learn from; everything but observations and latents is (B,)."""
+    """B steps to learn from; everything but observations, latents and features is (B,). features:
+    (B, F) of the network where they are given, as its eyes do not learn from this loss."""
 
     observations: Observations
     latents: torch.Tensor
     log_probs: torch.Tensor
     advantages: torch.Tensor
     returns: torch.Tensor
+    features: torch.Tensor | None = None
 
     def rows(self, index: torch.Tensor | slice) -> Batch:
-        return Batch(self.observations.map(lambda part: part[index]), *(p[index] for p in self[1:]))
+        parts = (None if part is None else part[index] for part in self[1:])
+        return Batch(self.observations.rows(index), *parts)
+
+
+Rows = TypeVar("Rows", Batch, Observations)
 
 
 class Losses(NamedTuple):
@@ -76,8 +83,14 @@ class GraspPPO:
         self.updates = 0
         self.generator = torch.Generator()
         share_weights(team, network)
-        self.weights = in_one_vector(self.network)
+        eyes = self.network.eyes()
+        theirs = {id(p) for p in eyes}
+        self.weights = in_one_vector([p for p in self.network.parameters() if id(p) not in theirs])
         self.optimizer = torch.optim.Adam([self.weights], settings.lr, eps=ADAM_EPSILON, fused=True)
+        self.eyes = self.eyes_optimizer = None
+        if eyes:
+            self.eyes = in_one_vector(eyes)
+            self.eyes_optimizer = torch.optim.Adam([self.eyes], settings.estimate_lr, fused=True)
 
     @staticmethod
     def compute_gae(
@@ -108,12 +121,13 @@ class GraspPPO:
         number.
         """
         batch, explained_variance = self._prepare(rollout)
-        lr = self.settings.lr * (1 - progress if self.settings.anneal_lr else 1)
+        left = 1 - progress if self.settings.anneal_lr else 1
+        lr = self.settings.lr * left
         for group in self.optimizer.param_groups:
             group["lr"] = lr
         watched: list[torch.Tensor] = []
         norms: list[float] = []
-        for minibatch in self._minibatches(batch):
+        for minibatch in self._minibatches(batch, len(batch.latents), self.settings.epochs):
             losses = self.losses(minibatch)
             norm = self.gradient(losses.loss)
             if not math.isfinite(norm):
@@ -126,8 +140,9 @@ class GraspPPO:
             if self._too_far(losses.approx_kl):
                 break
             self.optimizer.step()
+        seeing = {} if self.eyes is None else {"estimate_loss": self._learn_to_see(rollout, left)}
         # Only now, so that all of the rollout and its update saw the same normalised numbers.
-        self.network.observe(batch.observations, self.team)
+        self.network.observe(self._flat(rollout), self.team)
         self.updates += 1
         means = gather(self.team, torch.stack(watched).mean(0)).mean(0).tolist()
         return dict(zip(Losses._fields, means)) | {
@@ -136,12 +151,33 @@ class GraspPPO:
             "std": self.network.log_std.detach().exp().mean().item(),
             "learning_rate": lr,
             "minibatches": float(len(watched)),
+            **seeing,
         }
 
-    def gradient(self, loss: torch.Tensor) -> float:
-        """Put the gradient of a loss, averaged over the team, in `weights.grad`, its norm clipped
-        as that of one vector; returns the norm before."""
-        gradient = self.weights.grad
+    def _learn_to_see(self, rollout: Rollout, left: float) -> float:
+        """Bring the network's estimates closer to the truth; the mean loss.
+
+        left: share of the learning rate that annealing has left.
+        """
+        for group in self.eyes_optimizer.param_groups:
+            group["lr"] = self.settings.estimate_lr * left
+        watched = []
+        steps, epochs = rollout.latents.shape[:2].numel(), self.settings.estimate_epochs
+        for seen in self._minibatches(self._flat(rollout), steps, epochs):
+            estimate = self.network.estimate(seen.image(), seen.state)
+            truth = self.network.truth(seen.privileged)
+            loss = F.smooth_l1_loss(estimate, truth, beta=ESTIMATE_BETA)
+            norm = self.gradient(loss, self.eyes)
+            if not math.isfinite(norm):
+                raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
+            self.eyes_optimizer.step()
+            watched.append(loss.detach())
+        return gather(self.team, torch.stack(watched).mean()).mean().item()
+
+    def gradient(self, loss: torch.Tensor, weights: nn.Parameter | None = None) -> float:
+        """Put the gradient of a loss, averaged over the team, in `grad` of the weights (None: those
+        of policy and critic), its norm clipped as that of one vector; returns the norm before."""
+        gradient = (self.weights if weights is None else weights).grad
         gradient.zero_()
         loss.backward()
         average(self.team, gradient)
@@ -154,10 +190,10 @@ class GraspPPO:
         """The loss of a minibatch: PPO equation 9 with the clipped objective of equation 7, signs
         turned for minimising."""
         settings, advantages = self.settings, self._normalised(batch.advantages)
-        seen = batch.observations
-        distribution, values = self.network.policy_and_value(
-            seen.image(), seen.state, seen.privileged
-        )
+        seen, features = batch.observations, batch.features
+        if features is None:
+            features = self.network.features(seen.image(), seen.state)
+        distribution, values = self.network.judged(features, seen.privileged)
         log_ratio = distribution.log_prob(batch.latents) - batch.log_probs
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - settings.clip_epsilon, 1 + settings.clip_epsilon)
@@ -176,16 +212,16 @@ class GraspPPO:
         foreseen."""
         steps, envs = rollout.rewards.shape
         device = self.team.device
-        observations = rollout.observations.map(lambda part: part.flatten(0, 1).to(device))
+        observations = self._flat(rollout)
         latents = rollout.latents.flatten(0, 1).to(device)
-        log_probs, values = self._judge(observations, latents)
+        log_probs, values, features = self._judge(observations, latents)
         after = Observations(
             *(
                 (tuple(map(torch.cat, zip(a, b))) if isinstance(a, tuple) else torch.cat([a, b]))
                 for a, b in zip(rollout.cut_final, rollout.last)
             )
         ).map(lambda part: part.to(device))
-        _, after_values = self._judge(after)
+        _, after_values, _ = self._judge(after)
         after_values = after_values.cpu().numpy()
         values = values.cpu().numpy().reshape(steps, envs)
         next_values = np.concatenate([values[1:], after_values[None, -envs:]])
@@ -199,36 +235,46 @@ class GraspPPO:
             rewards.astype(np.float32), values, next_values, rollout.terminated, ended,
             self.settings.gamma, self.settings.gae_lambda,
         )  # fmt: skip
+        if self.eyes is None:
+            features = None
+        else:
+            observations = observations._replace(images=())
         batch = Batch(
             observations, latents, log_probs,
-            *(torch.from_numpy(x.ravel()).to(device) for x in (advantages, returns)),
+            *(torch.from_numpy(x.ravel()).to(device) for x in (advantages, returns)), features,
         )  # fmt: skip
         spread = float(returns.var())
         return batch, 1 - float((returns - values).var()) / spread if spread else 0.0
 
+    def _flat(self, rollout: Rollout) -> Observations:
+        """The observations of a rollout's steps, (T * N, ...), on the device."""
+        return rollout.observations.map(lambda part: part.flatten(0, 1).to(self.team.device))
+
     @torch.no_grad()
     def _judge(
         self, observations: Observations, latents: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B,) log-probabilities of latents and values, a part at a time to bound the memory."""
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B,) log-probabilities of latents, values, and (B, F) features; a part at a time to bound
+        the memory."""
         size = self.settings.batch_size
-        log_probs, values = [], []
+        log_probs, values, features = [], [], []
         for start in range(0, len(observations.state), size):
             part = observations.map(lambda whole: whole[start : start + size])  # noqa: B023
-            distribution, value = self.network.policy_and_value(
-                part.image(), part.state, part.privileged
-            )
+            features.append(self.network.features(part.image(), part.state))
+            distribution, value = self.network.judged(features[-1], part.privileged)
             values.append(value)
             if latents is not None:
                 log_probs.append(distribution.log_prob(latents[start : start + size]))
-        return torch.cat(log_probs) if log_probs else torch.empty(0), torch.cat(values)
+        known = torch.cat(log_probs) if log_probs else torch.empty(0)
+        return known, torch.cat(values), torch.cat(features)
 
-    def _minibatches(self, batch: Batch) -> Iterator[Batch]:
+    def _minibatches(self, steps: Rows, count: int, epochs: int) -> Iterator[Rows]:
+        """All `count` rows in another order in each epoch."""
         size = self.settings.batch_size // self.team.ranks
-        for _ in range(self.settings.epochs):
-            order = torch.randperm(len(batch.latents), generator=self.generator)
-            shuffled = batch.rows(order.to(self.team.device))
-            for start in range(0, len(order), size):
+        for _ in range(epochs):
+            order = torch.randperm(count, generator=self.generator)
+            shuffled = steps.rows(order.to(self.team.device))
+            for start in range(0, count, size):
                 yield shuffled.rows(slice(start, start + size))
 
     def _normalised(self, advantages: torch.Tensor) -> torch.Tensor:
@@ -265,6 +311,7 @@ class GraspPPO:
             extra={
                 "layout": self.layout.to_plain(),
                 "rewards": self.rewards.state_dict(),
+                **({} if self.eyes is None else {"eyes": self.eyes_optimizer.state_dict()}),
                 **extra,
             },
         )
@@ -283,18 +330,19 @@ class GraspPPO:
         load_weights(self.network, checkpoint, path)
         self.rewards.load_state_dict(extra["rewards"])
         self.optimizer.load_state_dict(checkpoint["optimizer"])
+        if self.eyes is not None:
+            self.eyes_optimizer.load_state_dict(extra["eyes"])
         self.updates = checkpoint["step"]
         return extra
 
 
-def in_one_vector(network: nn.Module) -> nn.Parameter:
-    """Lay all weights and all gradients of a network side by side: its parameters become views of
-    the vector returned, their gradients views of its `grad`.
+def in_one_vector(parameters: list[nn.Parameter]) -> nn.Parameter:
+    """Lay weights and their gradients side by side: the parameters become views of the vector
+    returned, their gradients views of its `grad`.
 
     So that a norm, a step of the optimiser or a message between processes is one operation, which
     counts for small networks; that the gradient is clipped as a whole needs no care either.
     """
-    parameters = list(network.parameters())
     whole = nn.Parameter(torch.cat([p.detach().flatten() for p in parameters]))
     whole.grad = torch.zeros_like(whole)
     sizes = [p.numel() for p in parameters]

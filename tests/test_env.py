@@ -1,6 +1,8 @@
 """`RobotGrasping-v0`: Gymnasium's contract, physics limits, reward, success and its endings."""
 
 import gc
+import itertools
+import math
 import os
 import subprocess
 import sys
@@ -16,7 +18,9 @@ import pytest
 import torch
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from scipy.spatial.transform import Rotation
 
+from envs.approach import Outline
 from envs.cell import PhysicsError
 from envs.grasping_env import RobotGraspingEnv, scripted_action
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
@@ -353,7 +357,7 @@ def test_truncation_comes_exactly_at_max_steps(make):
 def test_scripted_pick_succeeds(make, seed, reward):
     env = make(control="ee_planar", reward=reward)
     _, info = env.reset(seed=seed)
-    start, rewards, terminated, truncated = potential(info), [], False, False
+    start, rewards, terminated, truncated = potential(env, info), [], False, False
     while not (terminated or truncated):
         _, r, terminated, truncated, info = env.step(scripted_action(env, info))
         rewards.append(r)
@@ -362,22 +366,120 @@ def test_scripted_pick_succeeds(make, seed, reward):
     if reward == "sparse":
         assert rewards[-1] == 1.0 and not any(rewards[:-1])
     else:
-        assert sum(rewards) == pytest.approx(1.0 + potential(info) - start, abs=1e-9)
+        assert sum(rewards) == pytest.approx(1.0 + potential(env, info) - start, abs=1e-5)
 
 
-def potential(info, lift_height: float = 0.15) -> float:
-    """Phi as the class documents it."""
-    d = np.linalg.norm(info["object_position"] - info["end_effector_position"])
-    g = float(info["grasped"])
-    h = min(max(info["object_position"][2] / lift_height, 0.0), 1.0)
-    return float(((1 - np.tanh(5 * d)) + g + 2 * g * h) / 4)
+def potential(env, info, rest: float = 0.03, lift_height: float = 0.15) -> float:
+    """Phi as the class documents it, for the tutorial's cube, which rests 0.03 m over the table."""
+    if info["grasped"]:
+        h = (info["object_position"][2] - rest) / (lift_height - rest)
+        return (1 + min(max(h, 0.0), 1.0)) / 2
+    T_WE = forward_kinematics(env.cell.robot.q)
+    view = Outline(cube_corners()).seen_from(env.cell.object_pose(0), T_WE)
+    w = view.way_to_grasp(env.get_gripper_width())
+    return (1 - np.tanh(3 * w) / 2 - np.tanh(20 * w) / 2) / 4
+
+
+def cube_corners() -> tuple[np.ndarray]:
+    return (np.array(list(itertools.product([-0.03, 0.03], repeat=3))),)
 
 
 def test_dense_rewards_telescope_over_random_actions(make):
     env = make()
-    (_, start), *steps = run(env, 3, 40)
-    total = sum(reward for _, reward, *_ in steps)
-    assert total == pytest.approx(potential(steps[-1][-1]) - potential(start), abs=1e-9)
+    steps = run(env, 3, 40)
+    _, info = next(steps)
+    start, total = potential(env, info), 0.0
+    for step in steps:
+        total += step[1]
+    info = step[-1]
+    assert total == pytest.approx(potential(env, info) - start, abs=1e-5)
+
+
+def test_the_way_to_a_grasp_by_hand():
+    """Of a cube of 6 cm whose centre is E's origin: around it, 10 cm over it, turned by half a
+    right angle, shut, and 10 cm beside it, from where the way goes by a point 2 cm over its top."""
+    cube, here = Outline(cube_corners()), np.diag([1.0, -1.0, -1.0, 1.0])  # E looks down
+
+    def way(x=0.0, z=0.0, yaw=0.0, opening=0.08) -> float:
+        T_WE = here.copy()
+        T_WE[:3, :3] = Rotation.from_euler("z", yaw).as_matrix() @ T_WE[:3, :3]
+        T_WE[0, 3], T_WE[2, 3] = x, z
+        return cube.seen_from(np.eye(4), T_WE).way_to_grasp(opening)
+
+    assert way() == pytest.approx(0.0, abs=1e-12)
+    assert way(z=0.1) == pytest.approx(0.1)
+    assert way(yaw=np.pi / 4) == pytest.approx(0.06 * (np.sqrt(2) - 1))
+    assert way(opening=0.0) == pytest.approx(0.07)
+    assert way(x=0.1) == pytest.approx(0.1 + 0.05)
+    assert way(x=0.1, z=0.05) == pytest.approx(0.1)
+
+
+def test_an_outline_by_hand():
+    """A plate of 4 x 2 x 1 cm turned by 30 degrees from the closing line, its centre 5 cm under E:
+    along a line turned by t its shadow is 4 |cos (30 - t)| + 2 |sin (30 - t)| cm wide."""
+    corners = itertools.product([-0.02, 0.02], [-0.01, 0.01], [-0.005, 0.005])
+    plate = Outline((np.array(list(corners)),))
+    T_WO = np.eye(4)
+    T_WO[:3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    T_WE = np.eye(4)  # upright hand whose closing line is x
+    T_WE[:3, :3] = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]).T
+    T_WE[2, 3] = 0.05
+    view = plate.seen_from(T_WO, T_WE)
+    t = np.radians(30 - 25 * np.arange(8))
+    widths = 0.04 * abs(np.cos(t)) + 0.02 * abs(np.sin(t))
+    np.testing.assert_allclose(view.outline(), [*widths, 0.005 - 0.05], atol=1e-12)
+    np.testing.assert_allclose(view.offset, [0, 0, 0.05], atol=1e-12)
+
+
+def test_episodes_can_begin_near_an_object(make):
+    env = make(control="ee_planar", near_share=1.0)
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        x, y, z = info["end_effector_position"] - info["object_position"]
+        # The cube's top is 0.03 m over its centre.
+        assert max(abs(x), abs(y)) < 0.041 and 0.035 < z < 0.135
+        assert not info["grasped"] and info["gripper"][0] == pytest.approx(0.08, abs=1e-3)
+        before = env.cell.robot.q
+        env.step(np.array([0, 0, 0, 0, 1.0]))
+        np.testing.assert_allclose(env.cell.robot.q, before, atol=0.02)
+    _, at_home = env.reset(seed=0, options={"start": "home"})
+    assert at_home["end_effector_position"][2] > 0.4
+    with pytest.raises(UserError, match="start must be 'home' or 'near', got 'here'"):
+        env.reset(options={"start": "here"})
+
+
+def test_moves_along_the_axes_of_the_hand(make):
+    """At home x of the hand is x of the world, the other two are turned over."""
+    ends = []
+    for frame, signs in (("world", [1, 1, 1, 1]), ("hand", [1, -1, -1, -1])):
+        env = make(control="ee_planar", frame=frame)
+        env.reset(seed=0)
+        for action in ([0, 0, -1, 0, 1], [0.5, 0.2, -0.3, 0, 1]):
+            env.step(np.array([*np.array(action[:4]) * signs, action[4]]))
+        ends.append(env.cell.robot.q)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-3)  # home is so near to straight
+    env.reset(seed=0)
+    env.step(np.array([0, 0, 0, 1.0, 1]))
+    turned = [env.step(np.array([1.0, 0, 0, 0, 1]))[-1] for _ in range(4)]
+    way = turned[-1]["end_effector_position"] - turned[0]["end_effector_position"]
+    assert math.atan2(way[1], way[0]) == pytest.approx(-0.3, abs=0.03), "x turns with the hand"
+
+
+def test_the_gripper_can_be_told_changes(make):
+    env = make(control="ee_planar", gripper="change", gripper_step=0.01)
+    _, info = env.reset(seed=0)
+    np.testing.assert_allclose(info["gripper"], 0.08, atol=1e-3)
+    *_, info = env.step(np.array([0, 0, 0, 0, -0.5]))
+    assert info["gripper"][1] == pytest.approx(0.075)
+    *_, info = env.step(np.array([0, 0, 0, 0, 0.0]))
+    assert info["gripper"][1] == pytest.approx(0.075), "what is not changed stays"
+    for _ in range(3):
+        *_, info = env.step(np.array([0, 0, 0, 0, 1.0]))
+    assert info["gripper"][1] == 0.08, "no wider than the hand"
+    for _ in range(10):  # the fingers take 8.3 mm a step
+        before = env.get_gripper_width()
+        *_, info = env.step(np.array([0, 0, 0, 0, -1.0]))
+        assert info["gripper"][1] >= before - 0.02 - 1e-6
 
 
 def test_success_needs_the_object_held_up_for_a_while(picked):

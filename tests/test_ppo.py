@@ -192,6 +192,39 @@ def test_only_the_critic_sees_what_is_privileged():
     assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
 
 
+def estimating() -> GraspPolicyNetwork:
+    return GraspPolicyNetwork(8, 3, 2, 16, privileged_dim=3, conv_channels=[4, 4], estimated_dim=2)
+
+
+def test_the_policy_goes_by_estimates_and_never_by_the_truth():
+    network = estimating()
+    image, state = torch.rand(5, 4, 16, 16), torch.randn(5, 3)
+    network.privileged_norm.update(torch.randn(100, 3) * 4 + 7)
+    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
+    other_policy, other_value = network.policy_and_value(image, state, torch.ones(5, 3))
+    assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
+    features = network.features(image, state)
+    torch.testing.assert_close(features[:, :2], network.estimate(image, state))
+    assert features.shape == (5, 2 + 3) and not features.requires_grad
+    scaled = network.privileged_norm(torch.ones(5, 3))[:, :2]
+    torch.testing.assert_close(network.truth(torch.ones(5, 3)), scaled)
+
+
+def test_the_policy_s_loss_leaves_the_eyes_alone_and_theirs_the_policy():
+    network = estimating()
+    image, state = torch.rand(5, 4, 16, 16), torch.randn(5, 3)
+    eyes = {id(p) for p in network.eyes()}
+    assert 0 < len(eyes) < len(list(network.parameters()))
+
+    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
+    (policy.log_prob(torch.zeros(5, 2)).sum() + value.sum()).backward()
+    assert all((p.grad is None) == (id(p) in eyes) for p in network.parameters())
+
+    network.zero_grad()
+    network.estimate(image, state).square().sum().backward()
+    assert all((p.grad is not None) == (id(p) in eyes) for p in network.parameters())
+
+
 @pytest.mark.parametrize("squash", [False, True])
 def test_actions_keep_to_the_bounds(squash):
     space = spaces.Box(np.array([-1, 0], np.float32), np.array([3, 0.08], np.float32))

@@ -97,6 +97,62 @@ def test_the_evaluation_of_the_best_policy_can_be_repeated(finished):
     assert np.mean(totals) == pytest.approx(results["best"]["return"], rel=1e-5)
 
 
+def test_evaluations_are_at_full_difficulty():
+    seen = "rl.policy_observations=[state,end_effector_position]"
+    settings = ["rl.parallel=false", "env.near_share=1", "env.observations=[state]", seen]
+    config = load_config(None, settings)
+    with vector_envs(config, 2) as envs:
+        training = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
+        with envs.at_full_difficulty():
+            evaluated = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
+            again = envs.restart([1, 2], np.array([True, True]))["end_effector_position"][:, 2]
+            assert again.tolist() == evaluated.tolist()
+        after = envs.restart([1, 2])["end_effector_position"][:, 2]
+    assert max(training) < 0.2 < 0.4 < min(evaluated) and after.tolist() == training.tolist()
+
+
+ESTIMATED = [
+    "rl.env_kwargs=images=true", "rl.policy_observations=[rgb,depth,state]",
+    "rl.estimated_observations=goal", "rl.normalise_observations=false",
+]  # fmt: skip
+
+
+def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    whole = [*POINT, *ESTIMATED, "rl.total_steps=128"]
+    assert train_rl.main([*whole, "rl.name=whole"]) == 0
+    (run,) = Path("runs/train_rl").glob("*-whole")
+    expected = load_checkpoint(run / "last.pt", KIND)["model"]
+
+    stopped_at = train_rl.reached
+    monkeypatch.setattr(train_rl, "reached", lambda config, row: row["step"] == 64)
+    assert train_rl.main([*whole, "rl.name=halves"]) == 0
+    monkeypatch.setattr(train_rl, "reached", stopped_at)
+    (half,) = Path("runs/train_rl").glob("*-halves")
+    assert train_rl.main(["--resume", str(half)]) == 0
+    found = load_checkpoint(half / "last.pt", KIND)["model"]
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(found[name], value), name
+
+
+def test_the_eyes_learn_where_the_goal_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    longer = [*POINT, *ESTIMATED, "rl.total_steps=4096", "rl.rollout_steps=128", "rl.lr=1e-4",
+              "rl.batch_size=64", "rl.estimate_epochs=8", "rl.anneal_lr=false"]  # fmt: skip
+    assert train_rl.main(longer) == 0
+    (run,) = Path("runs/train_rl").iterdir()
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    losses = [event.value for event in events.Scalars("update/estimate_loss")]
+    assert losses[-1] < losses[0] / 3
+
+
+def test_what_is_estimated_has_no_other_role():
+    for other in ("policy", "privileged"):
+        with pytest.raises(UserError, match="goal"):
+            load_config(None, ["rl.estimated_observations=goal", f"rl.{other}_observations=goal"])
+
+
 def test_evaluation_does_not_depend_on_how_many_environments_there_are():
     ppo, episodes = None, []
     for count in (1, 3, 8):

@@ -249,6 +249,8 @@ class EnvConfig(Section):
         tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(_no_repeats)
     ]
     control: Literal["ee", "ee_planar", "joint"]
+    frame: Literal["world", "hand"]
+    gripper: Literal["opening", "change"]
     resolution: Pixels
     camera: Mount
     objects: ObjectSet
@@ -261,6 +263,8 @@ class EnvConfig(Section):
     position_step: Positive
     rotation_step: Positive
     joint_step: Positive
+    gripper_step: Positive
+    near_share: Annotated[float, Field(ge=0, le=1)]
 
 
 EnvArgument = Annotated[
@@ -274,6 +278,7 @@ class RLConfig(Section):
     env_kwargs: Annotated[tuple[EnvArgument, ...], Several] | None
     policy_observations: Names | None
     privileged_observations: Names | None
+    estimated_observations: Names | None
     envs: Count
     parallel: bool
     worker_timeout: Positive
@@ -290,6 +295,8 @@ class RLConfig(Section):
     value_coef: Annotated[float, Field(ge=0)]
     entropy_coef: Annotated[float, Field(ge=0)]
     max_gradient_norm: Positive
+    estimate_epochs: Count
+    estimate_lr: Positive
     normalise_observations: bool
     normalise_rewards: bool
     squash: bool
@@ -306,6 +313,15 @@ class RLConfig(Section):
     target_return: float | None
     device: Name
     name: Name | None
+
+    @model_validator(mode="after")
+    def _one_role_each(self) -> RLConfig:
+        for name in self.estimated_observations or ():
+            if name in (self.policy_observations or ()):
+                raise ValueError(f"estimated_observations: the policy sees {name!r} already")
+            if name in (self.privileged_observations or ()):
+                raise ValueError(f"{name!r} is both in estimated_ and privileged_observations")
+        return self
 
     @model_validator(mode="after")
     def _whole_minibatches(self) -> RLConfig:

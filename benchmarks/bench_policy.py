@@ -1,0 +1,78 @@
+"""A trained policy on fresh scenes: python -m benchmarks.bench_policy CHECKPOINT [--json FILE]
+
+Deterministic episodes at full difficulty (every one begins at home, whatever made training easier)
+from seeds that no training and none of its evaluations has met; the environment is the one that the
+checkpoint was trained in, up to the overrides that are given.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+import numpy as np
+
+from benchmarks.metrics import Metric, benchmark_parser, report
+from envs.vector import make_env
+from models.grasp_policy import SavedPolicy, load_policy
+from models.ppo import KIND
+from models.rollouts import derived_seeds
+from utils.checkpoint import load_checkpoint
+from utils.config import Config, load_config, run_script
+from utils.statistics import wilson_interval
+
+FRESH = 3  # after train_rl.py's purposes of seeds: training, evaluation, learning
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = benchmark_parser(__doc__.splitlines()[0])
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="e.g. objects.split=test")
+    parser.add_argument("--episodes", type=int, default=200)
+    options = parser.parse_args(argv)
+    count = min(options.episodes, 5) if options.quick else options.episodes
+    config = config_of(options.checkpoint, options.overrides)
+    episodes = run_episodes(load_policy(options.checkpoint), config, count)
+    reasons = Counter(reason for reason, _ in episodes)
+    print(", ".join(f"{number} {reason}" for reason, number in reasons.most_common()))
+    low, high = wilson_interval(reasons["success"], count)
+    name = config.env.objects
+    report(
+        [
+            Metric(f"{name}_success", reasons["success"] / count, ""),
+            Metric(f"{name}_success_low", low, ""),
+            Metric(f"{name}_success_high", high, ""),
+            Metric(f"{name}_steps", float(np.mean([length for _, length in episodes])), "steps"),
+        ],
+        options.json,
+    )
+
+
+def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
+    """The config that a checkpoint was trained with, changed by overrides."""
+    plain = load_checkpoint(checkpoint, KIND)["config"]
+    with NamedTemporaryFile("w", suffix=".yaml") as file:
+        json.dump(plain, file)  # JSON is YAML
+        file.flush()
+        return load_config(Path(file.name), [*overrides, "env.near_share=0"])
+
+
+def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[str, int]]:
+    """Why each of so many deterministic episodes ended, and after how many steps."""
+    env, ends = make_env(config), []
+    for seed in derived_seeds(count, config.seed, FRESH):
+        observation, _ = env.reset(seed=seed)
+        ended, length = False, 0
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(policy(observation))
+            ended, length = terminated or truncated, length + 1
+        ends.append((info["reason"], length))
+    env.close()
+    return ends
+
+
+if __name__ == "__main__":
+    run_script(main)
