@@ -9,7 +9,7 @@ the robot touches one of the bodies, or when the motion is over. Knows no camera
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,20 +69,17 @@ class Conveyor:
         return c * along - s * across, s * along + c * across, turn
 
 
-Motion = Callable[[float], tuple[float, float, float]]
-
-
 @contextlib.contextmanager
 def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[None]:
     """Within the block a motion carries the objects of the cell, from now on, unless it is None."""
     if motion is None or not cell.remaining:
         yield
         return
-    cell.before_step = _Carrier(cell, motion)
+    before, cell.before_step = cell.before_step, _Carrier(cell, motion)
     try:
         yield
     finally:
-        cell.before_step = None
+        cell.before_step = before
 
 
 class _Carrier:

@@ -120,6 +120,7 @@ def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
     settings = cell.config.execution
     around = approach(cell, grasp)
     _close(cell, around.wait)
+    cell.robot.command_arm(cell.robot.q, np.zeros(7))  # nothing that it followed is sent any more
     index = cell.held_object()
     if index is None:
         raise GraspFailure("missed")

@@ -21,6 +21,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -45,14 +46,18 @@ from utils.object_motion import PlanarMotion
 from utils.object_tracking import (
     ObjectTemplate,
     ObjectTracker,
-    TargetLostError,
     grasp_frame,
     make_template,
     planar,
     planar_part,
 )
 from utils.se3 import pose_exp
-from utils.servo_errors import FeatureCountError, ServoError
+from utils.servo_errors import (
+    CollinearPointsError,
+    FeatureCountError,
+    ServoError,
+    TargetLostError,
+)
 from utils.servo_features import MIN_POINTS
 from utils.servo_laws import joint_limit_avoidance, joint_velocities
 from utils.servo_loop import View, VisualServo
@@ -72,12 +77,15 @@ from utils.visual_servo import (
 
 _DAMPING = 0.02  # of the arm's Jacobian
 _AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
+_WORTH_TURNING = 0.3  # rad more of room for the wrist, for which the hand turns round
 _FORESIGHT = 1.5  # s, about what is left of the way in the far stage
 _RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for the other way round to be tried
 _NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
 _FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
 _BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
 _REACHED = 0.0015  # m from the end of the path that count as there
+_NEAR_ENOUGH = 0.005  # m that do when the time is over
+_BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, down to this
 _SLACK_SECONDS = 0.35  # beyond what the path takes, for the end of the blind stage
 _SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
 _NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
@@ -120,8 +128,8 @@ class LoopRecord:
     """What a closed loop did, for tests and figures.
 
     turn_seconds: wall-clock time of every turn, from the image to the joint velocities, rendering
-    left out. seconds, errors: simulated time and the way still to go (6,) in C at every turn of the
-    near stage. stage: the last one that was reached.
+    left out. seconds, errors: simulated time and the law's correction (6,) in C, minus the way
+    still to go, at every turn of the near stage. stage: the last one that was reached.
     """
 
     turn_seconds: list[float] = field(default_factory=list)
@@ -178,7 +186,7 @@ class ClosedLoop:
         robot, settings = cell.robot, cell.config.grasp
         robot.command_gripper(min(grasp.width, MAX_OPENING))
         arm = self._arm()
-        try:
+        with _told_as_failure(arm):
             run = _Run(self, arm, grasp)
             end = cell.seconds + settings.seconds
             while run.look():
@@ -187,24 +195,37 @@ class ClosedLoop:
                 run.go()
             self.record.stage = "blind"
             run.go_blind()
-        except ServoError as error:
-            arm.stop()
-            raise GraspFailure(_reason_of(error), detail=f"stopped: {error}") from error
         self.record.stage = "closing"
-        return Around(run.follow, None)
+
+        def wait(steps: int) -> None:
+            with _told_as_failure(arm):
+                run.follow(steps)
+
+        return Around(wait, None)
 
     def _arm(self) -> GuardedArm:
         safety, floor = self.cell.config.safety, self.cell.config.grasp.floor
         lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
-        # Images that are known to come late do not count as a camera that has failed.
-        changes = {"box_lower": lower, "watchdog": safety.watchdog + self.latency}
-        return GuardedArm(self.cell, safety=safety.model_copy(update=changes))
+        return GuardedArm(self.cell, safety=safety.model_copy(update={"box_lower": lower}))
+
+
+@contextlib.contextmanager
+def _told_as_failure(arm: GuardedArm) -> Iterator[None]:
+    """Whatever ends the block early leaves the arm at rest; what a servo can stop for is told as
+    the failure of the grasp."""
+    try:
+        yield
+    except BaseException as error:
+        arm.stop()
+        if isinstance(error, ServoError):
+            raise GraspFailure(_reason_of(error), detail=f"stopped: {error}") from error
+        raise
 
 
 def _reason_of(error: ServoError) -> str:
-    if isinstance(error, TargetLostError | FeatureCountError):
+    if isinstance(error, TargetLostError | FeatureCountError | CollinearPointsError):
         return "lost"
-    contact = isinstance(error, ArmStoppedError) and str(error).startswith("contact")
+    contact = isinstance(error, ArmStoppedError) and error.contact
     return "collision" if contact else "stopped"
 
 
@@ -224,13 +245,16 @@ class _Run:
         self.near, self.height = False, np.inf
         self.lowest = self._lowest_view()
         self.wish = np.zeros(7)
+        self._spent = 0.0  # s of the clock, on the last image
+        self.steps_to_image = 0  # physics steps, in the blind stage
+        self.holds = False  # something is gripped, or in the way of the closing hand
         self._wait_for_sight()
 
     def _choose_way_round(self) -> None:
         """Take the grasp or the same one turned by half a turn: that which leaves the wrist more
         room to turn with the object. Raises UnreachableError if neither can be reached."""
         T_WE = self._foreseen() @ self.T_OE
-        self.chosen_at = np.arctan2(T_WE[1, 0], T_WE[0, 0])  # modulo pi
+        direction = np.arctan2(T_WE[1, 0], T_WE[0, 0])
         T_WE[2, 3] += self.settings.look_height
         room, error = {}, None
         for turned in (False, True):
@@ -242,8 +266,9 @@ class _Run:
                 error = unreachable
         if not room:
             raise error
-        if max(room, key=room.get):
+        if False not in room or room.get(True, 0.0) > room[False] + _WORTH_TURNING:
             self.T_OE = self.T_OE @ HALF_TURN
+        self.chosen_at = direction  # of an undirected line
 
     def _reconsider_way_round(self) -> None:
         """Choose again where the object turns: a wrist that must follow may meet its limit."""
@@ -275,9 +300,12 @@ class _Run:
 
     def _wait_for_sight(self) -> None:
         """Hold still until a first image has come (it may be late) and shows the object."""
-        while not self._take_in(self.loop.camera()) or self.motion is None:
+        end = self.cell.seconds + self.settings.lost_seconds
+        while not self._take_in(self.loop.camera()):
+            if self.cell.seconds > end:
+                raise TargetLostError(f"no image has come for {self.settings.lost_seconds} s")
             for _ in range(servo_period(self.cell)):
-                self.arm.move(np.zeros(7), self.cell.seconds - self.image_seconds)
+                self.arm.wait()
 
     def _take_in(self, sight: DepthSight | None) -> bool:
         """Find the object in a new image; whether there was one."""
@@ -292,9 +320,9 @@ class _Run:
                 sight.depth, inverse_pose(T_WC) @ expected, inverse_pose(T_WC)
             )
         except TargetLostError as error:
-            if self.motion is None or sight.seconds - self.found_seconds > (
-                self.settings.lost_seconds
-            ):
+            if self.motion is None:
+                raise
+            if sight.seconds - self.found_seconds > self.settings.lost_seconds:
                 raise TargetLostError(f"{error}, for {self.settings.lost_seconds} s") from error
             self._spent = time.perf_counter() - start
             return True
@@ -387,8 +415,7 @@ class _Run:
             height < self.lowest + 0.01
             and distance < settings.aligned_distance
             and turn < settings.aligned_angle
-            and self.cell.seconds - self.found_seconds
-            < 0.5 * settings.lost_seconds + (self.loop.latency)
+            and self.cell.seconds - self.found_seconds <= self.arm.gate.safety.watchdog
         )
 
     def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[View, View]:
@@ -428,9 +455,15 @@ class _Run:
         return np.array([vx - omega * arm[1], vy + omega * arm[0], 0.0, 0.0, 0.0, omega])
 
     def go(self) -> None:
-        """Send the wish until the next image."""
+        """Send the wish until the next image. While images come but do not show the object, the arm
+        stands still: what it would go by is too old."""
+        watchdog = self.arm.gate.safety.watchdog
         for _ in range(servo_period(self.cell)):
-            self.arm.move(self.wish, self.cell.seconds - self.image_seconds)
+            now = self.cell.seconds
+            if now - self.image_seconds <= watchdog < now - self.found_seconds:
+                self.arm.wait()
+            else:
+                self.arm.move(self.wish, now - self.found_seconds)
 
     # --- Without looking ---------------------------------------------------------------------
 
@@ -442,26 +475,31 @@ class _Run:
         self.depth_gone = 0.0
 
     def go_blind(self) -> None:
-        """Down to the grasp along the foreseen path; raises ServoError where the arm is stopped."""
+        """Down to the grasp along the foreseen path; raises ServoError where the arm is stopped, or
+        does not get there in time."""
         speed = self.settings.descend_speed
         end = self.cell.seconds + self.left / speed + _SLACK_SECONDS
-        while self.cell.seconds < end:
+        while True:
             rest = self.left - self.depth_gone
-            off = self._follow_period(min(speed, max(6.0 * rest, 0.02)) if rest > 0 else 0.0)
+            off = self._follow_step(min(speed, max(_BRAKE * rest, _SLOWEST)) if rest > 0 else 0.0)
             if rest <= 0 and off < _REACHED:
                 return
-
-    def _follow_period(self, sink: float) -> float:
-        """Follow the path for the time between two images; metres off it at the end."""
-        sight = self.loop.camera()
-        if sight is not None:
-            self.image_seconds = sight.seconds  # a sign of life; the object is too near to be seen
-        for _ in range(servo_period(self.cell)):
-            off = self._follow_step(sink)
-        return off
+            if self.cell.seconds > end:
+                if off < _NEAR_ENOUGH:
+                    return
+                raise ServoError(f"{1000 * off:.0f} mm off the foreseen path at its end")
 
     def _follow_step(self, sink: float) -> float:
+        """Follow the path for one physics step, sinking at `sink` m/s; metres off it before."""
+        if self.steps_to_image == 0:
+            self.steps_to_image = servo_period(self.cell)
+            sight = self.loop.camera()
+            if sight is not None:
+                self.image_seconds = sight.seconds
+        self.steps_to_image -= 1
         dt, now = self.cell.dt, self.cell.seconds
+        if now - self.found_seconds > self.settings.blind_seconds:
+            raise TargetLostError(f"not seen for {self.settings.blind_seconds} s")
         self.depth_gone = min(self.depth_gone + sink * dt, self.left)
         path = self.motion.motion(self.start_seconds, now) @ self.start
         path[:3, 3] += self.depth_gone * path[:3, 2]
@@ -472,26 +510,21 @@ class _Run:
         twist[:3] += sink * path[:3, 2] * (self.depth_gone < self.left)
         away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
         wish = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)[0]
+        # The object is too near to be seen: by design the wish is based on what was foreseen, for
+        # no longer than blind_seconds, and as long as the camera shows that it lives.
         self.arm.move(wish, now - self.image_seconds)
         return float(np.linalg.norm(error[:3]))
 
     def follow(self, steps: int) -> None:
         """Let physics steps pass while the fingers close, along with the object; hold still once
         something presses harder than the gate allows, which is what a grip does."""
-        period = servo_period(self.cell)
-        while steps > 0:
+        for _ in range(steps):
             try:
-                if self.arm_holds:
-                    self.cell.step(steps)
-                    return
-                if steps >= period:
-                    self._follow_period(0.0)
-                else:
-                    for _ in range(steps):
-                        self._follow_step(0.0)
-            except ArmStoppedError:
-                self.arm_holds = True
-                self.cell.step(min(steps, period))
-            steps -= period
-
-    arm_holds = False
+                if not self.holds:
+                    self._follow_step(0.0)
+                    continue
+            except ArmStoppedError as stop:
+                if not stop.contact:
+                    raise
+                self.holds = True
+            self.arm.wait()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
 from envs.grasp_loop import ClosedLoop
 from envs.kinematics import forward_kinematics
 from envs.scenes import Scene
-from utils.object_tracking import TargetLostError
 from utils.results import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
+from utils.servo_errors import TargetLostError
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.
@@ -71,7 +72,8 @@ def run_round(
             grasp = first_untried(grasps, failed)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
-                approach = ClosedLoop(cell, controller, frame, beliefs, taught, challenge.latency)
+                seen = frame.without_truth()
+                approach = ClosedLoop(cell, controller, seen, beliefs, taught, challenge.latency)
             with disturbed(cell, challenge.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
             on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
@@ -105,11 +107,12 @@ def run_round(
 
 def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
     """A frame of the cell's camera, taken now, with the camera where it is believed to be. An image
-    in which no table is found cannot be levelled and stays as it is."""
+    in which no table is found cannot be levelled."""
+    mount, T_WE = cell.config.camera.mount, forward_kinematics(cell.robot.q)
     try:
-        return beliefs.frame(frame, cell.config.camera.mount, forward_kinematics(cell.robot.q))
+        return beliefs.frame(frame, mount, T_WE)
     except TargetLostError:
-        return frame
+        return replace(beliefs, levelled=False).frame(frame, mount, T_WE)
 
 
 def _turn_ms(approach: Approach) -> float | None:

@@ -32,10 +32,12 @@ _FINGERTIPS = ((0.0, 0.0, 0.0),)
 
 @dataclass(frozen=True)
 class Verdict:
-    """velocity: (7,) rad/s that may be sent. reason: why it is zero; None where the arm may go."""
+    """velocity: (7,) rad/s that may be sent. reason: why it is zero; None where the arm may go.
+    contact: whether the reason is that something presses against the arm."""
 
     velocity: np.ndarray
     reason: str | None = None
+    contact: bool = False
 
 
 class SafetyGate:
@@ -68,9 +70,13 @@ class SafetyGate:
         q: (7,) rad, where the joints are. contact_force: N on the arm and what it carries.
         perception_age: seconds since the image was taken from which the wish was computed.
         """
-        reason = self._refusal(wish, q, contact_force, perception_age)
+        reason = self._refusal(wish, q, perception_age)
         if reason is not None:
             return Verdict(np.zeros(7), reason)
+        if not contact_force <= self.safety.contact_stop:
+            limit = self.safety.contact_stop
+            reason = f"contact with {contact_force:.1f} N, allowed are {limit} N"
+            return Verdict(np.zeros(7), reason, contact=True)
         points, speeds, turn = self._motion(q, wish)
         slower = self._speed_share(wish, speeds, turn)
         velocity = slower * wish
@@ -79,7 +85,7 @@ class SafetyGate:
             return Verdict(np.zeros(7), reason)
         return Verdict(share * velocity)
 
-    def _refusal(self, wish, q, contact_force, perception_age) -> str | None:
+    def _refusal(self, wish, q, perception_age) -> str | None:
         """Why nothing at all may be sent. A number that is not finite fails each comparison."""
         if not (np.isfinite(wish).all() and np.isfinite(q).all()):
             return "the wished joint velocities or the joint positions are not finite"
@@ -88,8 +94,6 @@ class SafetyGate:
                 f"what was seen last is {1000 * perception_age:.0f} ms old, "
                 f"the watchdog allows {1000 * self.safety.watchdog:.0f} ms"
             )
-        if not contact_force <= self.safety.contact_stop:
-            return f"contact with {contact_force:.1f} N, allowed are {self.safety.contact_stop} N"
         return None
 
     def _motion(self, q, wish) -> tuple[np.ndarray, np.ndarray, float]:

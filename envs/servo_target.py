@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import pybullet
 
-from utils.servo_errors import ServoError
+from utils.servo_errors import TargetLostError
 from utils.transforms import position_quaternion
 
 MARKERS = 4
@@ -38,10 +38,6 @@ _OUTERMOST = _MARGIN + (_CELLS - 2 * _MARGIN) * _SQUARE  # corners of the marker
 _WHITE, _BLACK = (0.95, 0.95, 0.95, 1.0), (0.03, 0.03, 0.03, 1.0)
 _MASS = 0.05  # kg, of a board that is carried
 _ALIGNED = 0.9  # least correlation of the board's image with its pattern; a free view has 0.98
-
-
-class TargetLostError(ServoError):
-    """The board, or so much of it that its place is unsure, is not in the image."""
 
 
 @dataclass(frozen=True)

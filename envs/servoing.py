@@ -131,7 +131,11 @@ class CarriedBoard:
 
 
 class ArmStoppedError(ServoError):
-    """The safety gate stopped the arm."""
+    """The safety gate stopped the arm. contact: because something presses against it."""
+
+    def __init__(self, reason: str, contact: bool = False):
+        super().__init__(reason)
+        self.contact = contact
 
 
 class GuardedArm:
@@ -165,11 +169,16 @@ class GuardedArm:
         verdict = self.gate.check(wish, q, force, perception_age)
         if verdict.reason is not None:
             self._hold()
-            raise ArmStoppedError(verdict.reason)
+            raise ArmStoppedError(verdict.reason, verdict.contact)
         ahead = self._reference + verdict.velocity * self.cell.dt
         # An arm that something holds back must not store up a way to jump when it is let go.
         self._reference = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
         self.robot.command_arm(self._reference, verdict.velocity)
+        self.cell.step()
+
+    def wait(self) -> None:
+        """Stand still for one physics step, for which nothing has to have been seen."""
+        self._hold()
         self.cell.step()
 
     def stop(self) -> None:

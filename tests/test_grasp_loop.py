@@ -30,6 +30,7 @@ CLOSED = ("pbvs", "ibvs", "hybrid")
 @pytest.fixture(scope="module")
 def cell(config):
     with Cell(config) as cell:
+        teach(cell)  # empties the cell, the first time
         yield cell
 
 
@@ -56,7 +57,6 @@ def loop(cell, controller, latency=0.0, camera=None):
 
 @pytest.mark.parametrize("controller", CLOSED)
 def test_every_controller_grasps_a_box_at_rest(cell, scene, controller):
-    teach(cell)  # empties the cell, the first time
     cell.load(scene)
     approach = loop(cell, controller)
     outcome = execute_grasp(cell, grasp_of_box(cell), approach)
@@ -66,7 +66,10 @@ def test_every_controller_grasps_a_box_at_rest(cell, scene, controller):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["moved", "moving_5cm", "turning_5cm", "latency"])
-def test_the_loop_grasps_what_the_open_loop_misses(cell, scene, scenario):
+def test_the_loop_grasps_what_the_open_loop_misses(cell, scene, scenario, monkeypatch):
+    # Images that are 100 ms late are older than the default watchdog allows.
+    allowed = load_config(None, ["sim.renderer=tiny", "safety.watchdog=0.2"])
+    monkeypatch.setattr(cell, "config", allowed)
     results = {}
     for controller in ("open_loop", "ibvs"):
         record = run_round(
@@ -107,6 +110,42 @@ def test_a_frozen_camera_stops_the_arm(cell, scene, images):
     assert images * 8 + 20 < cell.steps < images * 8 + 24 + 8 + 30
 
 
+@pytest.mark.parametrize("stage", ["near", "blind", "closing"])
+def test_a_camera_that_freezes_later_stops_the_arm(cell, scene, stage):
+    cell.load(scene)
+    camera = WristCamera(cell)
+    approach = loop(
+        cell, "ibvs", camera=lambda: None if approach.record.stage == stage else camera()
+    )
+    outcome = execute_grasp(cell, replace(grasp_of_box(cell), width=0.08), approach)
+    assert outcome.reason == "stopped", outcome
+    assert "the watchdog allows 100 ms" in outcome.detail
+    assert approach.record.stage == stage
+
+
+def test_images_that_come_late_stop_the_arm(cell, scene):
+    cell.load(scene)
+    outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs", latency=0.1))
+    assert outcome.reason == "stopped" and "the watchdog allows 100 ms" in outcome.detail
+
+
+def test_the_arm_waits_for_an_object_that_images_do_not_show(cell, scene):
+    """Blank images for 0.2 s: the arm comes to rest after the watchdog's 0.1 s, then goes on."""
+    cell.load(scene)
+    camera, slowest = WristCamera(cell), [np.inf]
+
+    def see():
+        sight = camera()
+        if 0.5 < cell.seconds < 0.7:
+            slowest[0] = min(slowest[0], np.abs(cell.robot.joint_state()[1]).max())
+            return sight._replace(depth=np.zeros_like(sight.depth))
+        return sight
+
+    outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs", camera=see))
+    assert outcome.success, outcome
+    assert slowest[0] < 0.05, "rad/s"
+
+
 def test_a_vanished_object_stops_the_arm(cell, scene):
     cell.load(scene)
     grasp, camera, start = grasp_of_box(cell), WristCamera(cell), cell.seconds
@@ -138,11 +177,11 @@ def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
     assert "2 of those on the object are in the image, needed are at least 3" in outcome.detail
 
 
-def test_an_approach_that_does_not_end_is_stopped(cell, scene):
-    cell.config = load_config(None, ["sim.renderer=tiny", "grasp.seconds=0.3"])
+def test_an_approach_that_does_not_end_is_stopped(cell, scene, monkeypatch):
+    short = load_config(None, ["sim.renderer=tiny", "grasp.seconds=0.3"])
+    monkeypatch.setattr(cell, "config", short)
     cell.load(scene)
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "pbvs"))
-    cell.config = load_config(None, ["sim.renderer=tiny"])
     assert outcome.reason == "stopped" and "0.3 s" in outcome.detail
 
 

@@ -9,13 +9,13 @@ from envs.camera import Intrinsics
 from utils.object_motion import PlanarMotion
 from utils.object_tracking import (
     ObjectTracker,
-    TargetLostError,
     grasp_frame,
     make_template,
     planar,
     planar_part,
     table_plane,
 )
+from utils.servo_errors import TargetLostError
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, look_at, project
 
 OVERHEAD = Intrinsics(224, 224, 28.0)

@@ -250,11 +250,12 @@ def test_report_of_an_interrupted_run(tmp_path):
     assert "interrupted: 0 of 4 rounds" in page and "nothing to show yet" in page
 
 
-def test_oracle_is_a_bound_not_the_headline(tmp_path):
-    oracle = a_round("oracle", 0, 1, 1, [attempt("success")], "cleared")
-    page = report(tmp_path, [*ROUNDS, oracle])
+@pytest.mark.parametrize("name, controller", [("oracle", "open_loop"), ("oracle+ibvs", "ibvs")])
+def test_oracle_is_a_bound_not_the_headline(tmp_path, name, controller):
+    oracle = a_round(name, 0, 1, 1, [attempt("success")], "cleared")
+    page = report(tmp_path, [*ROUNDS, replace(oracle, controller=controller)])
     assert "succeed with <strong>heuristic" in page
-    assert "oracle, which knows the true scene: 100 %" in page
+    assert f"{name}, which knows the true scene: 100 %" in page
 
 
 def test_report_refuses_bad_videos(tmp_path):

@@ -13,11 +13,12 @@ from envs.camera import Intrinsics, render
 from envs.cell import Cell
 from envs.kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.scenes import Scene
-from envs.servo_target import Board, TargetLostError
+from envs.servo_target import Board
 from envs.servoing import ArmStoppedError, GuardedArm, Sight, servo_arm, servo_settings, view_of
 from envs.world import static_box
 from utils.config import load_config
 from utils.errors import UserError
+from utils.servo_errors import TargetLostError
 from utils.servo_features import MOUNTINGS
 from utils.transforms import inverse_pose, project, transform_points
 

@@ -171,6 +171,7 @@ class GraspConfig(Section):
     aligned_angle: Positive
     floor: Annotated[float, Field(ge=0)]
     lost_seconds: Positive
+    blind_seconds: Positive
     seconds: Positive
     camera_shift: Annotated[float, Field(ge=0)]
     camera_turn_deg: Annotated[float, Field(ge=0, le=45)]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from utils.servo_errors import ServoError
+from utils.servo_errors import TargetLostError
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, known_depth, transform_points
 
 CELL = 0.002  # m, side of a template's cell
@@ -39,10 +39,6 @@ _RECTANGLE = (0.015, 0.03)  # m, smallest and largest half side of a template's 
 _SEEN = 0.6  # share of the object that has to be in the image
 _NOISE = 0.001  # m, standard deviation of a measured place
 _TURN_NOISE = 0.02  # rad, what sides that are seen now and were not then do to a measured turn
-
-
-class TargetLostError(ServoError):
-    """The object, or so much of it that its place is unsure, is not in the image."""
 
 
 class Found(NamedTuple):

@@ -28,6 +28,7 @@ from utils.results import (
     RoundRecord,
     Row,
     compare,
+    contestant,
     failures_in_words,
     interruption,
 )
@@ -109,16 +110,21 @@ def _groups(rows: Sequence[Row]) -> list[dict[str, Any]]:
             "objects": Path(objects).name or objects,  # a folder by its last part
             "rows": cell,
             "best": _best(cell),
-            "bounds": [row for row in cell if row.policy in PRIVILEGED and row != _best(cell)],
+            "bounds": [row for row in cell if _privileged(row) and row != _best(cell)],
             "outcomes": [(row, _outcomes(row)) for row in cell],
         }
         for (scenario, objects), cell in cells.items()
     ]
 
 
+def _privileged(row: Row) -> bool:
+    """Whether its planner, with whatever controller, sees the true scene."""
+    return any(row.policy == contestant(planner, row.controller) for planner in PRIVILEGED)
+
+
 def _best(rows: Sequence[Row]) -> Row:
     """The row with the best success rate, of those that work from the camera if there are any."""
-    fair = [row for row in rows if row.policy not in PRIVILEGED] or rows
+    fair = [row for row in rows if not _privileged(row)] or rows
     return max(fair, key=lambda row: -1 if row.success_rate is None else row.success_rate)
 
 

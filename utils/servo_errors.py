@@ -20,6 +20,10 @@ class FeatureCountError(ServoError):
     """Fewer than three points, or as many as on the other side are not there."""
 
 
+class TargetLostError(ServoError):
+    """What is servoed to, or so much of it that its place is unsure, is not in the image."""
+
+
 class PointError(ServoError):
     """A point is not finite or lies outside the image."""
 
