@@ -266,7 +266,8 @@ class _Run:
                 error = unreachable
         if not room:
             raise error
-        if False not in room or room.get(True, 0.0) > room[False] + _WORTH_TURNING:
+        worth = 0.0 if self.motion is None else _WORTH_TURNING
+        if False not in room or room.get(True, 0.0) > room[False] + worth:
             self.T_OE = self.T_OE @ HALF_TURN
         self.chosen_at = direction  # of an undirected line
 
