@@ -64,7 +64,6 @@ from utils.servo_loop import View, VisualServo
 from utils.transforms import (
     Grasp,
     RGBDFrame,
-    angle_difference,
     inverse_pose,
     top_down_pose,
     transform_points,
@@ -77,9 +76,12 @@ from utils.visual_servo import (
 
 _DAMPING = 0.02  # of the arm's Jacobian
 _AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
-_WORTH_TURNING = 0.3  # rad more of room for the wrist, for which the hand turns round
+_ROOM = 0.6  # rad to the wrist's limits that a way round should leave
+_LITTLE_ROOM = 0.3  # rad of it at which the other way round is looked at
+_LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
 _FORESIGHT = 1.5  # s, about what is left of the way in the far stage
-_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for the other way round to be tried
+_TURNING_KNOWN = 0.15  # rad/s, standard deviation of a turning rate that can be relied on
+_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for that
 _NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
 _FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
 _BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
@@ -229,6 +231,11 @@ def _reason_of(error: ServoError) -> str:
     return "collision" if contact else "stopped"
 
 
+def _wrist_room(q: np.ndarray) -> float:
+    """Radians from the last joint to the nearer one of its limits."""
+    return float(min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1]))
+
+
 class _Run:
     """One approach under way."""
 
@@ -240,6 +247,7 @@ class _Run:
         self.T_WO = grasp_frame(grasp)  # as last seen
         self.T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
         self.motion: PlanarMotion | None = None
+        self.chosen_at = planar_part(self.T_WO)[2]
         self._choose_way_round()
         self.image_seconds = self.found_seconds = self.cell.seconds
         self.near, self.height = False, np.inf
@@ -251,38 +259,49 @@ class _Run:
         self._wait_for_sight()
 
     def _choose_way_round(self) -> None:
-        """Take the grasp or the same one turned by half a turn: that which leaves the wrist more
-        room to turn with the object. Raises UnreachableError if neither can be reached."""
-        T_WE = self._foreseen() @ self.T_OE
-        direction = np.arctan2(T_WE[1, 0], T_WE[0, 0])
-        T_WE[2, 3] += self.settings.look_height
-        room, error = {}, None
-        for turned in (False, True):
-            try:
-                pose = T_WE @ HALF_TURN if turned else T_WE
-                q = inverse_kinematics(pose, self.cell.home, self.cell.home)
-                room[turned] = min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1])
-            except UnreachableError as unreachable:
-                error = unreachable
-        if not room:
-            raise error
-        worth = 0.0 if self.motion is None else _WORTH_TURNING
-        if False not in room or room.get(True, 0.0) > room[False] + worth:
+        """Take the grasp or the same one turned by half a turn: the smaller turn of the wrist that
+        leaves it room to turn with the object. Raises UnreachableError if neither is in reach."""
+        ways = self._ways_round()
+        roomy = [turned for turned, q in ways.items() if _wrist_room(q) > _ROOM] or list(ways)
+        now = self.cell.robot.q[-1]
+        if min(roomy, key=lambda turned: abs(ways[turned][-1] - now)):
             self.T_OE = self.T_OE @ HALF_TURN
-        self.chosen_at = direction  # of an undirected line
 
     def _reconsider_way_round(self) -> None:
-        """Choose again where the object turns: a wrist that must follow may meet its limit."""
+        """Turn round where the wrist, following the object, is about to meet its limit."""
+        direction = planar_part(self._foreseen())[2]
+        if abs(direction - self.chosen_at) < _RECONSIDER_ANGLE:
+            return
+        self.chosen_at = direction
+        # Out of reach at this moment is no reason to change anything.
+        with contextlib.suppress(UnreachableError):
+            ways, now = self._ways_round(), self.cell.robot.q[-1]
+            kept, other = (
+                _wrist_room(ways[turned]) if turned in ways else 0.0 for turned in (0, 1)
+            )
+            # The law takes the shorter turn; a longer one than half a turn would be the wrong way.
+            if kept < _LITTLE_ROOM < other and abs(ways[True][-1] - now) < _LONGEST_TURN:
+                self.T_OE = self.T_OE @ HALF_TURN
+
+    def _ways_round(self) -> dict[bool, np.ndarray]:
+        """Joint positions (7,) over the grasp as it is (False) and turned by half a turn (True),
+        those that can be reached; raises UnreachableError if there are none."""
         T_WE = self._foreseen() @ self.T_OE
-        direction = np.arctan2(T_WE[1, 0], T_WE[0, 0])
-        if angle_difference(direction, self.chosen_at) > _RECONSIDER_ANGLE:
-            # Out of reach at this moment is no reason to change anything.
-            with contextlib.suppress(UnreachableError):
-                self._choose_way_round()
+        T_WE[2, 3] += self.settings.look_height
+        ways, error = {}, None
+        for turned, pose in ((False, T_WE), (True, T_WE @ HALF_TURN)):
+            try:
+                ways[turned] = inverse_kinematics(pose, self.cell.home, self.cell.home)
+            except UnreachableError as unreachable:
+                error = unreachable
+        if not ways:
+            raise error
+        return ways
 
     def _foreseen(self) -> np.ndarray:
-        """(4, 4) T_WO where the object is expected a little before the fingers close."""
-        return self._object_at(self.cell.seconds + _FORESIGHT)
+        """(4, 4) T_WO a little before the fingers close, once it is known how the object moves."""
+        known = self.motion is not None and self.motion.covariance[5, 5] < _TURNING_KNOWN**2
+        return self._object_at(self.cell.seconds + _FORESIGHT) if known else self.T_WO
 
     def _goal(self, height: float) -> np.ndarray:
         """(4, 4) T_CO: the object as the camera should see it from `height` above the grasp."""

@@ -50,6 +50,25 @@ def block():
     return T_WB, grasp, ObjectTracker(template, WRIST.K, (WRIST.width, WRIST.height))
 
 
+def test_what_is_round_is_so_wherever_it_is_grasped(block):
+    """A disc of 4 cm height, grasped at its middle and 3 cm beside it: a turn about the grasp moves
+    it sideways, but no picture tells how far it has turned about its middle."""
+    v, u = np.mgrid[0 : OVERHEAD.height, 0 : OVERHEAD.width]
+    K, eye = OVERHEAD.K, FROM_ABOVE[:3, 3]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    way = rays @ FROM_ABOVE[:3, :3].T
+    depth = -eye[2] / way[..., 2]
+    top = (0.04 - eye[2]) / way[..., 2]
+    at = eye[:2] + way[..., :2] * top[..., None]
+    depth = np.where(np.linalg.norm(at - (0.5, 0.0), axis=-1) < 0.035, top, depth)
+    frame = RGBDFrame(None, depth.astype(np.float32), OVERHEAD.K, FROM_ABOVE)
+    for beside in (0.0, 0.03):
+        grasp = Grasp(np.array([0.5 + beside, 0.0, 0.02]), 0.4, 0.05, 1.0)
+        template = make_template(frame, grasp)
+        assert ObjectTracker(template, WRIST.K, (WRIST.width, WRIST.height)).round
+    assert not block[2].round
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_moved_object_is_found_where_it_is(block, seed):
     T_WB, grasp, tracker = block

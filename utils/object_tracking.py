@@ -34,7 +34,9 @@ _TURNS = 10  # of the alignment at each blur, at most
 _HUBER = 0.008  # m of height beyond which a difference counts less
 _ALIGNED = 0.80  # least correlation of template and image
 _RIDGE = 0.02  # of the Hessian's turn: what is round keeps the turn that was expected
+_STIFF = 1e3  # of the Hessian's turn: what is round does not turn at all
 _YAWS = 24  # directions that are tried where the object is not where it was expected
+_PER_METRE, _PER_RADIAN = 0.5, 0.1  # of correlation that a place or turn off the expected one costs
 _RECTANGLE = (0.015, 0.03)  # m, smallest and largest half side of a template's rectangle of points
 _SEEN = 0.6  # share of the object that has to be in the image
 _NOISE = 0.001  # m, standard deviation of a measured place
@@ -271,13 +273,19 @@ class ObjectTracker:
         return T_PO, level.correlation(image, motion), level.covariance()
 
     def _search(self, depth, T_PC, expected) -> tuple[np.ndarray, float, np.ndarray] | None:
-        """The best of many places and turns: each thing on the table, in each direction."""
+        """The best of many places and turns: each thing on the table, in each direction. What is
+        not as expected has to look better for it, as images follow each other closely: nearly
+        round things would else seem to turn with every search."""
         best = None
+        middle = (expected @ planar(*self._centre, 0.0))[:2, 3]
         for place in self._things(depth, T_PC):
-            for yaw in 2 * np.pi * np.arange(_YAWS) / _YAWS + planar_part(expected)[2]:
+            away = _PER_METRE * np.linalg.norm(place - middle)
+            for turn in np.pi * (2 * np.arange(_YAWS) / _YAWS - 1):
+                yaw = planar_part(expected)[2] + turn
                 T_PO = planar(*place, yaw) @ planar(*-self._centre, 0.0)
                 image = _patch(depth, self.K, inverse_pose(T_PO) @ T_PC, self.template.side)
                 score = self._levels[0].correlation(image, np.eye(3))
+                score -= away + _PER_RADIAN * abs(turn)
                 if best is None or score > best[0]:
                     best = score, T_PO
         return None if best is None else self._align(depth, T_PC, best[1])
@@ -331,7 +339,13 @@ class _Level:
         self.ridge += 1e-9 * np.trace(hessian) * np.eye(3)
         whole = np.linalg.inv(hessian + self.ridge)
         self.scale = _NOISE**2 / max(whole[0, 0], whole[1, 1])
-        self.round = bool(hessian[2, 2] < 4 * self.ridge[2, 2])
+        # What a turn about the object's own middle changes, wherever on it the grasp is: that part
+        # of the turn which no shift can undo.
+        shifts, coupling = hessian[:2, :2] + self.ridge[:2, :2], hessian[:2, 2]
+        turning = hessian[2, 2] - coupling @ np.linalg.solve(shifts, coupling)
+        self.round = bool(turning < 4 * self.ridge[2, 2])
+        if self.round:
+            self.ridge[2, 2] = _STIFF * hessian[2, 2]
         self._hessian = hessian
 
     def covariance(self) -> np.ndarray:
