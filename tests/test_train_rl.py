@@ -430,7 +430,7 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
     (run,) = Path("runs/train_rl").iterdir()
     policy = load_policy(run / "last.pt")
     keys = {part.key for part in (*policy.layout.images, *policy.layout.state)}
-    assert ("object_position" in keys) == (name == "ppo_state")
+    assert ("object_offset" in keys) == (name == "ppo_state")
     first = load_checkpoint(run / "last.pt", KIND)
     shutil.rmtree("runs")
     assert train_rl.main(arguments) == 0  # the same seeds, in new processes
@@ -441,7 +441,8 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
 @pytest.mark.parametrize("name", ["ppo", "ppo_state", "ppo_primitives", "ppo_random_urdfs"])
 def test_shipped_configs_are_valid(name):
     config = load_config(REPOSITORY / "configs" / f"{name}.yaml")
-    hidden = set(config.rl.privileged_observations or ())
+    hidden = {*(config.rl.privileged_observations or ()), *(config.rl.estimated_observations or ())}
+    truth = {"object_position", "object_offset", "object_outline", "grasped"}
     if name != "ppo_state":
-        assert "object_position" in hidden, "what only the critic is told"
-        assert not {"object_position", "grasped"} & set(config.rl.policy_observations)
+        assert hidden == truth - {"object_position"}, "what only the critic is told"
+        assert not truth & set(config.rl.policy_observations)
