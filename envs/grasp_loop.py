@@ -20,10 +20,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +40,7 @@ from envs.kinematics import (
 )
 from envs.panda import MAX_OPENING
 from envs.servoing import ArmStoppedError, GuardedArm, servo_period
+from envs.wrist_camera import DepthSight, WristCamera
 from utils.object_motion import PlanarMotion
 from utils.object_tracking import (
     ObjectTemplate,
@@ -93,36 +92,6 @@ _SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
 _NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
 
 _TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are told as they look to the camera
-
-
-class DepthSight(NamedTuple):
-    """A depth image (H, W), metres, the joint positions (7,) when it was taken, and that time."""
-
-    depth: np.ndarray
-    q: np.ndarray
-    seconds: float
-
-
-class WristCamera:
-    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken."""
-
-    def __init__(self, cell: Cell, latency: float = 0.0):
-        camera, grasp = cell.config.camera, cell.config.grasp
-        self.cell, self.latency = cell, latency
-        self.intrinsics = Intrinsics(
-            grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
-        )
-        self._coming: deque[DepthSight] = deque()
-
-    def __call__(self) -> DepthSight | None:
-        """Take an image now; the newest that has arrived by now, or None."""
-        cell = self.cell
-        image = cell.look(self.intrinsics, cell.camera_pose("wrist"))
-        self._coming.append(DepthSight(image.depth, cell.robot.q, cell.seconds))
-        arrived = None
-        while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:
-            arrived = self._coming.popleft()
-        return arrived
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The gate that every velocity for the arm passes: what of a wish may be sent, and why not.
+"""The gate that every velocity of a servo loop passes: what of a wish may be sent, and why not.
 
 The arm is slowed by one factor for all joints, so that its direction is kept; where nothing may be
 sent the answer is zero and a reason in words. Each limit is approached so that the arm can still

@@ -364,26 +364,26 @@ def test_parameters_drawn_at_every_step(scene):
 # --- Vision -----------------------------------------------------------------------------------
 
 
-def test_the_view_alone_is_what_the_cell_sees(scene):
-    """With every parameter idle the picture is the nominal one, up to the light's rounding."""
-    config = only(camera_fov="1,1,uniform,scale,episode")
+def frames_without_and_with(scene, **parameters):
+    """The nominal frame of a scene, and one with these parameters drawn and all others idle."""
+    config = only(**parameters)
     with Cell(config) as cell:
         cell.build(scene)
         nominal = cell.frame()
         randomizer_of(cell).randomize(0)
-        seen = cell.frame()
+        return nominal, cell.frame()
+
+
+def test_the_view_alone_is_what_the_cell_sees(scene):
+    """With every parameter idle the picture is the nominal one, up to the light's rounding."""
+    nominal, seen = frames_without_and_with(scene, camera_fov="1,1,uniform,scale,episode")
     np.testing.assert_array_equal(seen.depth, nominal.depth)
     assert abs(seen.rgb.astype(int) - nominal.rgb).max() <= 1
 
 
 def test_camera_error_is_not_reported(scene):
     """1 cm nearer: the depth of the table falls from 0.8 to 0.79 m, and T_WC says nothing of it."""
-    config = only(camera_shift="0.01,0.01,uniform,add,episode")
-    with Cell(config) as cell:
-        cell.build(scene)
-        nominal = cell.frame()
-        randomizer_of(cell).randomize(0)
-        seen = cell.frame()
+    nominal, seen = frames_without_and_with(scene, camera_shift="0.01,0.01,uniform,add,episode")
     assert nominal.depth[0, 0] == pytest.approx(0.8, abs=1e-4)
     assert seen.depth[0, 0] == pytest.approx(0.79, abs=1e-4)
     np.testing.assert_array_equal(seen.T_WC, nominal.T_WC)

@@ -15,10 +15,11 @@ from envs.cell import Cell, wrist_mount
 from envs.challenges import CHALLENGES
 from envs.disturbances import Conveyor, Displacement, disturbed
 from envs.execution import execute_grasp
-from envs.grasp_loop import ClosedLoop, WristCamera
+from envs.grasp_loop import ClosedLoop
 from envs.kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenes import make_scene
+from envs.wrist_camera import WristCamera
 from utils.config import load_config
 from utils.config_schema import ScoredScenario
 from utils.object_tracking import planar_part, table_plane

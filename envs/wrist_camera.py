@@ -1,0 +1,44 @@
+"""The depth camera in the hand as a closed loop reads it: images with their times, perhaps late.
+
+Knows neither what is looked for in the images nor where anybody believes the camera to be.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from envs.camera import Intrinsics
+from envs.cell import Cell
+
+
+class DepthSight(NamedTuple):
+    """A depth image (H, W), metres, the joint positions (7,) when it was taken, and that time."""
+
+    depth: np.ndarray
+    q: np.ndarray
+    seconds: float
+
+
+class WristCamera:
+    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken."""
+
+    def __init__(self, cell: Cell, latency: float = 0.0):
+        camera, grasp = cell.config.camera, cell.config.grasp
+        self.cell, self.latency = cell, latency
+        self.intrinsics = Intrinsics(
+            grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
+        )
+        self._coming: deque[DepthSight] = deque()
+
+    def __call__(self) -> DepthSight | None:
+        """Take an image now; the newest that has arrived by now, or None."""
+        cell = self.cell
+        image = cell.look(self.intrinsics, cell.camera_pose("wrist"))
+        self._coming.append(DepthSight(image.depth, cell.robot.q, cell.seconds))
+        arrived = None
+        while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:
+            arrived = self._coming.popleft()
+        return arrived
