@@ -180,7 +180,7 @@ def test_a_cube_lying_on_the_fingers_is_no_grip(cell, box_set):
     cell.load(cube_scene(box_set, position=(0.5, 0.3, 0.03)))
     level = cell.home + [0, 0, 0, 0, 0, np.pi / 2, 0]  # the hand points forwards, fingers level
     cell.robot.place(level, opening=0.02)
-    tip = cell.robot.tip_position()
+    tip = cell.robot.tip_pose()[:3, 3]
     pybullet.resetBasePositionAndOrientation(
         cell.bodies[0], tip + [-0.01, 0, 0.045], [0, 0, 0, 1], physicsClientId=cell.client
     )
