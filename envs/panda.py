@@ -263,6 +263,13 @@ class Panda:
         """Whether anything touches the robot, or is so near that Bullet already looks at it."""
         return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
 
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body, linkIndexA=ARM[-1], physicsClientId=self.client
+        )
+        return any(contact[9] > 0 for contact in contacts)
+
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the whole robot."""
         contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
