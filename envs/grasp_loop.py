@@ -39,7 +39,8 @@ from envs.kinematics import (
     pose_error,
 )
 from envs.panda import MAX_OPENING
-from envs.servoing import ArmStoppedError, GuardedArm, servo_period
+from envs.safety import ArmStoppedError
+from envs.servoing import GuardedArm, servo_period
 from envs.wrist_camera import DepthSight, WristCamera
 from utils.object_motion import PlanarMotion
 from utils.object_tracking import (

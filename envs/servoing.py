@@ -19,7 +19,7 @@ from envs.camera import Intrinsics
 from envs.cell import Cell, wrist_mount
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.panda import ARM
-from envs.safety import SafetyGate
+from envs.safety import ArmStoppedError, SafetyGate
 from envs.servo_target import Board
 from utils.config import SafetyConfig, ServoConfig
 from utils.errors import unknown_choice
@@ -130,16 +130,8 @@ class CarriedBoard:
         return sum(contact[9] for contact in contacts)
 
 
-class ArmStoppedError(ServoError):
-    """The safety gate stopped the arm. contact: because something presses against it."""
-
-    def __init__(self, reason: str, contact: bool = False):
-        super().__init__(reason)
-        self.contact = contact
-
-
 class GuardedArm:
-    """The arm behind the gate: the only way in which a servo's velocities get to the motors."""
+    """The arm behind the servo's gate: the only way for a servo's velocities to the arm's own."""
 
     def __init__(
         self,
@@ -172,8 +164,8 @@ class GuardedArm:
             raise ArmStoppedError(verdict.reason, verdict.contact)
         ahead = self._reference + verdict.velocity * self.cell.dt
         # An arm that something holds back must not store up a way to jump when it is let go.
-        self._reference = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
-        self.robot.command_arm(self._reference, verdict.velocity)
+        ahead = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
+        self._reference = self.robot.command_arm(ahead, verdict.velocity)
         self.cell.step()
 
     def wait(self) -> None:
@@ -188,7 +180,7 @@ class GuardedArm:
 
     def _hold(self) -> None:
         self._reference = self.robot.q
-        self.robot.command_arm(self._reference, np.zeros(7))
+        self.robot.hold()
 
 
 def servo_arm(
