@@ -61,6 +61,7 @@ from utils.results import (
     write_results,
 )
 from utils.runs import check_writable, git_state, new_run_folder
+from utils.stop_reasons import print_stop_reasons, stop_reasons
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 MOST_FAILURES = 24  # on failures.png
@@ -81,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     rows = summarise(outcome.rounds, config.seed)
     print_table(rows)
+    print_stop_reasons(stop_reasons(outcome.rounds))
     print_comparisons(compare(outcome.rounds, config.seed))
     complete = interruption(len(outcome.rounds), config) is None
     for path in filter(None, [run / "results.json", options.results]):

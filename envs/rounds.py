@@ -84,8 +84,8 @@ def run_round(
                     plan_seconds,
                     outcome.sim_seconds,
                     on_image,
-                    _turn_ms(approach),
-                    outcome.detail,
+                    detail=outcome.detail,
+                    **_turn_ms(approach),
                 )  # fmt: skip
             )
             failed = [] if outcome.success else [*failed, grasp]
@@ -115,9 +115,15 @@ def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
         return replace(beliefs, levelled=False).frame(frame, mount, T_WE)
 
 
-def _turn_ms(approach: Approach) -> float | None:
+def _turn_ms(approach: Approach) -> dict[str, float]:
+    """Fields of an AttemptRecord on the turns of a closed loop that has made any."""
     turns = approach.record.turn_seconds if isinstance(approach, ClosedLoop) else []
-    return 1000 * float(np.percentile(turns, 95)) if turns else None
+    if not turns:
+        return {}
+    return {
+        "turn_ms": 1000 * float(np.percentile(turns, 95)),
+        "turn_ms_mean": 1000 * float(np.mean(turns)),
+    }
 
 
 def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:

@@ -130,8 +130,8 @@ class SafetyGate:
     """Judges every wish for joint velocities of a loop that goes by what it sees.
 
     Keeps the guarded points within the workspace box and under a linear speed, the hand under an
-    angular speed, and the joints within their limits of position and velocity. Nothing is sent on
-    contact, or when what the wish was computed from is too old.
+    angular speed, and the joints within their limits of position, velocity and acceleration. A stop
+    is at once: nothing is sent on contact, or when what the wish was computed from is too old.
     """
 
     def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, guarded_E=_FINGERTIPS):
@@ -144,17 +144,24 @@ class SafetyGate:
         self._speed = JOINT_VELOCITY * robot.velocity_scale
         self._lower = JOINT_LOWER + safety.joint_margin
         self._upper = JOINT_UPPER - safety.joint_margin
-        self._joint_deceleration = JOINT_ACCELERATION * robot.acceleration_scale
+        self._joint_acceleration = JOINT_ACCELERATION * robot.acceleration_scale
         self._deceleration = CARTESIAN_ACCELERATION * robot.acceleration_scale
         self._box = np.array(safety.box_lower), np.array(safety.box_upper)
 
     def check(
-        self, wish: np.ndarray, q: np.ndarray, contact_force: float, perception_age: float
+        self,
+        wish: np.ndarray,
+        q: np.ndarray,
+        contact_force: float,
+        perception_age: float,
+        before: np.ndarray | None = None,
     ) -> Verdict:
         """What may be sent of the wished joint velocities (7,), rad/s.
 
         q: (7,) rad, where the joints are. contact_force: N on the arm and what it carries.
         perception_age: seconds since the image was taken from which the wish was computed.
+        before: (7,) rad/s, what was sent last, from where the arm gets no faster or slower than its
+        acceleration limits allow; None: as if it had been this wish.
         """
         reason = self._refusal(wish, q, perception_age)
         if reason is not None:
@@ -162,13 +169,20 @@ class SafetyGate:
         reason = contact_reason(contact_force, self.safety.contact_stop)
         if reason is not None:
             return Verdict(np.zeros(7), reason, contact=True)
-        points, speeds, turn = self._motion(q, wish)
-        slower = self._speed_share(wish, speeds, turn)
-        velocity = slower * wish
-        share, reason = self._room_share(velocity, q, points, slower * speeds)
-        if share < _LEAST_SHARE:
-            return Verdict(np.zeros(7), reason)
-        return Verdict(share * velocity)
+        T_WE, J = forward_kinematics(q), geometric_jacobian(q)
+        arms = self.guarded_E @ T_WE[:3, :3].T
+        twist = J @ wish
+        velocity = wish * self._speed_share(wish, _speeds(twist, arms), twist[3:])
+        choices = [velocity]
+        if before is not None:  # the wish itself, where braking that gently would leave no room
+            change = velocity - before
+            choices.insert(0, before + change * self._change_share(change))
+        for velocity in choices:
+            speeds = _speeds(J @ velocity, arms)
+            share, reason = self._room_share(velocity, q, T_WE[:3, 3] + arms, speeds)
+            if share >= _LEAST_SHARE:
+                return Verdict(share * velocity)
+        return Verdict(np.zeros(7), reason)
 
     def _refusal(self, wish, q, perception_age) -> str | None:
         """Why nothing at all may be sent. A number that is not finite fails each comparison."""
@@ -181,25 +195,24 @@ class SafetyGate:
             )
         return None
 
-    def _motion(self, q, wish) -> tuple[np.ndarray, np.ndarray, float]:
-        """The guarded points (n, 3) in W, their velocities (n, 3), and the hand's turning rate."""
-        T_WE, twist = forward_kinematics(q), geometric_jacobian(q) @ wish
-        arms = self.guarded_E @ T_WE[:3, :3].T
-        speeds = twist[:3] + np.cross(twist[3:], arms)
-        return T_WE[:3, 3] + arms, speeds, float(np.linalg.norm(twist[3:]))
-
-    def _speed_share(self, wish, speeds, turn: float) -> float:
+    def _speed_share(self, wish, speeds, turn) -> float:
         """The factor, at most 1, that brings every speed within its limit."""
         excess = max(
             float(np.max(np.abs(wish) / self._speed)),
             float(np.linalg.norm(speeds, axis=1).max()) / self.safety.linear_speed,
-            turn / self.safety.angular_speed,
+            float(np.linalg.norm(turn)) / self.safety.angular_speed,
         )
+        return 1.0 / max(excess, 1.0)
+
+    def _change_share(self, change) -> float:
+        """The factor, at most 1, that brings a change of velocities (7,) within one period within
+        the acceleration limits."""
+        excess = float(np.max(np.abs(change) / (self._joint_acceleration * self.dt)))
         return 1.0 / max(excess, 1.0)
 
     def _room_share(self, velocity, q, points, speeds) -> tuple[float, str]:
         """The factor, at most 1, that lets the arm stop before each limit; who sets it."""
-        joints = self._shares(velocity, q - self._lower, self._upper - q, self._joint_deceleration)
+        joints = self._shares(velocity, q - self._lower, self._upper - q, self._joint_acceleration)
         box = self._shares(speeds, points - self._box[0], self._box[1] - points, self._deceleration)
         joint, place = int(joints.argmin()), np.unravel_index(box.argmin(), box.shape)
         if joints[joint] <= box[place]:
@@ -214,3 +227,8 @@ class SafetyGate:
         allowed = np.minimum(np.sqrt(2.0 * deceleration * room), room / self.dt)
         size = np.abs(speed)
         return np.divide(allowed, size, out=np.ones_like(size), where=size > allowed)
+
+
+def _speeds(twist: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """(n, 3) m/s in W of points at `arms` (n, 3) from E, which moves with a twist (6,)."""
+    return twist[:3] + np.cross(twist[3:], arms)

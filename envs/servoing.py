@@ -146,7 +146,7 @@ class GuardedArm:
             guarded = np.vstack([guarded, carried.corners_E])
         safety = safety or cell.config.safety
         self.gate = SafetyGate(safety, cell.config.robot, cell.dt, guarded)
-        self._reference = cell.robot.q
+        self._reference, self._velocity = cell.robot.q, np.zeros(7)  # as sent last
 
     def move(self, wish: np.ndarray, perception_age: float) -> None:
         """Send what may be sent of joint velocities (7,), rad/s, and do one physics step.
@@ -158,10 +158,11 @@ class GuardedArm:
         force = self.robot.contact_force()
         if self.carried is not None:
             force += self.carried.contact_force()
-        verdict = self.gate.check(wish, q, force, perception_age)
+        verdict = self.gate.check(wish, q, force, perception_age, self._velocity)
         if verdict.reason is not None:
             self._hold()
             raise ArmStoppedError(verdict.reason, verdict.contact)
+        self._velocity = verdict.velocity
         ahead = self._reference + verdict.velocity * self.cell.dt
         # An arm that something holds back must not store up a way to jump when it is let go.
         ahead = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
@@ -179,7 +180,7 @@ class GuardedArm:
         self.cell.step(round(_REST_SECONDS / self.cell.dt))
 
     def _hold(self) -> None:
-        self._reference = self.robot.q
+        self._reference, self._velocity = self.robot.q, np.zeros(7)
         self.robot.hold()
 
 
