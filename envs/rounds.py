@@ -73,7 +73,9 @@ def run_round(
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
-                approach = ClosedLoop(cell, controller, seen, beliefs, taught, challenge.latency)
+                # What is worked out of an image late is what a late image would have been worth.
+                late = challenge.latency + cell.config.grasp.compute_seconds
+                approach = ClosedLoop(cell, controller, seen, beliefs, taught, late)
             with disturbed(cell, challenge.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
             on_image = grasp_to_image(grasp, frame.K, frame.T_WC)

@@ -16,6 +16,7 @@ a command comes from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -86,9 +87,12 @@ class ArmGate:
     def passed(self, q: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is sent of a reference q (7,) and its velocity (7,), rad/s, for one control period:
         these very arrays where they are legal. Raises ArmStoppedError."""
+        angles, rates = q.tolist(), velocity.tolist()
+        if not math.isfinite(sum(angles) + sum(rates)):
+            raise ArmStoppedError("the commanded joint positions or velocities are not finite")
         fastest = max(
             max(abs(new - old) / self._dt, abs(rate)) / limit
-            for new, old, rate, limit in zip(q.tolist(), self._q, velocity.tolist(), self._speeds)
+            for new, old, rate, limit in zip(angles, self._q, rates, self._speeds)
         )
         if fastest > _TOO_FAST:
             before = np.array(self._q)
