@@ -18,7 +18,8 @@ import pybullet
 
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.cell import Cell
-from envs.kinematics import UnreachableError, inverse_kinematics, moved
+from envs.execution import choose_posture
+from envs.kinematics import UnreachableError, moved
 from envs.objects import load_object_set
 from envs.scenes import make_scene
 from envs.wrist_camera import WristCamera
@@ -87,9 +88,10 @@ def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Er
         camera = WristCamera(cell)
         size = camera.intrinsics.width, camera.intrinsics.height
         tracker = ObjectTracker(template, camera.intrinsics.K, size)
-        rng = np.random.default_rng([seed, _STREAM])
+        rng, T_WB = np.random.default_rng([seed, _STREAM]), cell.object_pose(0)
         for height in HEIGHTS:
-            for place, turn in sightings(cell, camera, tracker, grasps[0], height, views, rng):
+            found = sightings(cell, camera, tracker, T_WB, grasps[0], height, views, rng)
+            for place, turn in found:
                 errors[height].tried += 1
                 if place is not None:
                     errors[height].places.append(place)
@@ -102,13 +104,15 @@ def sightings(
     cell: Cell,
     camera: WristCamera,
     tracker: ObjectTracker,
+    T_WB: np.ndarray,
     grasp: Grasp,
     height: float,
     views: int,
     rng: np.random.Generator,
 ) -> Iterator[tuple[float | None, float | None]]:
-    """Errors (m, rad) of finding the one object from `height` m over its grasp; None if lost."""
-    T_WB, T_WO = cell.object_pose(0), grasp_frame(grasp)
+    """Errors (m, rad) of finding the one object from `height` m over its grasp; None if lost.
+    T_WB: (4, 4) the object when the grasp was planned."""
+    T_WO = grasp_frame(grasp)
     for _ in range(views):
         T_WE = grasp.pose
         T_WE[2, 3] += height
@@ -117,7 +121,7 @@ def sightings(
         about = planar(*T_WB[:2, 3], 0.0)
         motion = about @ motion @ inverse_pose(about)
         try:
-            q = inverse_kinematics(moved(T_WE, np.append(beside, tilt)), cell.home, cell.home)
+            q = choose_posture(cell, moved(T_WE, np.append(beside, tilt)))
         except UnreachableError:
             continue
         cell.robot.place(q)
