@@ -47,6 +47,7 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import contact_sheet, draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
+    OPEN_LOOP,
     RoundRecord,
     append_round,
     compare,
@@ -61,6 +62,7 @@ from utils.results import (
     write_results,
 )
 from utils.runs import check_writable, git_state, new_run_folder
+from utils.stop_reasons import print_stop_reasons, stop_reasons
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 MOST_FAILURES = 24  # on failures.png
@@ -69,6 +71,7 @@ MOST_FAILURES = 24  # on failures.png
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_policies(config)
+    check_controllers(config, options.overrides)
     check_resume(config, options.resume)
     check_writable("--results", options.results)
     Cell(config).close()  # an impossible robot or cache is named here, not by a dying worker
@@ -81,6 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     rows = summarise(outcome.rounds, config.seed)
     print_table(rows)
+    print_stop_reasons(stop_reasons(outcome.rounds))
     print_comparisons(compare(outcome.rounds, config.seed))
     complete = interruption(len(outcome.rounds), config) is None
     for path in filter(None, [run / "results.json", options.results]):
@@ -105,6 +109,19 @@ def check_policies(config: Config) -> None:
     """Raise UserError for a policy that does not exist or a network that cannot be loaded."""
     for name in config.evaluate.policies:
         make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+
+
+def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
+    """Raise UserError for a grasp.controller that evaluate.controllers would leave unheard."""
+    several, one = config.evaluate.controllers, config.grasp.controller
+    asked = any(change.split("=")[0].strip() == "grasp.controller" for change in overrides)
+    if several is not None and (asked or one != OPEN_LOOP):
+        raise UserError(
+            f"grasp.controller={one} would be ignored: evaluate.controllers is "
+            f"[{', '.join(several)}] and says which controllers are scored; write "
+            f"evaluate.controllers={one} or, to have grasp.controller count, "
+            "evaluate.controllers=null"
+        )
 
 
 def workspace_of(config: Config) -> Workspace:

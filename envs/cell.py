@@ -17,6 +17,7 @@ from envs.camera import DEFAULT_LIGHT, Image, Intrinsics, load_renderer, render
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
+from envs.safety import ArmGate
 from envs.scenes import Scene, settle
 from envs.world import SOLVER_RESIDUAL, add_bin, add_table, on_table, set_up_physics
 from utils.config import CameraConfig, Config
@@ -84,7 +85,9 @@ class Cell:
         set_up_physics(self.client, self.config.sim)
         self.table = add_table(self.client)
         self.bin = add_bin(self.client)
-        self.robot = Panda(self.client, self.dt, self._urdf, self.config.robot.grip_force)
+        robot, safety, floor = self.config.robot, self.config.safety, self.config.grasp.floor
+        gate = ArmGate(safety, robot, self.dt, floor)
+        self.robot = Panda(self.client, self.dt, self._urdf, robot.grip_force, gate)
         self.robot.place(self.home)
         self.bodies = [
             spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)

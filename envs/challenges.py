@@ -20,13 +20,15 @@ _STREAM = 7  # keeps these draws apart from the scene's of the same seed
 @dataclass(frozen=True)
 class Challenge:
     """moved: objects are displaced during the approach. speed: m/s of a conveyor. turning: whether
-    it goes round a corner. miscalibrated: whether the cameras' believed poses are off. latency:
-    seconds by which images arrive late. Scenes are laid out as `layout`."""
+    it goes round a corner. crossing: whether it goes through the middle of the workspace, in
+    whatever direction that is, instead of sideways. miscalibrated: whether the cameras' believed
+    poses are off. latency: seconds by which images arrive late. Scenes are laid out as `layout`."""
 
     layout: str
     moved: bool = False
     speed: float = 0.0
     turning: bool = False
+    crossing: bool = False
     miscalibrated: bool = False
     latency: float = 0.0
 
@@ -39,6 +41,8 @@ class Challenge:
         place = cell.object_position(min(cell.remaining))[:2]
         if self.moved:
             return displacement(rng, place, centre, cell.config.workspace.size / 2)
+        if self.crossing:
+            return crossing(rng, place, centre, self.speed)
         if self.speed > 0.0:
             return conveyor(rng, place, centre, self.speed, self.turning)
         return None
@@ -79,6 +83,15 @@ def conveyor(
     return Conveyor(speed, heading, turn_rate)
 
 
+def crossing(
+    rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float
+) -> Conveyor:
+    """Straight towards the middle of the workspace and on, up to 30 degrees askew: from where the
+    object lies that can be towards the robot, away from it, or sideways."""
+    x, y = centre - place
+    return Conveyor(speed, float(np.arctan2(y, x)) + rng.uniform(-np.pi / 6, np.pi / 6))
+
+
 CHALLENGES = {
     "isolated": Challenge("isolated"),
     "packed": Challenge("packed"),
@@ -89,6 +102,7 @@ CHALLENGES = {
     "moving_10cm": Challenge("isolated", speed=0.10),
     "turning_5cm": Challenge("isolated", speed=0.05, turning=True),
     "turning_10cm": Challenge("isolated", speed=0.10, turning=True),
+    "crossing_5cm": Challenge("isolated", speed=0.05, crossing=True),
     "miscalibrated": Challenge("isolated", miscalibrated=True),
     "latency": Challenge("isolated", speed=0.05, latency=0.1),
 }

@@ -21,6 +21,7 @@ from envs.kinematics import (
     inverse_kinematics,
 )
 from envs.panda import MAX_OPENING
+from envs.safety import ArmStoppedError
 from envs.world import BIN_CENTRE, BIN_HEIGHT
 from utils.transforms import Grasp, top_down_pose
 
@@ -36,8 +37,9 @@ class GraspOutcome:
 
     reason: `success`, or how it failed: `ik` (a pose or the line to it cannot be reached),
     `collision` (a contact stopped the approach), `missed` (the fingers closed on nothing),
-    `slipped` (lost before the lift height), `dropped` (lost after it); of a closed loop also `lost`
-    (the object was not seen any more) and `stopped` (by the safety gate, or out of time).
+    `slipped` (lost before the lift height), `dropped` (lost after it), `stopped` (by the gate that
+    every command to the arm passes, or out of time); of a closed loop also `lost` (the object was
+    not seen any more).
     sim_seconds: simulated time from home and back home, at legal joint speeds.
     object_index: the object that was held, if any. detail: a sentence on the failure, if there is
     more to say. palm_stopped_at: metres, height of E where something under the palm stopped the
@@ -58,16 +60,9 @@ class GraspOutcome:
 class GraspFailure(Exception):
     """Ends an attempt early with a reason."""
 
-    def __init__(
-        self,
-        reason: str,
-        object_index: int | None = None,
-        detail: str = "",
-        palm_stopped_at: float | None = None,
-    ):
+    def __init__(self, reason: str, object_index: int | None = None, detail: str = ""):
         super().__init__(detail or reason)
         self.reason, self.object_index, self.detail = reason, object_index, detail
-        self.palm_stopped_at = palm_stopped_at
 
 
 class Around(NamedTuple):
@@ -80,7 +75,7 @@ class Around(NamedTuple):
 
 def open_loop(cell: Cell, grasp: Grasp) -> Around:
     """Bring the open gripper around a grasp as planned, without looking again. Raises
-    GraspFailure on a collision and UnreachableError before anything has moved."""
+    ArmStoppedError on a collision and UnreachableError before anything has moved."""
     settings = cell.config.execution
     pregrasp = grasp.pose.copy()
     pregrasp[2, 3] += settings.pregrasp_height
@@ -90,10 +85,7 @@ def open_loop(cell: Cell, grasp: Grasp) -> Around:
 
     cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
     _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
-    if not _follow(cell, approach, stop_force=settings.contact_stop):
-        height = float(cell.robot.tip_pose()[2, 3])
-        palm = cell.robot.palm_touches()
-        raise GraspFailure("collision", palm_stopped_at=height if palm else None)
+    _follow(cell, approach, stop_force=settings.contact_stop)
     return Around(cell.step, target)
 
 
@@ -111,7 +103,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     approach: how the open gripper gets around the object; the rest is the same for all.
     """
     cell.check_physics()
-    start, detail, palm_stopped_at = cell.seconds, "", None
+    start, detail = cell.seconds, ""
     try:
         index = _pick(cell, grasp, approach)
         _carry_to_bin(cell, index)
@@ -120,11 +112,16 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
         outcome, index = "ik", None
     except GraspFailure as failure:
         outcome, index, detail = failure.reason, failure.object_index, failure.detail
-        palm_stopped_at = failure.palm_stopped_at
+    except ArmStoppedError as stop:
+        outcome, index = "collision" if stop.contact else "stopped", None
+        detail = f"stopped: {stop}"
+    stopped_at = None
+    if outcome == "collision" and cell.robot.palm_touches():
+        stopped_at = float(cell.robot.tip_pose()[2, 3])
     _go_home(cell)
     cell.check_physics()
     cell.retire_lost_objects()
-    return GraspOutcome(outcome, cell.seconds - start, index, detail, palm_stopped_at)
+    return GraspOutcome(outcome, cell.seconds - start, index, detail, stopped_at)
 
 
 def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
@@ -132,7 +129,7 @@ def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
     settings = cell.config.execution
     around = approach(cell, grasp)
     _close(cell, around.wait)
-    cell.robot.command_arm(cell.robot.q, np.zeros(7))  # nothing that it followed is sent any more
+    cell.robot.hold()  # nothing that it followed is sent any more
     index = cell.held_object()
     if index is None:
         raise GraspFailure("missed")
@@ -188,9 +185,13 @@ def _go_home(cell: Cell) -> None:
         up = T.copy()
         up[2, 3] = 0.2
         # Where the line cannot be had, the joint motion below goes up as well, only less straight.
-        with contextlib.suppress(UnreachableError):
+        with contextlib.suppress(UnreachableError, ArmStoppedError):
             _follow(cell, _line(cell, robot.q, up))
-    _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+    try:
+        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+    except ArmStoppedError:  # the way bulges out of the workspace; a straight line does not
+        _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
+        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
 
 
 def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
@@ -225,12 +226,11 @@ def _scales(cell: Cell) -> dict[str, float]:
     }
 
 
-def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> bool:
-    """Run a trajectory; stop where it is and return False at a contact above `stop_force` N."""
+def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> None:
+    """Run a trajectory; raises ArmStoppedError, with the arm held where it is, at a contact above
+    `stop_force` N and where the gate refuses to go on."""
     for q, velocity in zip(trajectory.positions, trajectory.velocities):
         cell.robot.command_arm(q, velocity)
         cell.step()
-        if stop_force is not None and cell.robot.contact_force() > stop_force:
-            cell.robot.command_arm(cell.robot.q, np.zeros(7))
-            return False
-    return True
+        if stop_force is not None:
+            cell.robot.stop_on_contact(stop_force)

@@ -39,7 +39,8 @@ from envs.kinematics import (
     pose_error,
 )
 from envs.panda import MAX_OPENING
-from envs.servoing import ArmStoppedError, GuardedArm, servo_period
+from envs.safety import ArmStoppedError
+from envs.servoing import GuardedArm, servo_period
 from envs.wrist_camera import DepthSight, WristCamera
 from utils.object_motion import PlanarMotion
 from utils.object_tracking import (
@@ -315,15 +316,16 @@ class _Run:
                 raise TargetLostError(f"{error}, for {self.settings.lost_seconds} s") from error
             self._spent = time.perf_counter() - start
             return True
-        self.T_WO = T_WC @ found.T_CO
-        pose = planar_part(self.T_WO)
+        T_WO, believed = T_WC @ found.T_CO, True
+        pose = planar_part(T_WO)
         if self.motion is None:
             self.motion = PlanarMotion(pose, sight.seconds, turns=not self.tracker.round)
         else:
             axes = planar(0, 0, pose[2])[:3, :3]
             covariance = axes @ found.covariance @ axes.T
-            self.motion.see(pose, covariance, sight.seconds)
-        self.found_seconds = sight.seconds
+            believed = self.motion.see(pose, covariance, sight.seconds)
+        if believed:  # a false match shows no more than an image without the object
+            self.T_WO, self.found_seconds = T_WO, sight.seconds
         self._spent = time.perf_counter() - start
         return True
 

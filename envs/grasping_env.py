@@ -75,7 +75,7 @@ class RobotGraspingEnv(gymnasium.Env):
     units of `joint_step` radians. Changes add up on the *commanded* pose, are held within the
     workspace and the joint limits, and are scaled down as a whole where a joint would have to
     exceed its velocity limit. The command stays where it is when the arm cannot reach the new
-    one, or is held up by something on its way.
+    one, is held up by something on its way, or would leave the workspace box (`safety`).
     No joint is faster than the Panda's lowest joint speed limit, 2.175 rad/s, at any physics step;
     the torque limits alone bound its acceleration.
 
@@ -315,7 +315,7 @@ class RobotGraspingEnv(gymnasium.Env):
             goal = self._servo.q + self.settings.joint_step * action[:7]
             goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
             goal, _ = self._within_speed(goal)
-            self._reachable = not self._blocked(goal)
+            self._reachable = self._allowed(goal)
             if self._reachable:
                 self._servo = ServoStep(goal)
         else:
@@ -357,13 +357,17 @@ class RobotGraspingEnv(gymnasium.Env):
             servo = ServoStep(goal)
             error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
             if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
-                self._reachable = not self._blocked(goal)
+                self._reachable = self._allowed(goal)
                 if self._reachable:
                     self._servo, self._T_command = servo, wanted
                 return
             goal, slower = self._within_speed(servo.towards(wanted))
             share *= slower
         self._reachable = False
+
+    def _allowed(self, goal: np.ndarray) -> bool:
+        """Whether a goal (7,) may be commanded: the arm is free, and its gate lets that pass."""
+        return not self._blocked(goal) and self.cell.robot.gate.refusal(goal) is None
 
     def _blocked(self, goal: np.ndarray) -> bool:
         """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""

@@ -31,6 +31,7 @@ from envs.kinematics import (
     rotation_vector,
     time_path,
 )
+from envs.safety import ArmGate, ArmStoppedError, contact_reason
 from utils.files import write_atomic
 
 MAX_OPENING = 0.08  # m between the fingertips
@@ -46,10 +47,11 @@ class Panda:
 
     position_gain, velocity_gain, gripper_gain: factors on the motors' gains. latency: physics steps
     after which a motor command arrives. All are as good as the motors can be unless changed.
+    gate: what every command to the arm passes; no other way leads to its motors.
     """
 
-    def __init__(self, client: int, dt: float, urdf: Path, grip_force: float):
-        self.client, self.dt, self.grip_force = client, dt, grip_force
+    def __init__(self, client: int, dt: float, urdf: Path, grip_force: float, gate: ArmGate):
+        self.client, self.dt, self.grip_force, self.gate = client, dt, grip_force, gate
         self.position_gain = self.velocity_gain = self.gripper_gain = 1.0
         self.latency = 0
         self._clock = 0  # physics steps
@@ -92,7 +94,7 @@ class Panda:
             pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
         self._underway.clear()
         latency, self.latency = self.latency, 0
-        self.command_arm(q, np.zeros(7))
+        self._stay(q)
         self.command_gripper(opening)
         self.latency = latency
 
@@ -114,8 +116,35 @@ class Panda:
         self._clock += count
         return count
 
-    def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
-        """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s."""
+    def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s.
+        Gives the q that was sent: another one where the gate has slowed the arm. Raises
+        ArmStoppedError, the arm being told to stay where it is, where the gate lets nothing pass.
+        """
+        try:
+            q, velocity = self.gate.passed(q, velocity)
+        except ArmStoppedError:
+            self.hold()
+            raise
+        self._send_arm(q, velocity)
+        return q
+
+    def hold(self) -> None:
+        """Tell the arm to stay where it is, which is allowed everywhere."""
+        self._stay(self.q)
+
+    def stop_on_contact(self, limit: float) -> None:
+        """Hold the arm and raise ArmStoppedError if more than `limit` newtons press against it."""
+        reason = contact_reason(self.contact_force(), limit)
+        if reason is not None:
+            self.hold()
+            raise ArmStoppedError(reason, contact=True)
+
+    def _stay(self, q: np.ndarray) -> None:
+        self.gate.restart(q)
+        self._send_arm(q, np.zeros(7))
+
+    def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         self._send(
             pybullet.setJointMotorControlArray, self.body, ARM, pybullet.POSITION_CONTROL,
             targetPositions=q, targetVelocities=velocity, forces=JOINT_TORQUE,
@@ -126,8 +155,10 @@ class Panda:
 
     def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
         """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
-        nor than `speed` rad/s."""
-        speeds = [min(limit, speed) for limit in _SPEEDS]
+        nor than `speed` rad/s. Raises ArmStoppedError, and sends nothing, where the gate refuses
+        q."""
+        self.gate.admit(q)
+        speeds = [min(limit, speed) for limit in self.gate.speeds]
         self._send(self._drive, q.tolist(), speeds, self.position_gain * _DRIVE_GAIN)
 
     def _drive(self, q: list[float], speeds: list[float], gain: float) -> None:
@@ -278,7 +309,7 @@ class Panda:
 
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
 _POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
-_TORQUES, _SPEEDS = JOINT_TORQUE.tolist(), JOINT_VELOCITY.tolist()
+_TORQUES = JOINT_TORQUE.tolist()
 _GRIP_COSINE = np.cos(np.radians(70))
 _STATE_JOINTS = [*ARM, *FINGERS]
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis

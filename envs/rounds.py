@@ -75,7 +75,9 @@ def run_round(
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
-                approach = ClosedLoop(cell, controller, seen, beliefs, taught, challenge.latency)
+                # What is worked out of an image late is what a late image would have been worth.
+                late = challenge.latency + cell.config.grasp.compute_seconds
+                approach = ClosedLoop(cell, controller, seen, beliefs, taught, late)
             with disturbed(cell, challenge.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
             on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
@@ -86,8 +88,8 @@ def run_round(
                     plan_seconds,
                     outcome.sim_seconds,
                     on_image,
-                    _turn_ms(approach),
-                    outcome.detail,
+                    detail=outcome.detail,
+                    **_turn_ms(approach),
                 )  # fmt: skip
             )
             failed = [] if outcome.success else [*failed, grasp]
@@ -118,9 +120,15 @@ def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
         return replace(beliefs, levelled=False).frame(frame, mount, T_WE)
 
 
-def _turn_ms(approach: Approach) -> float | None:
+def _turn_ms(approach: Approach) -> dict[str, float]:
+    """Fields of an AttemptRecord on the turns of a closed loop that has made any."""
     turns = approach.record.turn_seconds if isinstance(approach, ClosedLoop) else []
-    return 1000 * float(np.percentile(turns, 95)) if turns else None
+    if not turns:
+        return {}
+    return {
+        "turn_ms": 1000 * float(np.percentile(turns, 95)),
+        "turn_ms_mean": 1000 * float(np.mean(turns)),
+    }
 
 
 def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:

@@ -19,7 +19,7 @@ from envs.camera import Intrinsics
 from envs.cell import Cell, wrist_mount
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.panda import ARM
-from envs.safety import SafetyGate
+from envs.safety import ArmStoppedError, SafetyGate
 from envs.servo_target import Board
 from utils.config import SafetyConfig, ServoConfig
 from utils.errors import unknown_choice
@@ -130,16 +130,8 @@ class CarriedBoard:
         return sum(contact[9] for contact in contacts)
 
 
-class ArmStoppedError(ServoError):
-    """The safety gate stopped the arm. contact: because something presses against it."""
-
-    def __init__(self, reason: str, contact: bool = False):
-        super().__init__(reason)
-        self.contact = contact
-
-
 class GuardedArm:
-    """The arm behind the gate: the only way in which a servo's velocities get to the motors."""
+    """The arm behind the servo's gate: the only way for a servo's velocities to the arm's own."""
 
     def __init__(
         self,
@@ -154,7 +146,7 @@ class GuardedArm:
             guarded = np.vstack([guarded, carried.corners_E])
         safety = safety or cell.config.safety
         self.gate = SafetyGate(safety, cell.config.robot, cell.dt, guarded)
-        self._reference = cell.robot.q
+        self._reference, self._velocity = cell.robot.q, np.zeros(7)  # as sent last
 
     def move(self, wish: np.ndarray, perception_age: float) -> None:
         """Send what may be sent of joint velocities (7,), rad/s, and do one physics step.
@@ -166,14 +158,15 @@ class GuardedArm:
         force = self.robot.contact_force()
         if self.carried is not None:
             force += self.carried.contact_force()
-        verdict = self.gate.check(wish, q, force, perception_age)
+        verdict = self.gate.check(wish, q, force, perception_age, self._velocity)
         if verdict.reason is not None:
             self._hold()
             raise ArmStoppedError(verdict.reason, verdict.contact)
+        self._velocity = verdict.velocity
         ahead = self._reference + verdict.velocity * self.cell.dt
         # An arm that something holds back must not store up a way to jump when it is let go.
-        self._reference = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
-        self.robot.command_arm(self._reference, verdict.velocity)
+        ahead = np.clip(ahead, q - _MAX_LAG, q + _MAX_LAG)
+        self._reference = self.robot.command_arm(ahead, verdict.velocity)
         self.cell.step()
 
     def wait(self) -> None:
@@ -187,8 +180,8 @@ class GuardedArm:
         self.cell.step(round(_REST_SECONDS / self.cell.dt))
 
     def _hold(self) -> None:
-        self._reference = self.robot.q
-        self.robot.command_arm(self._reference, np.zeros(7))
+        self._reference, self._velocity = self.robot.q, np.zeros(7)
+        self.robot.hold()
 
 
 def servo_arm(

@@ -1,4 +1,5 @@
-"""The depth camera in the hand as a closed loop reads it: images with their times, perhaps late.
+"""The depth camera in the hand as a closed loop reads it: images with their times, perhaps late,
+and as noisy as `camera.depth_noise` has the cell's cameras.
 
 Knows neither what is looked for in the images nor where anybody believes the camera to be.
 """
@@ -12,6 +13,9 @@ import numpy as np
 
 from envs.camera import Intrinsics
 from envs.cell import Cell
+from utils.depth_noise import KinectNoise
+
+_NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
 
 
 class DepthSight(NamedTuple):
@@ -23,7 +27,11 @@ class DepthSight(NamedTuple):
 
 
 class WristCamera:
-    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken."""
+    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken.
+
+    The noise is a function of the scene's seed, the number of frames planned on so far, and that of
+    the image: every controller meets the same.
+    """
 
     def __init__(self, cell: Cell, latency: float = 0.0):
         camera, grasp = cell.config.camera, cell.config.grasp
@@ -32,12 +40,18 @@ class WristCamera:
             grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
         )
         self._coming: deque[DepthSight] = deque()
+        self._noise = None
+        if camera.depth_noise == "kinect":
+            self._noise = KinectNoise(image_focal=float(self.intrinsics.K[0, 0]))
+            self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
 
     def __call__(self) -> DepthSight | None:
         """Take an image now; the newest that has arrived by now, or None."""
         cell = self.cell
-        image = cell.look(self.intrinsics, cell.camera_pose("wrist"))
-        self._coming.append(DepthSight(image.depth, cell.robot.q, cell.seconds))
+        depth = cell.look(self.intrinsics, cell.camera_pose("wrist")).depth
+        if self._noise is not None:
+            depth = self._noise(depth, self._rng)
+        self._coming.append(DepthSight(depth, cell.robot.q, cell.seconds))
         arrived = None
         while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:
             arrived = self._coming.popleft()

@@ -146,6 +146,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["robot.home=[9,0,0,-2,0,1.5,0]"], "robot.home"),
         (["workspace.center=[7,7]"], "workspace"),
         (["cache_dir=/dev/null/x"], "cache_dir"),
+        (
+            ["evaluate.controllers=[open_loop,ibvs]", "grasp.controller=pbvs"],
+            "grasp.controller=pbvs would be ignored: evaluate.controllers is [open_loop, ibvs]",
+        ),
+        (["evaluate.controllers=ibvs", "grasp.controller=open_loop"], "would be ignored"),
     ],
 )
 def test_bad_input_is_one_clear_line(arguments, message, tmp_path):

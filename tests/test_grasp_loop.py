@@ -12,11 +12,11 @@ import pytest
 from envs import grasp_loop
 from envs.beliefs import level, off, teach, true_beliefs, wrong_beliefs
 from envs.cell import Cell, wrist_mount
-from envs.challenges import CHALLENGES
+from envs.challenges import CHALLENGES, crossing
 from envs.disturbances import Conveyor, Displacement, disturbed
 from envs.execution import execute_grasp
 from envs.grasp_loop import ClosedLoop
-from envs.kinematics import inverse_kinematics
+from envs.kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.wrist_camera import WristCamera
@@ -124,6 +124,18 @@ def test_a_camera_that_freezes_later_stops_the_arm(cell, scene, stage):
     assert approach.record.stage == stage
 
 
+def test_a_frozen_camera_stops_the_arm_whose_camera_is_tilted(cell, scene):
+    """Two degrees and a centimetre off: the loop is fed wrong poses, and then none."""
+    cell.load(scene)
+    beliefs = wrong_beliefs(cell, np.random.default_rng(1), 0.01, np.radians(2))
+    frame = beliefs.frame(cell.frame(), "overhead", np.eye(4))
+    camera = frozen_after(WristCamera(cell), 20)
+    approach = ClosedLoop(cell, "ibvs", frame, beliefs, teach(cell), camera=camera)
+    outcome = execute_grasp(cell, grasp_of_box(cell), approach)
+    assert outcome.reason == "stopped" and "the watchdog allows 100 ms" in outcome.detail
+    assert approach.record.stage in ("far", "near")
+
+
 def test_images_that_come_late_stop_the_arm(cell, scene):
     cell.load(scene)
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs", latency=0.1))
@@ -205,6 +217,20 @@ def test_a_displacement_ends_where_it_says(cell, scene):
     R = after[:3, :3] @ before[:3, :3].T
     assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(0.5, abs=0.01)
     assert cell.before_step is None
+
+
+PLACES = [(0.6, 0.1), (0.4, -0.1), (0.5, 0.14), (0.36, 0.02)]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_crossing_goes_through_the_middle(place):
+    for seed in range(20):
+        path = crossing(np.random.default_rng(seed), np.array(place), np.array([0.5, 0.0]), 0.05)
+        way = np.subtract(path(10.0)[:2], path(0.2)[:2])
+        towards = np.subtract((0.5, 0.0), place)
+        assert np.linalg.norm(way) == pytest.approx(0.49)
+        cosine = way @ towards / np.linalg.norm(way) / np.linalg.norm(towards)
+        assert np.degrees(np.arccos(cosine)) <= 30 + 1e-6
 
 
 @pytest.mark.parametrize("turn_rate", [0.0, 0.4])
@@ -292,3 +318,53 @@ def test_the_object_is_found_by_the_real_camera(cell, scene):
     )
     assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
     assert abs(np.degrees((turn + np.pi / 2) % np.pi - np.pi / 2)) < 4
+
+
+def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
+    """A law that wishes for nothing: what is left is the velocity of the object's point below the
+    hand, v + omega x r by hand, and the goal's sinking. Ahead of the object, not behind it."""
+    cell.load(scene)
+    run = grasp_loop._Run(loop(cell, "pbvs"), grasp_loop.GuardedArm(cell), grasp_of_box(cell))
+    x, y = run.motion.state[:2]
+    run.motion.state[3:] = [0.04, -0.03, 0.3]
+    q = cell.robot.q
+    T_WE, J = forward_kinematics(q), geometric_jacobian(q)
+
+    class NoWish:
+        def compute_joint_velocities(self, *args):
+            return np.zeros(7)
+
+    twist = J @ run._joint_wish(q, T_WE, np.zeros(6), NoWish(), 0.05)
+    rx, ry = T_WE[:2, 3] - (x, y)
+    expected = [0.04 - 0.3 * ry, -0.03 + 0.3 * rx, -0.05, 0, 0, 0.3]
+    np.testing.assert_allclose(twist, expected, atol=4e-3)
+
+
+def test_the_wrist_cameras_noise_is_the_configs_and_of_the_scene(cell, scene, monkeypatch):
+    cell.load(scene)
+    clean = WristCamera(cell)().depth
+    noisy = load_config(None, ["sim.renderer=tiny", "camera.depth_noise=kinect"])
+    monkeypatch.setattr(cell, "config", noisy)
+    first, again = WristCamera(cell)().depth, WristCamera(cell)().depth
+    np.testing.assert_array_equal(first, again)
+    camera = WristCamera(cell)
+    assert (camera().depth != camera().depth).any(), "each image has noise of its own"
+    known = (first > 0) & (clean > 0)
+    error = np.abs(first - clean)[known]
+    # From 0.5 m: 0.5^2 m^2 / (480 px x 0.075 m) x 1/8 px is 0.9 mm a step of disparity.
+    assert 1e-4 < np.median(error) < 1.5e-3
+    assert 0.5 < known.mean() < 1.0, "with holes, at the edges of things"
+
+
+def test_computing_takes_its_time(cell, scene, monkeypatch):
+    """The time to work out a velocity counts as an image's age: too much and the arm stops."""
+    monkeypatch.setattr(cell, "config", slow := load_config(
+        None, ["sim.renderer=tiny", "grasp.compute_seconds=0.1"]
+    ))  # fmt: skip
+    assert slow.safety.watchdog == 0.1
+    record = run_round(
+        cell, scene, lambda frame: [grasp_of_box(cell)], policy="exact", objects="box",
+        max_failures=1, controller="ibvs",
+    )  # fmt: skip
+    assert record.attempts[0].reason == "stopped"
+    assert "the watchdog allows 100 ms" in record.attempts[0].detail

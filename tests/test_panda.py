@@ -26,6 +26,7 @@ from envs.kinematics import (
     time_path,
 )
 from envs.panda import ARM, FINGERS, MAX_OPENING, Panda, panda_urdf
+from envs.safety import ArmGate
 from envs.world import set_up_physics
 from utils.transforms import top_down_pose
 
@@ -38,7 +39,9 @@ def robot(config):
     client = pybullet.connect(pybullet.DIRECT)
     set_up_physics(client, config.sim)
     urdf = panda_urdf(config.cache_folder, fine=False)
-    robot = Panda(client, 1 / config.sim.frequency, urdf, config.robot.grip_force)
+    dt = 1 / config.sim.frequency
+    gate = ArmGate(config.safety, config.robot, dt, config.grasp.floor)
+    robot = Panda(client, dt, urdf, config.robot.grip_force, gate)
     robot.place(HOME)
     yield robot
     pybullet.disconnect(physicsClientId=client)

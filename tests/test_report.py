@@ -31,7 +31,12 @@ from utils.results import (
     write_results,
 )
 from utils.runs import environment, git_state, new_run_folder
+from utils.stop_reasons import print_stop_reasons, stop_reasons
 from utils.transforms import ImageGrasp
+
+
+def stopped(reason: str, detail: str) -> AttemptRecord:
+    return AttemptRecord(False, reason, 0.01, 5.0, turn_ms=14.0, detail=detail, turn_ms_mean=8.0)
 
 
 def attempt(reason: str, plan: float = 0.01, sim: float = 5.0) -> AttemptRecord:
@@ -172,7 +177,8 @@ def test_results_json_is_strict_and_complete(tmp_path):
     fields = """policy scenario objects seed rounds attempts successes objects_total
         objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
         sim_seconds_per_pick picks_per_hour"""
-    assert set(content["rows"][0]) == {*fields.split(), "failures", "controller", "turn_ms_p95"}
+    loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
+    assert set(content["rows"][0]) == {*fields.split(), "failures"} | loops
     assert content["rows"][1]["picks_per_hour"] is None
     bad = replace(rows[0], plan_ms_median=math.nan)
     before = path.read_bytes()
@@ -327,3 +333,42 @@ def test_json_refuses_nan(tmp_path):
     with pytest.raises(ValueError):
         write_json_atomic(tmp_path / "x.json", {"a": math.inf})
     assert list(tmp_path.iterdir()) == []
+
+
+OLD = "stopped: what was seen last is {} ms old, the watchdog allows 100 ms"
+STOPS = [
+    a_round("heuristic+ibvs", 7, 1, 0, [stopped("stopped", OLD.format(104))]),
+    a_round("heuristic+ibvs", 8, 1, 0, [stopped("collision", "stopped: contact with 12.0 N")]),
+    a_round("heuristic+ibvs", 9, 1, 0, [stopped("stopped", OLD.format(108))]),
+]
+
+
+def test_what_stopped_the_arm_is_told_and_counted(capsys, tmp_path):
+    assert stop_reasons(ROUNDS) == []
+    stops = stop_reasons([*ROUNDS, *STOPS])
+    assert [(s.count, s.reason, s.sentence, s.seed) for s in stops] == [
+        (2, "stopped", OLD.format(104), 7),
+        (1, "collision", "stopped: contact with 12.0 N", 8),
+    ]
+    print_stop_reasons(stops)
+    assert (
+        f"   2 x heuristic+ibvs, pile, box: {OLD.format(104)} (scene 7)" in capsys.readouterr().out
+    )
+    print_stop_reasons([])
+    assert capsys.readouterr().out == ""
+
+    def page(rounds):
+        write_report(tmp_path / "r.html", summarise(rounds, 0), rounds, load_config(None))
+        return (tmp_path / "r.html").read_text()
+
+    told = page([*ROUNDS, *STOPS])
+    assert "What stopped the arm" in told and OLD.format(104) in told and "8.0, 14.0" in told
+    untold = page(ROUNDS)
+    assert "What stopped the arm" not in untold and "turn, ms" not in untold
+
+
+def test_a_loops_turns_are_told_where_there_are_any():
+    table = format_table(summarise([*ROUNDS, *STOPS], 0)).splitlines()
+    assert "turn ms, 95 %" in table[0]
+    assert "8.0, 14.0" in table[-1] and "8.0" not in table[2]
+    assert "turn ms" not in format_table(summarise(ROUNDS, 0))

@@ -70,6 +70,29 @@ def test_joint_speeds_are_scaled_together():
     np.testing.assert_allclose(passed(wish, "robot.velocity_scale=0.1"), wish / 2)
 
 
+def test_the_arm_speeds_up_and_slows_down_within_the_acceleration_limits():
+    wish = np.array([0.2, -0.1, 0, 0.2, 0, 0, 0.05])
+    # In 1/240 s joints 1, 2 and 4 may change by 15, 7.5 and 12.5 rad/s^2 times that, which are
+    # shares of 0.3125, 0.3125 and 0.2604 of this wish: the last one is everybody's.
+    share = 12.5 / 240 / 0.2
+    speed_up = gate().check(wish, HOME, 0.0, 0.0, np.zeros(7)).velocity
+    np.testing.assert_allclose(speed_up, share * wish, rtol=1e-9)
+    slow_down = gate().check(np.zeros(7), HOME, 0.0, 0.0, wish).velocity
+    np.testing.assert_allclose(slow_down, (1 - share) * wish, rtol=1e-9)
+    near = wish + 0.01
+    np.testing.assert_allclose(gate().check(near, HOME, 0.0, 0.0, wish).velocity, near)
+    half = gate("robot.acceleration_scale=0.5").check(wish, HOME, 0.0, 0.0, np.zeros(7)).velocity
+    np.testing.assert_allclose(half, share / 2 * wish, rtol=1e-9)
+
+
+def test_a_wish_to_come_back_is_no_reason_to_stop():
+    q = HOME.copy()
+    q[6] = JOINT_UPPER[6] - 0.02  # at the limit, and still going there
+    verdict = gate().check(joint(7, -0.5), q, 0.0, 0.0, joint(7, 0.5))
+    assert verdict.reason is None
+    np.testing.assert_array_equal(verdict.velocity, joint(7, -0.5))
+
+
 def test_linear_speed_of_the_fingertips():
     # Turning about the base, E goes round a circle: 0.25 m/s are 0.25 / r rad/s.
     np.testing.assert_allclose(passed(joint(1, 0.9)), joint(1, 0.25 / RADIUS), rtol=1e-5)

@@ -46,7 +46,7 @@ ObjectSet = Annotated[
 Scenario = Literal["isolated", "packed", "pile"]
 ScoredScenario = Literal[
     "isolated", "packed", "pile", "static", "moved", "moving_5cm", "moving_10cm", "turning_5cm",
-    "turning_10cm", "miscalibrated", "latency",
+    "turning_10cm", "crossing_5cm", "miscalibrated", "latency",
 ]  # fmt: skip
 Controller = Literal["open_loop", "pbvs", "ibvs", "hybrid"]
 Mount = Literal["overhead", "wrist"]
@@ -170,6 +170,7 @@ class GraspConfig(Section):
     aligned_distance: Positive
     aligned_angle: Positive
     floor: Annotated[float, Field(ge=0)]
+    compute_seconds: Annotated[float, Field(ge=0)]
     lost_seconds: Positive
     blind_seconds: Positive
     seconds: Positive

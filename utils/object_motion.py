@@ -2,8 +2,9 @@
 
 An extended Kalman filter with the model of constant speed and turning rate (Bar-Shalom, Li and
 Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, chapter 11): the
-velocity turns as the body turns, as on a belt that goes round a corner. A sighting that the model
-cannot explain, because the thing was pushed, makes the filter forget its velocities.
+velocity turns as the body turns, as on a belt that goes round a corner. One sighting that the model
+cannot explain is a false match and moves nothing; a second one after it, near the first, tells that
+the thing was pushed, and makes the filter forget its velocities.
 
 State: x, y (m), turn (rad) and their rates vx, vy (m/s), omega (rad/s). Knows no camera.
 """
@@ -18,6 +19,9 @@ _ACCELERATION = 0.03  # m/s^2 by root hertz: how fast velocities wander unless s
 _ANGULAR_ACCELERATION = 0.06  # rad/s^2 by root hertz
 _FIRST_RATES = (0.15, 0.15, 0.5)  # m/s, m/s, rad/s: what a first sighting leaves open
 _SURPRISE = 16.0  # squared Mahalanobis distance of 3 numbers; chance gives more once in 900 times
+# Two surprises in a row are one push where they are no farther apart than this: 8 cm and 45 degrees
+# within 0.4 s, smoothly, are up to 0.4 m/s and 3.7 rad/s.
+_PUSH_SPEED, _PUSH_TURN = 0.8, 8.0  # m/s, rad/s
 
 
 class PlanarMotion:
@@ -32,6 +36,7 @@ class PlanarMotion:
         rates = self._rates
         self.covariance = np.diag(np.concatenate([[0.003, 0.003, 0.05], rates]) ** 2)
         self.seconds = seconds
+        self._surprise: tuple[np.ndarray, float] | None = None  # the last sighting, if it was one
 
     @property
     def velocity(self) -> np.ndarray:
@@ -47,17 +52,21 @@ class PlanarMotion:
         (x0, y0, a0), (x1, y1, a1) = self.at(start)[:3], self.at(end)[:3]
         return planar(x1, y1, a1) @ np.linalg.inv(planar(x0, y0, a0))
 
-    def see(self, pose: tuple[float, float, float], covariance: np.ndarray, seconds: float) -> None:
-        """Take in a sighting of x, y and turn with a covariance (3, 3) in W's axes."""
+    def see(self, pose: tuple[float, float, float], covariance: np.ndarray, seconds: float) -> bool:
+        """Take in a sighting of x, y and turn with a covariance (3, 3) in W's axes; False where it
+        is not believed, and the thing is taken to have gone on as before."""
         dt = seconds - self.seconds
         F = _transition(self.state, dt)
         self.state = _advance(self.state, dt)
         self.covariance = F @ self.covariance @ F.T + _noise(dt, self._turns)
         self.seconds = seconds
-        innovation = np.asarray(pose) - self.state[:3]
-        innovation[2] = (innovation[2] + np.pi) % (2 * np.pi) - np.pi
+        innovation = _difference(np.asarray(pose), self.state[:3])
         S = self.covariance[:3, :3] + covariance
+        before, self._surprise = self._surprise, None
         if innovation @ np.linalg.solve(S, innovation) > _SURPRISE:
+            self._surprise = np.asarray(pose), seconds
+            if before is None or not _near(before, self._surprise):
+                return False
             forget = np.diag(np.concatenate([[0.02, 0.02, 0.2], self._rates]) ** 2)
             self.covariance = self.covariance + forget
             S = self.covariance[:3, :3] + covariance
@@ -65,6 +74,21 @@ class PlanarMotion:
         self.state = self.state + gain @ innovation
         self.covariance = self.covariance - gain @ self.covariance[:3]
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
+        return True
+
+
+def _difference(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(3,) from `other` to `pose`, the turn the shorter way round."""
+    difference = pose - other
+    difference[2] = (difference[2] + np.pi) % (2 * np.pi) - np.pi
+    return difference
+
+
+def _near(first: tuple[np.ndarray, float], second: tuple[np.ndarray, float]) -> bool:
+    """Whether a push can have taken a thing from one sighting, pose and seconds, to the next."""
+    x, y, turn = _difference(second[0], first[0])
+    dt = second[1] - first[1]
+    return bool(np.hypot(x, y) < _PUSH_SPEED * dt and abs(turn) < _PUSH_TURN * dt)
 
 
 def _advance(state: np.ndarray, dt: float) -> np.ndarray:

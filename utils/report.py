@@ -31,9 +31,11 @@ from utils.results import (
     contestant,
     failures_in_words,
     interruption,
+    turn_ms_in_words,
 )
 from utils.runs import git_state
 from utils.statistics import Difference
+from utils.stop_reasons import stop_reasons
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 PRIVILEGED = ("oracle",)  # policies that see the true scene: a bound, not a headline
@@ -79,6 +81,9 @@ def write_report(
         few_rounds=FEW_ROUNDS,
         labels={SUCCESS: "success", **FAILURES},
         failures_in_words=failures_in_words,
+        stops=stop_reasons(rounds),
+        turns_known=any(row.turn_ms_p95 is not None for row in rows),
+        turn_ms_in_words=turn_ms_in_words,
         rows=rows,
         totals={"rounds": len(rounds), "grasps": sum(row.attempts for row in rows)},
         interruption=interruption(len(rounds), config),

@@ -58,8 +58,9 @@ class AttemptRecord:
 
     reason: "success" or a key of FAILURES; a "no_plan" is a failure but not an executed grasp.
     plan_seconds: wall-clock time of the planner. sim_seconds: simulated time of the execution.
-    grasp: where it was on the image, for pictures. turn_ms: 95th percentile of the wall-clock time
-    of a closed loop's turns, rendering left out. detail: a sentence on a failure.
+    grasp: where it was on the image, for pictures. turn_ms, turn_ms_mean: 95th percentile and mean
+    of the wall-clock time of a closed loop's turns, rendering left out. detail: a sentence on a
+    failure.
     """
 
     success: bool
@@ -69,6 +70,7 @@ class AttemptRecord:
     grasp: ImageGrasp | None = None
     turn_ms: float | None = None
     detail: str = ""
+    turn_ms_mean: float | None = None
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -126,7 +128,8 @@ class Row:
     attempts: executed grasps. Intervals: Wilson, 95 %, each attempt (object) taken as independent.
     plan_ms_median: over every call of the planner, those that found nothing included.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
-    turn_ms_p95: 95th percentile of a closed loop's turns, the median of all attempts.
+    turn_ms_mean, turn_ms_p95: mean and 95th percentile of a closed loop's turns, the median of all
+    attempts.
     """
 
     policy: str
@@ -148,6 +151,7 @@ class Row:
     failures: dict[str, int]
     controller: str = OPEN_LOOP
     turn_ms_p95: float | None = None
+    turn_ms_mean: float | None = None
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -168,6 +172,7 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
     turns = [call.turn_ms for call in calls if call.turn_ms is not None]
+    means = [call.turn_ms_mean for call in calls if call.turn_ms_mean is not None]
     return Row(
         *key,
         seed=seed,
@@ -186,6 +191,7 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
         failures={reason: reasons[reason] for reason in FAILURES},
         controller=rounds[0].controller,
         turn_ms_p95=median(turns) if turns else None,
+        turn_ms_mean=median(means) if means else None,
     )
 
 
@@ -349,8 +355,12 @@ def print_table(rows: Sequence[Row]) -> None:
 
 def format_table(rows: Sequence[Row]) -> str:
     """The rows as aligned plain text."""
-    header = ("policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed")
-    return _aligned(header, [_cells(row) for row in rows], to_the_right=(5, 6))
+    header = ["policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed"]
+    lines = [list(_cells(row)) for row in rows]
+    if any(row.turn_ms_p95 is not None for row in rows):  # of a closed loop
+        for line, cell in zip([header, *lines], ["turn ms, 95 %", *map(turn_ms_in_words, rows)]):
+            line.insert(-1, cell)
+    return _aligned(header, lines, to_the_right=(5, 6))
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
@@ -410,3 +420,9 @@ def failures_in_words(row: Row) -> str:
     """'3 missed, 1 slipped', most frequent first; 'none' without a failure."""
     counts = sorted(row.failures.items(), key=lambda item: -item[1])
     return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"
+
+
+def turn_ms_in_words(row: Row) -> str:
+    """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' of an open loop."""
+    known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
+    return ", ".join(f"{ms:.1f}" for ms in known) or "-"

@@ -1,0 +1,20 @@
+"""The benchmark of the tracking runs, and counts what it has tried."""
+
+from __future__ import annotations
+
+import json
+
+from benchmarks.bench_tracking import HEIGHTS, OBJECT_SETS, main
+
+
+def test_a_quick_run_counts_every_sighting(tmp_path):
+    path = tmp_path / "tracking.json"
+    main(["--quick", "--json", str(path), "sim.renderer=tiny"])
+    metrics = json.loads(path.read_text())
+    for objects in OBJECT_SETS:
+        for height in HEIGHTS:
+            name = f"{objects}_{round(100 * height)}cm"
+            tried, found = (metrics[f"{name}_{what}"]["value"] for what in ("tried", "found"))
+            assert 0 < found <= tried <= 2, "two scenes, one sighting each"
+            # The tracker's alignment is the tested part; here only that the truth is the truth.
+            assert metrics[f"{name}_place_p50"]["value"] < 10.0, "mm, of up to 21 mm moved"

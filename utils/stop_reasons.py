@@ -1,0 +1,57 @@
+"""Why attempts were stopped: the cell's sentences on it, those alike counted together.
+
+Reads the records of `utils.results`; what stops the arm is for `envs.safety` and the loops to say.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from utils.results import RoundRecord
+
+_NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
+
+
+@dataclass(frozen=True)
+class StopReason:
+    """count: attempts that one policy ended so on a scenario and object set. reason: a key of
+    `utils.results.FAILURES`. sentence: the first attempt's; the others differ in their numbers
+    only. seed: of that attempt's scene."""
+
+    policy: str
+    scenario: str
+    objects: str
+    reason: str
+    count: int
+    sentence: str
+    seed: int
+
+
+def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
+    """Every failure on which there is a sentence, in the order of the rounds, the most frequent
+    kinds of a cell first."""
+    kinds: dict[tuple[str, str, str], dict[tuple[str, str], list[tuple[str, int]]]] = {}
+    for record in rounds:
+        cell = kinds.setdefault((record.policy, record.scenario, record.objects), {})
+        for attempt in record.attempts:
+            if attempt.detail:
+                kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
+                cell.setdefault(kind, []).append((attempt.detail, record.seed))
+    return [
+        StopReason(*where, reason, len(told), *told[0])
+        for where, cell in kinds.items()
+        for (reason, _), told in sorted(cell.items(), key=lambda item: -len(item[1]))
+    ]
+
+
+def print_stop_reasons(stops: Iterable[StopReason]) -> None:
+    """One line each on stdout; nothing if there are none."""
+    lines = [
+        f"{stop.count:4d} x {stop.policy}, {stop.scenario}, {stop.objects}: {stop.sentence} "
+        f"(scene {stop.seed})"
+        for stop in stops
+    ]
+    if lines:
+        print("\n".join(["\nwhat stopped the arm", *lines]))
