@@ -4,6 +4,7 @@
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
     python evaluate.py --config configs/servo.yaml     # closed loops on what moves
+    python evaluate.py world=mujoco                    # in another simulator
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
 runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
@@ -32,13 +33,14 @@ import cv2
 import imageio.v3 as iio
 from tqdm import tqdm
 
-from envs.cell import Cell
+from envs.base_cell import BaseCell
 from envs.challenges import CHALLENGES
 from envs.execution import GraspOutcome
 from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
+from envs.worlds import make_cell
 from models.planners import make_planner
 from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
 from utils.errors import UserError
@@ -71,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_policies(config)
     check_resume(config, options.resume)
     check_writable("--results", options.results)
-    Cell(config).close()  # an impossible robot or cache is named here, not by a dying worker
+    make_cell(config).close()  # what cannot be had is named here, not by a dying worker
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     device = f"{platform.machine()} CPU, {worker_count(config)} workers"
@@ -157,7 +159,7 @@ def announce(config: Config, run: Path, device: str) -> None:
         f"{', '.join(contestant(*pair) for pair in contestants(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, on {device}; results in {run}",
+        f"seed {config.seed}, in {config.world}, on {device}; results in {run}",
         flush=True,
     )
 
@@ -307,14 +309,14 @@ def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
 
 
 _worker_config: Config
-_worker_cell: Cell
+_worker_cell: BaseCell
 
 
 def _start_worker(config: Config) -> None:
     global _worker_config, _worker_cell
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     cv2.setNumThreads(1)  # as with OMP_NUM_THREADS
-    _worker_config, _worker_cell = config, Cell(config)
+    _worker_config, _worker_cell = config, make_cell(config)
 
 
 def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[Path, str]]]:

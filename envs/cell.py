@@ -27,6 +27,7 @@ from envs.panda import Panda, panda_urdf
 from envs.scenes import Scene, settle
 from envs.world import SOLVER_RESIDUAL, add_bin, add_table, set_up_physics
 from utils.config import Config
+from utils.errors import UserError
 from utils.random_view import RandomView
 
 __all__ = [
@@ -49,6 +50,11 @@ class Cell(BaseCell):
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
         super().__init__(config)
+        if config.world != "pybullet":
+            raise UserError(
+                f"world={config.world}: only evaluate.py can score policies there; leave it out, "
+                "or set world=pybullet"
+            )
         self.fine = fine
         self.on_step: Callable[[Cell], None] | None = None
         self.before_step: Callable[[Cell], None] | None = None

@@ -189,6 +189,7 @@ class EvaluateConfig(Section):
     scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(_no_repeats)]
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
     rounds: Count
+    randomise: bool
     workers: Count | None
     max_failures: Count
     videos: Annotated[int, Field(ge=0)]
@@ -457,6 +458,7 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
+    world: Literal["pybullet", "mujoco"]
     sim: SimConfig
     robot: RobotConfig
     camera: CameraConfig
