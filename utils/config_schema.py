@@ -198,6 +198,32 @@ class EvaluateConfig(Section):
     name: Name | None
 
 
+TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell"]
+
+
+class TransferPolicy(NamedTuple):
+    """A row of the transfer report. policy, training: what the reader is told. planner: as in
+    evaluate.policies. train_with: the command that makes the planner's file."""
+
+    policy: str
+    training: str
+    planner: str
+    train_with: str | None
+
+
+TransferRow = Annotated[
+    tuple[Name, Name, Name, Name | None],
+    Field(strict=False, description="a list of policy, training, planner, command or null"),
+    AfterValidator(lambda values: TransferPolicy(*values)),
+]
+
+
+class TransferConfig(Section):
+    policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(_no_repeats)] | None
+    worlds: Annotated[tuple[TransferWorld, ...], Several, AfterValidator(_no_repeats)]
+    cornell: Annotated[Path, Field(strict=False)] | None
+
+
 class DataConfig(Section):
     kind: Literal["simulated", "cornell", "jacquard"]
     root: Annotated[Path, Field(strict=False)] | None
@@ -210,6 +236,7 @@ class DataConfig(Section):
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
     max_objects: Annotated[int, Field(ge=2, le=12)]
     randomise: bool
+    randomise_physics: bool
     executed_share: Annotated[float, Field(ge=0, le=1)]
     workers: Count | None
 
@@ -443,6 +470,7 @@ class AdaptiveConfig(Section):
 
 
 class RandomizationConfig(Section):
+    parts: Annotated[tuple[Literal["physics", "vision"], ...], Several, AfterValidator(_no_repeats)]
     physics: PhysicsRangesConfig
     vision: VisionRangesConfig
     colour_share: Fraction
@@ -451,6 +479,12 @@ class RandomizationConfig(Section):
     shadow_share: Fraction
     depth_noise_share: Fraction
     adaptive: AdaptiveConfig
+
+    @model_validator(mode="after")
+    def _adaptive_ranges_are_of_physics(self) -> RandomizationConfig:
+        if self.adaptive.enabled and "physics" not in self.parts:
+            raise ValueError("adaptive ranges are those of physics: add it to parts")
+        return self
 
 
 class Config(Section):
@@ -472,6 +506,7 @@ class Config(Section):
     data: DataConfig
     train: TrainConfig
     evaluate: EvaluateConfig
+    transfer: TransferConfig
     env: EnvConfig
     rl: RLConfig
     randomization: RandomizationConfig
