@@ -5,6 +5,7 @@
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
     python evaluate.py --config configs/servo.yaml     # closed loops on what moves
     python evaluate.py world=mujoco                    # in another simulator
+    python evaluate.py --config configs/sim_to_real.yaml  # what is lost from world to world
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
 runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
@@ -40,11 +41,21 @@ from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
-from envs.worlds import make_cell
+from envs.worlds import in_world, make_cell
+from models.graspnet_planner import GraspNetPlanner
+from models.photographs import judge_photographs, photographs
 from models.planners import make_planner
-from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
+from utils.config import (
+    OBJECT_SETS,
+    Config,
+    TransferPolicy,
+    load_config,
+    parse_args,
+    run_script,
+    with_settings,
+)
 from utils.errors import UserError
-from utils.files import write_atomic
+from utils.files import write_atomic, write_json_atomic
 from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import contact_sheet, draw_grasp
 from utils.report import GalleryItem, write_report
@@ -63,13 +74,25 @@ from utils.results import (
     write_results,
 )
 from utils.runs import check_writable, git_state, new_run_folder
+from utils.transfer import (
+    Score,
+    TransferLine,
+    draw_transfer,
+    format_transfer,
+    score_of,
+    transfer_content,
+    transfer_notes,
+)
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
+PHOTOGRAPHS = "cornell"  # the one world of the transfer report that is not simulated
 MOST_FAILURES = 24  # on failures.png
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
+    if config.transfer.policies is not None:
+        return report_transfer(config, options.resume, options.results)
     check_policies(config)
     check_resume(config, options.resume)
     check_writable("--results", options.results)
@@ -162,6 +185,67 @@ def announce(config: Config, run: Path, device: str) -> None:
         f"seed {config.seed}, in {config.world}, on {device}; results in {run}",
         flush=True,
     )
+
+
+# --- From one world to another --------------------------------------------------------------
+
+
+def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
+    """The same policies on the same scenes in every world, and how well one foretells another."""
+    worlds, policies = config.transfer.worlds, config.transfer.policies
+    planners = list(dict.fromkeys(who.planner for who in policies if is_trained(who)))
+    config_of = {
+        world: with_settings(in_world(config, world), "evaluate", {"policies": planners})
+        for world in worlds
+        if world != PHOTOGRAPHS
+    }
+    for there in config_of.values():
+        check_policies(there)
+        make_cell(there).close()
+    check_resume(config, resume)
+    check_writable("--results", results)
+    check_objects(config)
+    samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
+    run = resume or new_run_folder("evaluate", config.evaluate.name, config)
+    device = f"{platform.machine()} CPU, {worker_count(config)} workers"
+
+    scores: dict[str, dict[str, Score]] = {planner: {} for planner in planners}
+    error, interrupted = None, False
+    for world, there in config_of.items():
+        (run / world).mkdir(exist_ok=True)
+        announce(there, run / world, device)
+        outcome = evaluate(there, run / world)
+        write_failures(run / world / "failures.png", outcome.gallery)
+        for planner in planners:
+            scores[planner][world] = score_of(outcome.rounds, planner)
+        error, interrupted = outcome.error, outcome.interrupted
+        if error is not None or interrupted:
+            break
+    for planner in planners if samples and PHOTOGRAPHS in worlds else []:
+        network = make_planner(planner, GripperGeometry(), workspace_of(config), config.seed)
+        if isinstance(network, GraspNetPlanner):
+            judged = judge_photographs(network.network, samples)
+            scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for one in judged), len(judged))
+
+    lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
+    print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
+    complete = error is None and not interrupted
+    content = {"schema": 1, "complete": complete, "commit": git_state().commit, "device": device}
+    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines)}
+    for path in filter(None, [run / "results.json", results]):
+        write_json_atomic(path, content)
+    write_atomic(run / "transfer.png", draw_transfer(lines, worlds))
+    print(f"picture: {run / 'transfer.png'}")
+    if not complete:
+        print(f"interrupted; go on with --resume {run}")
+    if error is not None:
+        raise error
+    return 130 if interrupted else 0
+
+
+def is_trained(who: TransferPolicy) -> bool:
+    """Whether a row of the report can be scored: what is no file needs no training."""
+    return Path(who.planner).suffix != ".pt" or Path(who.planner).exists()
 
 
 # --- Running rounds in worker processes -----------------------------------------------------

@@ -6,7 +6,7 @@ from envs.base_cell import BaseCell
 from envs.cell import Cell
 from envs.challenges import CHALLENGES
 from envs.mujoco_cell import MujocoCell
-from utils.config import Config
+from utils.config import Config, with_settings
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
 from utils.results import OPEN_LOOP
@@ -23,6 +23,13 @@ def make_cell(config: Config) -> BaseCell:
         randomizer = DomainRandomizer(cell, config.randomization)
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
     return cell
+
+
+def in_world(config: Config, world: str) -> Config:
+    """The config of an evaluation in a world of the transfer report: `pybullet`, `mujoco`, or
+    `outside`, which is PyBullet changed by the section `randomization`."""
+    config = with_settings(config, "evaluate", {"randomise": world == "outside"})
+    return config.model_copy(update={"world": "mujoco" if world == "mujoco" else "pybullet"})
 
 
 def check_world(config: Config) -> None:
