@@ -25,6 +25,7 @@ TITLES = {
     "mujoco": "MuJoCo",
     "cornell": "Cornell photographs",
 }
+NOT_TRAINED = "-"  # a row's training where the policy learns nothing
 PAIRS = (("mujoco", "pybullet"), ("outside", "pybullet"))  # (taken for real, simulation of it)
 
 
@@ -192,7 +193,7 @@ def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str])
             0.9 * height, xerr=errors, label=TITLES[world], color=_colour(number),
             error_kw={"elinewidth": 1.0, "capsize": 2},
         )  # fmt: skip
-    names = [f"{line.who.policy}\n{line.who.training}" for line in lines]
+    names = [_name(line, "\n") for line in lines]
     axes.set(yticks=range(len(lines)), yticklabels=names, xlim=(0, 105), xlabel="success, %")
     axes.invert_yaxis()
     axes.grid(axis="x", alpha=0.3)
@@ -210,7 +211,7 @@ def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
         spans = [[[100 * (s.rate - s.ci95[0])], [100 * (s.ci95[1] - s.rate)]] for s in scores]
         axes.errorbar(
             x, y, xerr=spans[0], yerr=spans[1], fmt="o", color=_colour(number), capsize=2,
-            label=f"{line.who.policy}, {line.who.training}",
+            label=_name(line, ", "),
         )  # fmt: skip
     found = [one for one in agreements(lines) if (one.real, one.simulation) == (real, simulation)]
     if found and found[0].pearson_r is not None:
@@ -221,6 +222,11 @@ def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
     )  # fmt: skip
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
+
+
+def _name(line: TransferLine, between: str) -> str:
+    training = [line.who.training] if line.who.training != NOT_TRAINED else []
+    return between.join([line.who.policy, *training])
 
 
 def _colour(number: int) -> Any:
