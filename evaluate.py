@@ -22,7 +22,6 @@ import functools
 import multiprocessing
 import platform
 import signal
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -31,7 +30,6 @@ from itertools import islice
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 from tqdm import tqdm
 
 from envs.base_cell import BaseCell
@@ -56,8 +54,9 @@ from utils.config import (
 )
 from utils.errors import UserError
 from utils.files import write_atomic, write_json_atomic
+from utils.gallery import balanced, write_failures
 from utils.geometry import GripperGeometry, Workspace
-from utils.overlay import contact_sheet, draw_grasp
+from utils.overlay import draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
     RoundRecord,
@@ -86,7 +85,6 @@ from utils.transfer import (
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 PHOTOGRAPHS = "cornell"  # the one world of the transfer report that is not simulated
-MOST_FAILURES = 24  # on failures.png
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -111,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, config, git_state().commit, device, complete)
     write_csv(run / "results.csv", rows)
-    gallery = _balanced(outcome.gallery, config.evaluate.gallery)
+    gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(run / "report.html", rows, outcome.rounds, config, gallery, outcome.films, device)
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
@@ -356,14 +354,6 @@ def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progre
         progress.update(len(rounds))
 
 
-def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
-    """One picture of failed grasps, of each policy in turn; none if nothing failed."""
-    failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
-    if failures:
-        sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
-        write_atomic(path, iio.imwrite("<bytes>", sheet, extension=".png"))
-
-
 def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     plan = config.evaluate
     return (
@@ -372,24 +362,6 @@ def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
         [contestant(*pair) for pair in contestants(config)].index(record.policy),
         record.seed,
     )
-
-
-def _balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
-    """`count` pictures, half of them failures where there are enough: those teach the most."""
-    failures = _in_turns([p for p in pictures if not p.success])
-    successes = _in_turns([p for p in pictures if p.success])
-    take = min(len(failures), max(count // 2, count - len(successes)))
-    return failures[:take] + successes[: count - take]
-
-
-def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
-    """One of each policy, then another of each: the worst policy fails most and would fill all."""
-    number_of: Counter[str] = Counter()
-    turns = []
-    for position, item in enumerate(pictures):
-        turns.append((number_of[item.policy], position))
-        number_of[item.policy] += 1
-    return [pictures[position] for _, position in sorted(turns)]
 
 
 _worker_config: Config
