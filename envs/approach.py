@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 DIRECTIONS = 36  # over half a turn, from the closing line on: every 5 degrees
 TOLD = 8  # of these that an outline tells: about every 22.5 degrees
@@ -20,6 +21,11 @@ _EDGE = 0.01  # m beyond that slack over which the way down is closed
 _OPENING_SLACK = 0.01  # m by which the fingers should be wider apart than the object
 
 
+# (3, 2 DIRECTIONS + 1): the directions over a whole turn in the closing line's frame, and up.
+_TURNS = math.pi / DIRECTIONS * np.arange(2 * DIRECTIONS)
+_AXES = np.column_stack([[np.cos(_TURNS), np.sin(_TURNS), 0 * _TURNS], [0.0, 0.0, 1.0]])
+
+
 class Outline:
     """The outer points of one object.
 
@@ -27,20 +33,23 @@ class Outline:
     """
 
     def __init__(self, parts: tuple[np.ndarray, ...]):
-        self._points = np.concatenate(parts)
+        points = np.concatenate(parts)
+        self._points = points[ConvexHull(points).vertices]
 
     def seen_from(self, T_WO: np.ndarray, T_WE: np.ndarray) -> View:
         """The object at T_WO (4, 4) as seen from a hand at T_WE (4, 4)."""
-        start = math.atan2(T_WE[1, 1], T_WE[0, 1])
-        angles = start + math.pi / DIRECTIONS * np.arange(DIRECTIONS)
-        axes = np.zeros((3, DIRECTIONS + 1))
-        axes[0, :-1], axes[1, :-1], axes[2, -1] = np.cos(angles), np.sin(angles), 1.0
-        along = self._points @ (T_WO[:3, :3].T @ axes)
+        x, y = T_WE[0, 1], T_WE[1, 1]  # of the closing line
+        length = math.hypot(x, y)
+        x, y = x / length, y / length
+        turn = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+        reach = np.maximum.reduce(self._points @ (T_WO[:3, :3].T @ turn @ _AXES))
+        between = T_WO[:3, 3] - T_WE[:3, 3]
+        height = float(between[2])
         return View(
-            T_WE[:3, :3].T @ (T_WO[:3, 3] - T_WE[:3, 3]),
-            np.ptp(along[:, :-1], axis=0),
-            float(along[:, -1].max() + T_WO[2, 3] - T_WE[2, 3]),
-            float(T_WO[2, 3] - T_WE[2, 3]),
+            between @ T_WE[:3, :3],
+            reach[:DIRECTIONS] + reach[DIRECTIONS:-1],
+            float(reach[-1]) + height,
+            height,
         )
 
 
@@ -56,7 +65,10 @@ class View:
     def outline(self) -> np.ndarray:
         """(TOLD + 1,) m: some of the widths, and the top. They tell a cylinder from a box and where
         a box's sides are without naming an angle, which symmetric objects have several of."""
-        return np.append(self.widths[:: -(-DIRECTIONS // TOLD)][:TOLD], self.top)
+        told = np.empty(TOLD + 1)
+        told[:TOLD] = self.widths[:: -(-DIRECTIONS // TOLD)][:TOLD]
+        told[TOLD] = self.top
+        return told
 
     def way_to_grasp(self, opening: float) -> float:
         """Metres that the hand, open by `opening` metres, has yet to go until it is around the
@@ -65,7 +77,7 @@ class View:
         Down it is only over the object; elsewhere the way goes by a point over the object's top.
         A hand that came down beside it is therefore farther away than one above it.
         """
-        x, y = abs(self.offset[0]), abs(self.offset[1])
+        x, y = abs(float(self.offset[0])), abs(float(self.offset[1]))
         off = max(x - _LENGTH_SLACK, y - _SIDE_SLACK, 0.0)
         down = max(self.centre, self.top - _FINGERS)  # of E at the grasp, over where E is now
         closed = min(off / _EDGE, 1.0)

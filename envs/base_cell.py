@@ -68,6 +68,14 @@ class BaseCell(ABC):
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
 
+    def calm(self) -> bool:
+        """Spare the simulator until the robot touches something, if it knows how; whether it does.
+        `wake` has to be called at the first touch."""
+        return False
+
+    def wake(self) -> None:
+        """Undo `calm`."""
+
     @abstractmethod
     def object_pose(self, index: int) -> np.ndarray:
         """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""

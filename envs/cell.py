@@ -149,24 +149,25 @@ class Cell(BaseCell):
         )
 
     def object_pose(self, index: int) -> np.ndarray:
-        """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""
-        position, quaternion = pybullet.getBasePositionAndOrientation(
-            self.bodies[index], physicsClientId=self.client
-        )
-        T = np.eye(4)
+        """(4, 4) pose in W of an object's body frame (its origin is the centre of mass). Raises
+        PhysicsError when it is not finite."""
+        position, quaternion = self._position_and_quaternion(index)
+        a, b, c, d, e, f, g, h, i = pybullet.getMatrixFromQuaternion(quaternion)
+        x, y, z = position
         # A tenth of the time that SciPy takes: the Gymnasium env asks at every step.
-        T[:3, :3] = np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))
-        T[:3, 3] = position
-        return T
+        return np.array([(a, b, c, x), (d, e, f, y), (g, h, i, z), (0.0, 0.0, 0.0, 1.0)])
 
     def object_position(self, index: int) -> np.ndarray:
         """(3,) centre of mass in W. Raises PhysicsError when it is not finite."""
-        position, _ = pybullet.getBasePositionAndOrientation(
+        return np.array(self._position_and_quaternion(index)[0])
+
+    def _position_and_quaternion(self, index: int) -> tuple[tuple, tuple]:
+        position, quaternion = pybullet.getBasePositionAndOrientation(
             self.bodies[index], physicsClientId=self.client
         )
         if not all(map(math.isfinite, position)):
             raise PhysicsError(f"object {index} has a non-finite position: {position}")
-        return np.array(position)
+        return position, quaternion
 
     def held_object(self) -> int | None:
         """The object that both fingers grip, or None."""

@@ -40,13 +40,15 @@ class GraspOutcome:
     (the object was not seen any more) and `stopped` (by the safety gate, or out of time).
     sim_seconds: simulated time from home and back home, at legal joint speeds.
     object_index: the object that was held, if any. detail: a sentence on the failure, if there is
-    more to say.
+    more to say. palm_stopped_at: metres, height of E where something under the palm stopped the
+    approach.
     """
 
     reason: str
     sim_seconds: float
     object_index: int | None = None
     detail: str = ""
+    palm_stopped_at: float | None = None
 
     @property
     def success(self) -> bool:
@@ -56,9 +58,16 @@ class GraspOutcome:
 class GraspFailure(Exception):
     """Ends an attempt early with a reason."""
 
-    def __init__(self, reason: str, object_index: int | None = None, detail: str = ""):
+    def __init__(
+        self,
+        reason: str,
+        object_index: int | None = None,
+        detail: str = "",
+        palm_stopped_at: float | None = None,
+    ):
         super().__init__(detail or reason)
         self.reason, self.object_index, self.detail = reason, object_index, detail
+        self.palm_stopped_at = palm_stopped_at
 
 
 class Around(NamedTuple):
@@ -82,7 +91,9 @@ def open_loop(cell: BaseCell, grasp: Grasp) -> Around:
     cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
     _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
     if not _follow(cell, approach, stop_force=settings.contact_stop):
-        raise GraspFailure("collision")
+        height = float(cell.robot.tip_pose()[2, 3])
+        palm = cell.robot.palm_touches()
+        raise GraspFailure("collision", palm_stopped_at=height if palm else None)
     return Around(cell.step, target)
 
 
@@ -100,7 +111,7 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
     approach: how the open gripper gets around the object; the rest is the same for all.
     """
     cell.check_physics()
-    start, detail = cell.seconds, ""
+    start, detail, palm_stopped_at = cell.seconds, "", None
     try:
         index = _pick(cell, grasp, approach)
         _carry_to_bin(cell, index)
@@ -109,10 +120,11 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
         outcome, index = "ik", None
     except GraspFailure as failure:
         outcome, index, detail = failure.reason, failure.object_index, failure.detail
+        palm_stopped_at = failure.palm_stopped_at
     _go_home(cell)
     cell.check_physics()
     cell.retire_lost_objects()
-    return GraspOutcome(outcome, cell.seconds - start, index, detail)
+    return GraspOutcome(outcome, cell.seconds - start, index, detail, palm_stopped_at)
 
 
 def _pick(cell: BaseCell, grasp: Grasp, approach: Approach) -> int:

@@ -158,8 +158,8 @@ class RobotGraspingEnv(gymnasium.Env):
         )
         reach = self.config.workspace.size / 2 + _MARGIN
         x, y = self.config.workspace.center
-        self._lowest = np.array([x - reach, y - reach, _LOWEST_TIP])
-        self._highest = np.array([x + reach, y + reach, _HIGHEST_TIP])
+        self._lowest = (x - reach, y - reach, _LOWEST_TIP)
+        self._highest = (x + reach, y + reach, _HIGHEST_TIP)
         self._speed = _FASTEST * _SPEED_HEADROOM * self.config.robot.velocity_scale
         seconds = self.settings.substeps / self.config.sim.frequency
         self._max_joint_change = self._speed * seconds
@@ -303,6 +303,8 @@ class RobotGraspingEnv(gymnasium.Env):
                 f"action has shape {action.shape}; control={self.settings.control!r} takes "
                 f"{self.action_space.shape}, each entry in [-1, 1]"
             )
+        if abs(action).max() <= 1.0:
+            return action
         if not np.isfinite(action).all():
             raise InvalidAction(f"action holds a non-finite number: {action.tolist()}")
         return np.minimum(np.maximum(action, -1.0), 1.0)
@@ -334,12 +336,12 @@ class RobotGraspingEnv(gymnasium.Env):
     def _moved_pose(self, action: np.ndarray) -> np.ndarray:
         """(4, 4) the commanded pose of E moved by an action, within the workspace."""
         settings, T = self.settings, self._T_command.copy()
-        move = action[:3]
+        move = settings.position_step * action[:3]
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if settings.frame == "hand":
             move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
-        position = T[:3, 3] + settings.position_step * move
-        T[:3, 3] = np.minimum(np.maximum(position, self._lowest), self._highest)
+        position = zip((T[:3, 3] + move).tolist(), self._lowest, self._highest)
+        T[:3, 3] = [min(max(value, low), high) for value, low, high in position]
         if any(turn.tolist()):
             T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
         return T
@@ -372,7 +374,7 @@ class RobotGraspingEnv(gymnasium.Env):
     def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
         """Joint positions (7,) towards a goal, and the share of the way that an action gets."""
         change = goal - self._servo.q
-        share = 1.0 / max(float((abs(change) / self._max_joint_change).max()), 1.0)
+        share = 1.0 / max(float(abs(change).max()) / self._max_joint_change, 1.0)
         return self._servo.q + share * change, share
 
     # --- What happened ----------------------------------------------------------------------
@@ -380,21 +382,18 @@ class RobotGraspingEnv(gymnasium.Env):
     def _look(self) -> None:
         """Read the robot and the nearest object. Raises PhysicsError on a non-finite number."""
         cell = self.cell
-        state = np.empty(15, np.float32)
-        q, state[7:14], state[14] = cell.robot.joint_state()
-        state[:7] = q
-        self._state = state
-        if not np.isfinite(self._state).all():
+        state = cell.robot.state()
+        self._state = np.array(state, np.float32)
+        if not math.isfinite(sum(state)):
             raise PhysicsError("the robot's state is not finite")
-        self._tip = cell.robot.tip_position()
-        positions = [cell.object_position(i) for i in range(len(cell.bodies))]
+        self._T_WE = cell.robot.tip_pose()
+        self._tip = self._T_WE[:3, 3]
+        poses = [cell.object_pose(i) for i in range(len(cell.bodies))]
+        positions = [T_WO[:3, 3] for T_WO in poses]
         distances = [math.dist(position, self._tip) for position in positions]
-        self._distance = min(distances)
-        nearest = distances.index(self._distance)
+        self._nearest = nearest = distances.index(min(distances))
         self._object_positions, self._object_position = positions, positions[nearest]
-        self._nearest = nearest
-        self._T_WE = forward_kinematics(q)
-        self._view = self._outlines[nearest].seen_from(cell.object_pose(nearest), self._T_WE)
+        self._view = self._outlines[nearest].seen_from(poses[nearest], self._T_WE)
         touches = cell.robot.touches()
         if touches and self._calm:
             cell.wake()
@@ -434,14 +433,17 @@ class RobotGraspingEnv(gymnasium.Env):
         }
 
     def _info(self, reason: str | None) -> dict[str, Any]:
+        offset = np.empty(6)
+        offset[:3] = self._view.offset
+        np.tanh(self._view.offset / _NEAR, out=offset[3:])
         return {
             "is_success": reason == "success",
             "reason": reason,
-            "object_position": self._object_position.copy(),
-            "object_offset": np.append(self._view.offset, np.tanh(self._view.offset / _NEAR)),
+            "object_position": self._object_position,
+            "object_offset": offset,
             "object_outline": self._view.outline(),
             "gripper": np.array([self._state[14], self._opening_command]),
-            "end_effector_position": self._tip.copy(),
+            "end_effector_position": self._tip,
             "grasped": self._grasped,
             "reachable": bool(self._reachable),
             "scene_seed": self._scene_seed,

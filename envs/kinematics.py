@@ -32,11 +32,13 @@ _D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
 TOOL_LENGTH = 0.107 + 0.105  # m from joint 7's frame to E
 # Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
 _TOOL_TURN = -np.pi / 4
-# Each joint's a, cos alpha, sin alpha and d; the tool as one more link that does not turn.
+# Each joint's a, sin alpha, which is 0, 1 or -1, and d; the tool as one more that does not turn.
 _LINKS = [
-    (a, float(np.round(np.cos(alpha))), float(np.round(np.sin(alpha))), d)
+    (a, float(np.round(np.sin(alpha))), d)
     for a, alpha, d in zip((*_A, 0.0), (*_ALPHA, 0.0), (*_D, TOOL_LENGTH))
 ]
+
+_IDENTITY = np.eye(6)
 
 
 class UnreachableError(UserError):
@@ -58,9 +60,10 @@ def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows, axes, origins = [], [], []
     for x, y, z in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
         p, axis, origin = 0.0, [], []  # (x, y, z, p) is a row of the pose so far
-        for a, cos_alpha, sin_alpha, d, cosine, sine in links:
+        for a, turn, d, cosine, sine in links:
             p += a * x
-            y, z = cos_alpha * y + sin_alpha * z, cos_alpha * z - sin_alpha * y
+            if turn:  # by a right angle about x
+                y, z = turn * z, -turn * y
             p += d * z
             x, y = cosine * x + sine * y, cosine * y - sine * x
             axis.append(z)
@@ -86,14 +89,18 @@ def geometric_jacobian(q: np.ndarray) -> np.ndarray:
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """(3,) axis-angle logarithm of a (3, 3) rotation, fast where the angle is not near pi."""
+    return np.array(_rotation_log(R))
+
+
+def _rotation_log(R: np.ndarray) -> tuple[float, float, float]:
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     cosine = 0.5 * (a + e + i - 1.0)
     if cosine < -0.99:
-        return Rotation.from_matrix(R).as_rotvec()
+        return tuple(Rotation.from_matrix(R).as_rotvec().tolist())
     x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
     sine = math.sqrt(x * x + y * y + z * z)
     scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
-    return np.array([scale * x, scale * y, scale * z])
+    return scale * x, scale * y, scale * z
 
 
 def rotation_matrix(vector: np.ndarray) -> np.ndarray:
@@ -116,10 +123,8 @@ def rotation_matrix(vector: np.ndarray) -> np.ndarray:
 
 def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(6,) small motion in W that takes pose T to the target: metres, then radians."""
-    error = np.empty(6)
-    error[:3] = target[:3, 3] - T[:3, 3]
-    error[3:] = rotation_vector(target[:3, :3] @ T[:3, :3].T)
-    return error
+    move = (target[:3, 3] - T[:3, 3]).tolist()
+    return np.array([*move, *_rotation_log(target[:3, :3] @ T[:3, :3].T)])
 
 
 def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
@@ -165,8 +170,8 @@ def inverse_kinematics(
 
 def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: float = 0.3):
     """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
-    square = jacobian @ jacobian.T
-    square.flat[::7] += damping**2  # positive definite, so that Cholesky's method serves
+    # Positive definite, so that Cholesky's method serves.
+    square = jacobian @ jacobian.T + damping**2 * _IDENTITY
     if rest is None:
         step = jacobian.T @ dposv(square, error)[1]
     else:

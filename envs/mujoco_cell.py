@@ -92,6 +92,11 @@ class MujocoCell(BaseCell):
             raise PhysicsError(f"object {index} has a non-finite position: {position}")
         return position
 
+    def speed(self, index: int) -> float:
+        """m/s of an object's centre of mass."""
+        start = self._speeds[index]
+        return math.hypot(*self.robot.data.qvel[start : start + 3])
+
     def held_object(self) -> int | None:
         return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
 

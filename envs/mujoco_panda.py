@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 HAND, GRASP_TARGET = "panda_hand", "panda_grasptarget"
+_HAND_LINKS = ("panda_link7", "panda_link8", HAND)  # one link in PyBullet's cell
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
 
 
@@ -200,6 +201,7 @@ class MujocoPanda(MotionPlanner):
         self._links = {body.name: body.id for body in bodies if body.name.startswith("panda_")}
         self.links = list(self._links.values())  # MuJoCo's numbers of the robot's bodies
         self._is_robot = np.isin(self.model.geom_bodyid, self.links)
+        self.limit_speed(JOINT_VELOCITY.max())
         self.place(np.zeros(7))
 
     # --- State --------------------------------------------------------------------------------
@@ -224,13 +226,9 @@ class MujocoPanda(MotionPlanner):
         T[:3, :3], T[:3, 3] = found.xmat.reshape(3, 3), found.xpos
         return T
 
-    def closing_direction(self) -> np.ndarray:
-        """(3,) unit vector in W along E's y axis."""
-        return forward_kinematics(self.q)[:3, 1]
-
-    def tip_position(self) -> np.ndarray:
-        """(3,) origin of E in W."""
-        return forward_kinematics(self.q)[:3, 3]
+    def tip_pose(self) -> np.ndarray:
+        """(4, 4) T_WE."""
+        return forward_kinematics(self.q)
 
     # --- Motion -------------------------------------------------------------------------------
 
@@ -243,6 +241,10 @@ class MujocoPanda(MotionPlanner):
         self.data.ctrl[:7], self.data.ctrl[7] = q, opening
         self._mujoco.mj_forward(self.model, self.data)
 
+    def limit_speed(self, speed: float) -> None:
+        """No joint is driven faster than `speed` rad/s; the servos themselves are not held back."""
+        self._fastest = np.minimum(JOINT_VELOCITY, speed)
+
     def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         """Servo targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s."""
         self._goal, self._speed = np.asarray(q, dtype=float), None
@@ -253,7 +255,7 @@ class MujocoPanda(MotionPlanner):
         """Servo targets for several periods: the targets go to q (7,) no faster than the joints'
         limits, nor than `speed` rad/s."""
         self._goal = np.asarray(q, dtype=float)
-        self._reference, self._speed = self.q, np.minimum(JOINT_VELOCITY, speed)
+        self._reference, self._speed = self.q, np.minimum(self._fastest, speed)
 
     def command_gripper(self, opening: float, force: float | None = None) -> None:
         """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
@@ -284,7 +286,7 @@ class MujocoPanda(MotionPlanner):
 
         A contact counts where `envs.panda.Panda.grip_forces` counts it.
         """
-        closing, inwards = self.closing_direction(), []
+        closing, inwards = self.tip_pose()[:3, 1], []
         # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
         for sign, name in zip((-1.0, 1.0), ("panda_leftfinger", "panda_rightfinger")):
             force = 0.0
@@ -302,6 +304,14 @@ class MujocoPanda(MotionPlanner):
     def touches(self) -> bool:
         """Whether anything touches the robot."""
         return len(self._robot_contacts()) > 0
+
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        hand = [self._links[name] for name in _HAND_LINKS]
+        numbers = self._robot_contacts()
+        bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
+        palm = numbers[np.isin(bodies, hand).any(axis=1)]
+        return any(self._normal_force(number) > 0 for number in palm)
 
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the robot by what is not the robot."""

@@ -5,6 +5,7 @@ Knows nothing of objects, cameras or grasps; where to move is worked out in `env
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections import deque
 from collections.abc import Callable
@@ -121,11 +122,13 @@ class Panda(MotionPlanner):
     def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
         """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
         nor than `speed` rad/s."""
-        speeds = np.minimum(JOINT_VELOCITY, speed).tolist()
-        gain = self.position_gain * _DRIVE_GAIN
-        for joint, position, torque, limit in zip(ARM, q.tolist(), _TORQUES, speeds):
-            self._send(
-                pybullet.setJointMotorControl2, self.body, joint, pybullet.POSITION_CONTROL,
+        speeds = [min(limit, speed) for limit in _SPEEDS]
+        self._send(self._drive, q.tolist(), speeds, self.position_gain * _DRIVE_GAIN)
+
+    def _drive(self, q: list[float], speeds: list[float], gain: float) -> None:
+        for joint, position, torque, limit in zip(ARM, q, _TORQUES, speeds):
+            pybullet.setJointMotorControl2(
+                self.body, joint, pybullet.POSITION_CONTROL,
                 targetPosition=position, targetVelocity=0.0, force=torque,
                 positionGain=gain, velocityGain=self.velocity_gain, maxVelocity=limit,
                 physicsClientId=self.client,
@@ -142,12 +145,16 @@ class Panda(MotionPlanner):
             physicsClientId=self.client,
         )  # fmt: skip
 
+    def state(self) -> list[float]:
+        """Joint positions (7, rad), joint velocities (7, rad/s) and the gripper's opening (m)."""
+        states = pybullet.getJointStates(self.body, _STATE_JOINTS, physicsClientId=self.client)
+        q, velocities, *_ = zip(*states)
+        return [*q[:7], *velocities[:7], q[7] + q[8]]
+
     def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
-        states = pybullet.getJointStates(self.body, _STATE_JOINTS, physicsClientId=self.client)
-        q = np.array([state[0] for state in states[:7]])
-        velocity = np.array([state[1] for state in states[:7]])
-        return q, velocity, states[7][0] + states[8][0]
+        state = self.state()
+        return np.array(state[:7]), np.array(state[7:14]), state[14]
 
     def closing_direction(self) -> np.ndarray:
         """(3,) unit vector in W along E's y axis, read from the physics."""
@@ -155,12 +162,15 @@ class Panda(MotionPlanner):
         x, y, z, w = state[5]
         return np.array([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)])
 
-    def tip_position(self) -> np.ndarray:
-        """(3,) origin of E in W, read from the physics."""
+    def tip_pose(self) -> np.ndarray:
+        """(4, 4) T_WE, read from the physics: quicker than forward kinematics."""
         state = pybullet.getLinkState(self.body, ARM[-1], physicsClientId=self.client)
-        x, y, z, w = state[5]
-        approach = (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
-        return np.array([p + TOOL_LENGTH * a for p, a in zip(state[4], approach)])
+        (px, py, pz), R = state[4], pybullet.getMatrixFromQuaternion(state[5])
+        rows = [
+            (_HALF * (x - y), _HALF * (x + y), z, p + TOOL_LENGTH * z)
+            for x, y, z, p in ((*R[:3], px), (*R[3:6], py), (*R[6:], pz))
+        ]
+        return np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
 
     @property
     def q(self) -> np.ndarray:
@@ -209,6 +219,13 @@ class Panda(MotionPlanner):
         """Whether anything touches the robot, or is so near that Bullet already looks at it."""
         return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
 
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body, linkIndexA=ARM[-1], physicsClientId=self.client
+        )
+        return any(contact[9] > 0 for contact in contacts)
+
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the whole robot."""
         contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
@@ -217,8 +234,9 @@ class Panda(MotionPlanner):
 
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
 _POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
-_TORQUES = JOINT_TORQUE.tolist()
+_TORQUES, _SPEEDS = JOINT_TORQUE.tolist(), JOINT_VELOCITY.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
+_HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 
 
 def panda_urdf(cache_dir: Path, fine: bool) -> Path:

@@ -29,6 +29,7 @@ from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
+ROOM_OVER_TOUCH = 0.004  # m
 
 
 def run_round(
@@ -58,6 +59,7 @@ def run_round(
     beliefs = challenge.beliefs(cell)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
+    stops: list[float | None] = []  # of these, where something under the palm stopped them
     plan_seconds, ended = 0.0, "cleared"
     try:
         while cell.remaining and len(failed) < max_failures:
@@ -69,7 +71,7 @@ def run_round(
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
                 ended = NO_PLAN
                 break
-            grasp = first_untried(grasps, failed)
+            grasp = no_deeper(first_untried(grasps, failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -89,6 +91,7 @@ def run_round(
                 )  # fmt: skip
             )
             failed = [] if outcome.success else [*failed, grasp]
+            stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
     except PhysicsError:
@@ -133,3 +136,23 @@ def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:
         )
     )
     return next(untried, grasps[0])
+
+
+def no_deeper(grasp: Grasp, failed: Sequence[Grasp], stops: Sequence[float | None]) -> Grasp:
+    """The grasp, raised over the heights (metres, of E) at which the palm met something there.
+
+    A camera may lose a thin part that stands up from an object; the palm that has come down on it
+    knows how high it is.
+    """
+    lowest = max(
+        (
+            stop + ROOM_OVER_TOUCH
+            for other, stop in zip(failed, stops)
+            if stop is not None
+            and np.linalg.norm(grasp.position[:2] - other.position[:2]) < TRIED_DISTANCE
+        ),
+        default=-np.inf,
+    )
+    if grasp.position[2] >= lowest:
+        return grasp
+    return replace(grasp, position=np.array([*grasp.position[:2], lowest]))

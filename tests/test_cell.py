@@ -9,7 +9,7 @@ from envs.execution import choose_posture, execute_grasp
 from envs.kinematics import forward_kinematics, inverse_kinematics
 from envs.objects import load_object_set
 from envs.panda import FINGERS
-from envs.rounds import first_untried, run_round
+from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
 from envs.scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.world import BIN_CENTRE, BIN_HALF_SIZE
 from utils.config import with_settings
@@ -180,7 +180,7 @@ def test_a_cube_lying_on_the_fingers_is_no_grip(cell, box_set):
     cell.load(cube_scene(box_set, position=(0.5, 0.3, 0.03)))
     level = cell.home + [0, 0, 0, 0, 0, np.pi / 2, 0]  # the hand points forwards, fingers level
     cell.robot.place(level, opening=0.02)
-    tip = cell.robot.tip_position()
+    tip = cell.robot.tip_pose()[:3, 3]
     pybullet.resetBasePositionAndOrientation(
         cell.bodies[0], tip + [-0.01, 0, 0.045], [0, 0, 0, 1], physicsClientId=cell.client
     )
@@ -277,6 +277,36 @@ def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
     assert first_untried([again, beside, turned], [first]) is beside
     assert first_untried([again, turned], [first]) is turned
     assert first_untried([again, first], [first]) is again  # nothing else is left
+
+
+def test_no_grasp_goes_as_deep_as_the_palm_was_stopped_there() -> None:
+    here, near, far, above = (
+        Grasp(np.array([x, 0.0, z]), 0.0, 0.08, 1.0)
+        for x, z in ((0.5, 0.01), (0.515, 0.01), (0.525, 0.01), (0.5, 0.06))
+    )
+    raised = no_deeper(near, [above, here], [None, 0.04])
+    np.testing.assert_allclose(raised.position, [0.515, 0.0, 0.04 + ROOM_OVER_TOUCH])
+    assert no_deeper(far, [here], [0.04]) is far
+    assert no_deeper(above, [here], [0.04]) is above
+    assert no_deeper(near, [here], [None]) is near
+    assert no_deeper(near, [], []) is near
+
+
+def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
+    """A cube 60 mm high, grasped 12 mm over the table: the palm, 39 mm over E, meets its top
+    when E is 21 mm up. The same grasp again, raised over that, succeeds."""
+    deep = cube_grasp(offset=(0, 0, -0.018))
+    heights = []
+    record = run_round(
+        cell, cube_scene(box_set), _planner_that_returns([deep]), policy="x", objects="box",
+        max_failures=2, on_attempt=lambda frame, grasp, outcome: heights.append(
+            (grasp.position[2], outcome.palm_stopped_at)
+        ),
+    )  # fmt: skip
+    assert [attempt.reason for attempt in record.attempts] == ["collision", "success"]
+    (first, stopped), (second, not_stopped) = heights
+    assert first == pytest.approx(0.012) and stopped == pytest.approx(0.021, abs=0.002)
+    assert second == stopped + ROOM_OVER_TOUCH and not_stopped is None
 
 
 def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -> None:

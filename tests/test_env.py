@@ -521,15 +521,14 @@ def blow_up_the_object(env, monkeypatch):
 
 
 def blow_up_the_robot(env, monkeypatch):
-    nowhere = np.full(7, np.nan)
-    monkeypatch.setattr(env.cell.robot, "joint_state", lambda: (nowhere, nowhere, 0.0))
+    monkeypatch.setattr(env.cell.robot, "state", lambda: [np.nan] * 15)
 
 
 def blow_up_the_judge(env, monkeypatch):
     def fail(index):
         raise PhysicsError("as if")
 
-    monkeypatch.setattr(env.cell, "object_position", fail)
+    monkeypatch.setattr(env.cell, "object_pose", fail)
 
 
 @pytest.mark.parametrize("blow_up", [blow_up_the_object, blow_up_the_robot, blow_up_the_judge])

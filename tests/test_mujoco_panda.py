@@ -112,7 +112,7 @@ def test_a_trajectory_is_followed(panda):
     for q, velocity in zip(way.positions, way.velocities):
         panda.command_arm(q, velocity)
         panda.step()
-        off = panda.tip_position() - forward_kinematics(q)[:3, 3]
+        off = (panda.tip_pose() - forward_kinematics(q))[:3, 3]
         farthest = max(farthest, float(np.linalg.norm(off)))
     assert farthest < 0.003
     panda.step(round(0.2 / panda.dt))

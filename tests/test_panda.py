@@ -117,7 +117,7 @@ def test_welded_model_is_the_stock_robot(stock, robot):
         np.testing.assert_allclose(
             _distance(robot.client, robot.body, near), _distance(client, body, near), atol=1e-5
         )
-        np.testing.assert_allclose(robot.tip_position(), forward_kinematics(q)[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(robot.tip_pose(), forward_kinematics(q), atol=1e-6)
 
 
 @given(joint_positions)

@@ -258,7 +258,7 @@ def test_contact_stops_the_arm(cell):
 def test_what_is_carried_counts_as_the_arm(cell, config):
     cell.config = config
     task = make_task(cell, "eye_to_hand", seed=0)
-    _, _, height = cell.robot.tip_position()
+    height = cell.robot.tip_pose()[2, 3]
     half = [0.05, 0.05, height / 2 - 0.03]
     block = static_box(cell.client, half, [0.5, 0, half[2]], (0.5, 0.5, 0.5, 1))
     down = np.linalg.pinv(geometric_jacobian(cell.robot.q)) @ [0, 0, -0.1, 0, 0, 0]
