@@ -73,7 +73,7 @@ class BaseCell(ABC):
         `wake` has to be called at the first touch."""
         return False
 
-    def wake(self) -> None:
+    def wake(self) -> None:  # noqa: B027 - there is nothing to undo where nothing was spared
         """Undo `calm`."""
 
     @abstractmethod
