@@ -20,7 +20,7 @@ from models.planners import make_planner
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
-from utils.transforms import look_at
+from utils.transforms import look_at, position_quaternion
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +155,33 @@ def test_a_collision_stops_the_approach(held_box):
     across = type(grasp)(grasp.position + [0, 0, -0.001], grasp.angle, 0.03, 1.0)
     outcome = execute_grasp(cell, across)  # fingers 3 cm apart come down on 6 cm of cube
     assert outcome.reason == "collision"
+
+
+def test_fingertips_are_no_palm(held_box):
+    """Fingers 3 cm apart come down on 6 cm of cube: what stops them is not under the palm."""
+    cell, grasp = held_box
+    narrow = type(grasp)(grasp.position, grasp.angle, 0.03, 1.0)
+    assert execute_grasp(cell, narrow).palm_stopped_at is None
+    assert not cell.robot.palm_touches()
+
+
+def test_what_presses_on_the_palm_is_felt(held_box):
+    """The cube put between the open fingers, up against the hand: E is 47 mm below the palm."""
+    cell, _ = held_box
+    T_WE = cell.robot.tip_pose()
+    place = cell.robot.model.joint("object0").qposadr[0]
+    cell.robot.data.qpos[place : place + 3] = T_WE[:3, 3] - 0.018 * T_WE[:3, 2]
+    cell.robot.data.qpos[place + 3 : place + 7] = np.roll(position_quaternion(T_WE)[1], 1)
+    cell.step(1)
+    assert cell.robot.palm_touches()
+
+
+def test_speed(held_box):
+    """A cube that falls for 0.1 s is as fast as g t."""
+    cell, _ = held_box
+    cell.robot.data.qpos[cell.robot.model.joint("object0").qposadr[0] + 2] += 0.3
+    cell.step(24)
+    assert cell.speed(0) == pytest.approx(0.981, rel=0.01)
 
 
 def test_a_world_that_blows_up_says_so(held_box):
