@@ -43,6 +43,7 @@ from envs.worlds import in_world, make_cell
 from models.graspnet_planner import GraspNetPlanner
 from models.photographs import judge_photographs, photographs
 from models.planners import make_planner
+from models.rectangle_pictures import draw_rectangles
 from utils.config import (
     OBJECT_SETS,
     Config,
@@ -224,6 +225,7 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
         if isinstance(network, GraspNetPlanner):
             judged = judge_photographs(network.network, samples)
             scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for one in judged), len(judged))
+            draw_rectangles(run / f"{Path(planner).stem}-{PHOTOGRAPHS}.png", samples, judged)
 
     lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
