@@ -4,6 +4,8 @@
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
     python evaluate.py --config configs/servo.yaml     # closed loops on what moves
+    python evaluate.py world=mujoco                    # in another simulator
+    python evaluate.py --config configs/sim_to_real.yaml  # what is lost from world to world
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
 runs/evaluate/<time>/. Ctrl-C stops early and still writes what was measured; --resume goes on.
@@ -20,7 +22,6 @@ import functools
 import multiprocessing
 import platform
 import signal
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -29,22 +30,34 @@ from itertools import islice
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 from tqdm import tqdm
 
-from envs.cell import Cell
+from envs.base_cell import BaseCell
 from envs.challenges import CHALLENGES
 from envs.execution import GraspOutcome
 from envs.objects import ObjectSet, load_object_set, prepare
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
+from envs.worlds import in_world, make_cell
+from models.graspnet_planner import GraspNetPlanner
+from models.photographs import judge_photographs, photographs
 from models.planners import make_planner
-from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
+from models.rectangle_pictures import draw_rectangles
+from utils.config import (
+    OBJECT_SETS,
+    Config,
+    TransferPolicy,
+    load_config,
+    parse_args,
+    run_script,
+    with_settings,
+)
 from utils.errors import UserError
-from utils.files import write_atomic
+from utils.files import write_atomic, write_json_atomic
+from utils.gallery import balanced, write_failures
 from utils.geometry import GripperGeometry, Workspace
-from utils.overlay import contact_sheet, draw_grasp
+from utils.overlay import draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
     OPEN_LOOP,
@@ -63,18 +76,29 @@ from utils.results import (
 )
 from utils.runs import check_writable, git_state, new_run_folder
 from utils.stop_reasons import print_stop_reasons, stop_reasons
+from utils.transfer import (
+    Score,
+    TransferLine,
+    draw_transfer,
+    format_transfer,
+    score_of,
+    transfer_content,
+    transfer_notes,
+)
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
-MOST_FAILURES = 24  # on failures.png
+PHOTOGRAPHS = "cornell"  # the one world of the transfer report that is not simulated
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
+    if config.transfer.policies is not None:
+        return report_transfer(config, options.resume, options.results)
     check_policies(config)
     check_controllers(config, options.overrides)
     check_resume(config, options.resume)
     check_writable("--results", options.results)
-    Cell(config).close()  # an impossible robot or cache is named here, not by a dying worker
+    make_cell(config).close()  # what cannot be had is named here, not by a dying worker
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     device = f"{platform.machine()} CPU, {worker_count(config)} workers"
@@ -90,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, config, git_state().commit, device, complete)
     write_csv(run / "results.csv", rows)
-    gallery = _balanced(outcome.gallery, config.evaluate.gallery)
+    gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(run / "report.html", rows, outcome.rounds, config, gallery, outcome.films, device)
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
@@ -174,9 +198,71 @@ def announce(config: Config, run: Path, device: str) -> None:
         f"{', '.join(contestant(*pair) for pair in contestants(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, on {device}; results in {run}",
+        f"seed {config.seed}, in {config.world}, on {device}; results in {run}",
         flush=True,
     )
+
+
+# --- From one world to another --------------------------------------------------------------
+
+
+def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
+    """The same policies on the same scenes in every world, and how well one foretells another."""
+    worlds, policies = config.transfer.worlds, config.transfer.policies
+    planners = list(dict.fromkeys(who.planner for who in policies if is_trained(who)))
+    config_of = {
+        world: with_settings(in_world(config, world), "evaluate", {"policies": planners})
+        for world in worlds
+        if world != PHOTOGRAPHS
+    }
+    for there in config_of.values():
+        check_policies(there)
+        make_cell(there).close()
+    check_resume(config, resume)
+    check_writable("--results", results)
+    check_objects(config)
+    samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
+    run = resume or new_run_folder("evaluate", config.evaluate.name, config)
+    device = f"{platform.machine()} CPU, {worker_count(config)} workers"
+
+    scores: dict[str, dict[str, Score]] = {planner: {} for planner in planners}
+    error, interrupted = None, False
+    for world, there in config_of.items():
+        (run / world).mkdir(exist_ok=True)
+        announce(there, run / world, device)
+        outcome = evaluate(there, run / world)
+        write_failures(run / world / "failures.png", outcome.gallery)
+        for planner in planners:
+            scores[planner][world] = score_of(outcome.rounds, planner)
+        error, interrupted = outcome.error, outcome.interrupted
+        if error is not None or interrupted:
+            break
+    for planner in planners if samples and PHOTOGRAPHS in worlds else []:
+        network = make_planner(planner, GripperGeometry(), workspace_of(config), config.seed)
+        if isinstance(network, GraspNetPlanner):
+            judged = judge_photographs(network.network, samples)
+            scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for one in judged), len(judged))
+            draw_rectangles(run / f"{Path(planner).stem}-{PHOTOGRAPHS}.png", samples, judged)
+
+    lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
+    print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
+    complete = error is None and not interrupted
+    content = {"schema": 1, "complete": complete, "commit": git_state().commit, "device": device}
+    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines)}
+    for path in filter(None, [run / "results.json", results]):
+        write_json_atomic(path, content)
+    write_atomic(run / "transfer.png", draw_transfer(lines, worlds))
+    print(f"picture: {run / 'transfer.png'}")
+    if not complete:
+        print(f"interrupted; go on with --resume {run}")
+    if error is not None:
+        raise error
+    return 130 if interrupted else 0
+
+
+def is_trained(who: TransferPolicy) -> bool:
+    """Whether a row of the report can be scored: what is no file needs no training."""
+    return Path(who.planner).suffix != ".pt" or Path(who.planner).exists()
 
 
 # --- Running rounds in worker processes -----------------------------------------------------
@@ -287,14 +373,6 @@ def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progre
         progress.update(len(rounds))
 
 
-def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
-    """One picture of failed grasps, of each policy in turn; none if nothing failed."""
-    failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
-    if failures:
-        sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
-        write_atomic(path, iio.imwrite("<bytes>", sheet, extension=".png"))
-
-
 def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     plan = config.evaluate
     return (
@@ -305,33 +383,15 @@ def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     )
 
 
-def _balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
-    """`count` pictures, half of them failures where there are enough: those teach the most."""
-    failures = _in_turns([p for p in pictures if not p.success])
-    successes = _in_turns([p for p in pictures if p.success])
-    take = min(len(failures), max(count // 2, count - len(successes)))
-    return failures[:take] + successes[: count - take]
-
-
-def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
-    """One of each policy, then another of each: the worst policy fails most and would fill all."""
-    number_of: Counter[str] = Counter()
-    turns = []
-    for position, item in enumerate(pictures):
-        turns.append((number_of[item.policy], position))
-        number_of[item.policy] += 1
-    return [pictures[position] for _, position in sorted(turns)]
-
-
 _worker_config: Config
-_worker_cell: Cell
+_worker_cell: BaseCell
 
 
 def _start_worker(config: Config) -> None:
     global _worker_config, _worker_cell
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     cv2.setNumThreads(1)  # as with OMP_NUM_THREADS
-    _worker_config, _worker_cell = config, Cell(config)
+    _worker_config, _worker_cell = config, make_cell(config)
 
 
 def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[Path, str]]]:

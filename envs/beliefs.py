@@ -16,8 +16,9 @@ import numpy as np
 import pybullet
 from scipy.spatial.transform import Rotation
 
+from envs.base_cell import BaseCell, wrist_mount
 from envs.camera import Intrinsics
-from envs.cell import Cell, wrist_mount
+from envs.cell import Cell
 from envs.kinematics import forward_kinematics
 from envs.scenes import Scene
 from envs.servo_target import Board
@@ -44,12 +45,12 @@ class CameraBeliefs:
         return level(frame) if self.levelled else frame
 
 
-def true_beliefs(cell: Cell) -> CameraBeliefs:
+def true_beliefs(cell: BaseCell) -> CameraBeliefs:
     return CameraBeliefs(cell.camera_pose("overhead"), wrist_mount(cell.config.camera))
 
 
 def wrong_beliefs(
-    cell: Cell, rng: np.random.Generator, distance: float, angle: float
+    cell: BaseCell, rng: np.random.Generator, distance: float, angle: float
 ) -> CameraBeliefs:
     """Both cameras believed `distance` metres and `angle` radians off, in random directions."""
     true = true_beliefs(cell)

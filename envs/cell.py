@@ -1,4 +1,4 @@
-"""The robot cell: one physics client with table, bin, Panda, objects and camera.
+"""The robot cell in PyBullet: one physics client with table, bin, Panda, objects and camera.
 
 Labelling, evaluation, demos and the Gymnasium env all run in this one cell. It knows how to
 build and observe the world; what to do in it is for others to say.
@@ -13,35 +13,33 @@ from dataclasses import replace
 import numpy as np
 import pybullet
 
+from envs.base_cell import (
+    ROBOT,
+    TABLE_OR_BACKGROUND,
+    BaseCell,
+    PhysicsError,
+    camera_intrinsics,
+    wrist_mount,
+)
 from envs.camera import DEFAULT_LIGHT, Image, Intrinsics, load_renderer, render
-from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
-from envs.safety import ArmGate
 from envs.scenes import Scene, settle
-from envs.world import SOLVER_RESIDUAL, add_bin, add_table, on_table, set_up_physics
-from utils.config import CameraConfig, Config
-from utils.depth_noise import KinectNoise
+from envs.world import SOLVER_RESIDUAL, add_bin, add_table, set_up_physics
+from utils.config import Config
 from utils.errors import UserError
-from utils.geometry import SceneGeometry, SolidObject
 from utils.random_view import RandomView
-from utils.transforms import RGBDFrame, look_at
 
-TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
-# An object farther than this share of the workspace's side from its centre is out of the game.
-_REACH = 0.63
+__all__ = [
+    "ROBOT", "TABLE_OR_BACKGROUND", "Cell", "PhysicsError", "camera_intrinsics", "wrist_mount",
+]  # fmt: skip
+
 # As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
 _CALM_RESIDUAL = 1e-6
 _CALM_LOOKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
-# Keeps the depth noise of a seed apart from the scene of the same seed.
-_DEPTH_NOISE_STREAM = 1
 
 
-class PhysicsError(RuntimeError):
-    """The simulation left the realm of finite numbers."""
-
-
-class Cell:
+class Cell(BaseCell):
     """A simulated robot cell.
 
     `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_step` is called
@@ -51,15 +49,13 @@ class Cell:
     """
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
-        self.config, self.fine = config, fine
-        self.dt = 1.0 / config.sim.frequency
-        self.home = np.array(config.robot.home)
-        if (self.home < JOINT_LOWER).any() or (self.home > JOINT_UPPER).any():
+        super().__init__(config)
+        if config.world != "pybullet":
             raise UserError(
-                f"robot.home {list(config.robot.home)} is outside the Panda's joint limits, "
-                f"{JOINT_LOWER.tolist()} to {JOINT_UPPER.tolist()} rad"
+                f"world={config.world}: only evaluate.py can score policies there; leave it out, "
+                "or set world=pybullet"
             )
-        config.make_cache_folder()
+        self.fine = fine
         self.on_step: Callable[[Cell], None] | None = None
         self.before_step: Callable[[Cell], None] | None = None
         self.on_build: Callable[[Cell], None] | None = None
@@ -68,7 +64,6 @@ class Cell:
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.renderer = load_renderer(self.client, config.sim.renderer)
         self._urdf = panda_urdf(config.cache_folder, fine)
-        self.scene: Scene | None = None
 
     def load(self, scene: Scene) -> None:
         """Build the scene and let its objects come to rest."""
@@ -85,9 +80,8 @@ class Cell:
         set_up_physics(self.client, self.config.sim)
         self.table = add_table(self.client)
         self.bin = add_bin(self.client)
-        robot, safety, floor = self.config.robot, self.config.safety, self.config.grasp.floor
-        gate = ArmGate(safety, robot, self.dt, floor)
-        self.robot = Panda(self.client, self.dt, self._urdf, robot.grip_force, gate)
+        grip_force = self.config.robot.grip_force
+        self.robot = Panda(self.client, self.dt, self._urdf, grip_force, self._new_gate())
         self.robot.place(self.home)
         self.bodies = [
             spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)
@@ -155,18 +149,6 @@ class Cell:
             solverResidualThreshold=residual, physicsClientId=self.client
         )
 
-    @property
-    def seconds(self) -> float:
-        """Simulated seconds since the scene was loaded."""
-        return self.steps * self.dt
-
-    def check_physics(self) -> None:
-        """Raise PhysicsError if the robot or an object has left the realm of finite numbers."""
-        if not np.isfinite(self.robot.q).all():
-            raise PhysicsError("the robot's joint positions are not finite")
-        for index in self.remaining:
-            self.object_position(index)
-
     def object_pose(self, index: int) -> np.ndarray:
         """(4, 4) pose in W of an object's body frame (its origin is the centre of mass). Raises
         PhysicsError when it is not finite."""
@@ -210,57 +192,6 @@ class Cell:
         pybullet.changeDynamics(body, -1, mass=0, physicsClientId=self.client)
         pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self.client)
 
-    def retire_lost_objects(self) -> list[int]:
-        """Retire the objects that fell off the table or left the camera's reach; their numbers."""
-        lost = [i for i in sorted(self.remaining) if not self._within_reach(i)]
-        for index in lost:
-            self.retire(index)
-        return lost
-
-    def _within_reach(self, index: int) -> bool:
-        # The camera sees a margin around the workspace, so an object that rolled a little way out
-        # is still in the game; one behind the robot or off the table is not.
-        position = self.object_position(index)
-        margin = abs(position[:2] - self.config.workspace.center).max()
-        return on_table(position) and margin <= _REACH * self.config.workspace.size
-
-    def camera_pose(self, mount: str | None = None) -> np.ndarray:
-        """(4, 4) T_WC of the overhead or the wrist camera."""
-        camera = self.config.camera
-        if (mount or camera.mount) == "overhead":
-            return look_at(camera.position, camera.target, camera.up)
-        return forward_kinematics(self.robot.q) @ wrist_mount(camera)
-
-    def frame(self, with_truth: bool = False) -> RGBDFrame:
-        """What the configured camera sees now; `with_truth` adds the true geometry.
-
-        `camera.depth_noise` changes the depth alone. It is a function of the scene's seed and the
-        number of frames since it was loaded, so that every policy meets the same.
-        """
-        camera = self.config.camera
-        frame = self.look(camera_intrinsics(camera), self.camera_pose(), with_truth)
-        if camera.depth_noise == "kinect":
-            rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
-            noise = KinectNoise(image_focal=float(frame.K[0, 0]))
-            frame = replace(frame, depth=noise(frame.depth, rng))
-        self.frames += 1
-        return frame
-
-    def look(
-        self,
-        intrinsics: Intrinsics,
-        T_WC: np.ndarray,
-        with_truth: bool = False,
-        light: dict | None = None,
-    ) -> RGBDFrame:
-        """What a camera at T_WC (4, 4) sees now, without noise; `light` as in
-        `envs.camera.render`."""
-        image = self.image(intrinsics, T_WC, light)
-        truth = self.truth() if with_truth else None
-        return RGBDFrame(
-            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
-        )
-
     def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
         """What `look` sees, without a frame around it. With a `view`, the camera is really where
         that has it, and what is reported of it stays as it is here: it was calibrated so."""
@@ -282,48 +213,13 @@ class Cell:
             segmentation[image.bodies == body] = index
         return segmentation
 
-    def truth(self) -> SceneGeometry:
-        """The true geometry of the objects still in the game."""
-        solids = []
-        for index in sorted(self.remaining):
-            model, T = self.scene.placements[index].model, self.object_pose(index)
-            solids.append(
-                SolidObject(
-                    tuple(solid.transformed(T) for solid in model.geometry()),
-                    T[:3, 3],
-                    model.friction,
-                )
-            )
-        return SceneGeometry(tuple(solids))
-
     def close(self) -> None:
         if self.client >= 0:
             pybullet.disconnect(physicsClientId=self.client)
             self.client = -1
-
-    def __enter__(self) -> Cell:
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self.close()
 
 
 def _divides(dt: float, count: int) -> bool:
     """Whether Bullet, told to cut `count * dt` seconds into `count` steps, makes just that many of
     just `dt`: where rounding is against it, it makes one fewer."""
     return count > 1 and count * dt / count == dt and int(count * dt / dt) == count
-
-
-def camera_intrinsics(camera: CameraConfig) -> Intrinsics:
-    """The configured camera's intrinsics; the wrist camera has a field of view of its own."""
-    fov = camera.fov_deg if camera.mount == "overhead" else camera.wrist_fov_deg
-    return Intrinsics(camera.width, camera.height, fov, camera.near, camera.far)
-
-
-def wrist_mount(camera: CameraConfig) -> np.ndarray:
-    """(4, 4) T_EC: the wrist camera beside the hand, looking along the approach."""
-    T = np.eye(4)
-    # Image right is E's +y, the closing line; at home image up points away from the robot.
-    T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    T[:3, 3] = camera.wrist_position
-    return T

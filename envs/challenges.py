@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from envs.base_cell import BaseCell
 from envs.beliefs import CameraBeliefs, true_beliefs, wrong_beliefs
-from envs.cell import Cell
 from envs.disturbances import Conveyor, Displacement
 
 _STREAM = 7  # keeps these draws apart from the scene's of the same seed
@@ -32,7 +32,12 @@ class Challenge:
     miscalibrated: bool = False
     latency: float = 0.0
 
-    def motion(self, cell: Cell, attempt: int) -> Displacement | Conveyor | None:
+    @property
+    def plain(self) -> bool:
+        """Whether nothing makes it hard beside its layout."""
+        return self == Challenge(self.layout)
+
+    def motion(self, cell: BaseCell, attempt: int) -> Displacement | Conveyor | None:
         """What happens to the objects during an attempt, 0 being the first."""
         rng = self._rng(cell, attempt)
         if not cell.remaining:
@@ -47,7 +52,7 @@ class Challenge:
             return conveyor(rng, place, centre, self.speed, self.turning)
         return None
 
-    def beliefs(self, cell: Cell) -> CameraBeliefs:
+    def beliefs(self, cell: BaseCell) -> CameraBeliefs:
         """Where the cameras are believed to be, in every attempt of a round."""
         if not self.miscalibrated:
             return true_beliefs(cell)
@@ -55,7 +60,7 @@ class Challenge:
         rng = self._rng(cell, -1)
         return wrong_beliefs(cell, rng, off.camera_shift, np.radians(off.camera_turn_deg))
 
-    def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
+    def _rng(self, cell: BaseCell, attempt: int) -> np.random.Generator:
         return np.random.default_rng([cell.scene.seed, attempt + 1, _STREAM])
 
 

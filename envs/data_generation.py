@@ -14,7 +14,7 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -34,6 +34,7 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, dense_labels
 from utils.label_trials import Trial, draw_pairs
+from utils.random_ranges import changed, draw
 
 SPLITS = ("train", "validation")
 HELD_OUT = 10  # every tenth training object is kept for validation
@@ -41,6 +42,7 @@ FRAMES_PER_SCENE = 4  # the whole scene, then parts of it as they are met on the
 SCENES_PER_SHARD = 8
 MOST_DRAWS = 100  # of one scene, each of which makes tries of its own
 _LAYOUT_SHARES = {"isolated": 0.15, "packed": 0.35, "pile": 0.5}
+_PHYSICS = ("object_friction", "object_mass")  # what labels and their trials can depend on
 _FIRST_SEED = {"train": 1_000_000_000, "validation": 2_000_000_000}  # never met in evaluation
 
 
@@ -61,6 +63,9 @@ def _content(config: Config) -> str:
     chosen["data"] = {
         key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")
     }
+    if config.data.randomise_physics:
+        physics = everything["randomization"]["physics"]
+        chosen["physics"] = {key: physics[key] for key in _PHYSICS}
     chosen["generation"] = {
         "held_out": HELD_OUT,
         "frames_per_scene": FRAMES_PER_SCENE,
@@ -244,6 +249,8 @@ def label_scene(
     configured = cell.config.camera
     for number in range(FRAMES_PER_SCENE):
         part = _part(scene, rng) if number else scene
+        if config.data.randomise_physics:
+            part = with_other_physics(part, config, number)
         cell.load(part)
         look = Appearance.draw(rng, len(part.placements))
         intrinsics, T_WC = draw_camera(rng, configured)
@@ -268,6 +275,25 @@ def _part(scene: Scene, rng: np.random.Generator) -> Scene:
     count = int(rng.integers(max(total - 3, 1), total + 1))
     kept = np.sort(rng.choice(total, count, replace=False))
     return Scene(scene.layout, scene.seed, tuple(scene.placements[i] for i in kept))
+
+
+def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
+    """Frame `number` of a scene with each object's friction and mass changed, in the physics and in
+    the labels alike. Draws of their own: everything else about the frame stays as it is."""
+    rng = np.random.default_rng([config.seed, scene.seed, 2, number])
+    ranges, placements = config.randomization.physics, []
+    for placed in scene.placements:
+        friction, mass = (getattr(ranges, name) for name in _PHYSICS)
+        model = placed.model
+        heavier = changed(mass.operation, model.mass, draw(mass, rng))
+        model = replace(
+            model,
+            friction=changed(friction.operation, model.friction, draw(friction, rng)),
+            mass=heavier,
+            inertia=model.inertia * (heavier / model.mass),
+        )
+        placements.append(replace(placed, model=model))
+    return replace(scene, placements=tuple(placements))
 
 
 def execute_pairs(cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator) -> list[Trial]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.cell import Cell
+from envs.base_cell import BaseCell
 from envs.kinematics import (
     Trajectory,
     UnreachableError,
@@ -73,7 +73,7 @@ class Around(NamedTuple):
     pose: np.ndarray | None
 
 
-def open_loop(cell: Cell, grasp: Grasp) -> Around:
+def open_loop(cell: BaseCell, grasp: Grasp) -> Around:
     """Bring the open gripper around a grasp as planned, without looking again. Raises
     ArmStoppedError on a collision and UnreachableError before anything has moved."""
     settings = cell.config.execution
@@ -89,10 +89,10 @@ def open_loop(cell: Cell, grasp: Grasp) -> Around:
     return Around(cell.step, target)
 
 
-Approach = Callable[[Cell, Grasp], Around]
+Approach = Callable[[BaseCell, Grasp], Around]
 
 
-def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
+def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
     """Approach, close, lift, hold, carry to the bin, release, go home.
 
     Success: one object gripped by both fingers, off the table, its centre of mass above
@@ -124,7 +124,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     return GraspOutcome(outcome, cell.seconds - start, index, detail, stopped_at)
 
 
-def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
+def _pick(cell: BaseCell, grasp: Grasp, approach: Approach) -> int:
     """From home to an object held above the lift height; its number. Raises GraspFailure."""
     settings = cell.config.execution
     around = approach(cell, grasp)
@@ -145,12 +145,12 @@ def _pick(cell: Cell, grasp: Grasp, approach: Approach) -> int:
     return index
 
 
-def _still_lifted(cell: Cell, index: int) -> None:
+def _still_lifted(cell: BaseCell, index: int) -> None:
     if not cell.is_lifted(index, cell.config.execution.lift_height):
         raise GraspFailure("dropped", index)
 
 
-def _carry_to_bin(cell: Cell, index: int) -> None:
+def _carry_to_bin(cell: BaseCell, index: int) -> None:
     over_bin = top_down_pose([*BIN_CENTRE, BIN_HEIGHT + 0.17], -np.pi / 2)
     posture = choose_posture(cell, over_bin)
     carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
@@ -163,7 +163,7 @@ def _carry_to_bin(cell: Cell, index: int) -> None:
     cell.retire(index)
 
 
-def _close(cell: Cell, wait: Callable[[int], None]) -> None:
+def _close(cell: BaseCell, wait: Callable[[int], None]) -> None:
     """Close the fingers until they stop moving."""
     cell.robot.command_gripper(0.0)
     before = cell.robot.opening
@@ -175,7 +175,7 @@ def _close(cell: Cell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: Cell) -> None:
+def _go_home(cell: BaseCell) -> None:
     """Open, rise on a straight line if the hand is low, and return to the home posture."""
     robot = cell.robot
     robot.command_gripper(MAX_OPENING)
@@ -194,7 +194,7 @@ def _go_home(cell: Cell) -> None:
         _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
 
 
-def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
+def choose_posture(cell: BaseCell, pose: np.ndarray) -> np.ndarray:
     """Joint positions (7,) for a gripper pose or the same grasp turned by half a turn, whichever
     is nearer to home. Raises UnreachableError if neither can be reached."""
     found, error = [], None
@@ -213,12 +213,12 @@ def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ HALF_TURN
 
 
-def _line(cell: Cell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
+def _line(cell: BaseCell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
     speed = cell.config.execution.approach_speed
     return cell.robot.straight_move(q, pose, speed, cell.home, **_scales(cell))
 
 
-def _scales(cell: Cell) -> dict[str, float]:
+def _scales(cell: BaseCell) -> dict[str, float]:
     robot = cell.config.robot
     return {
         "velocity_scale": robot.velocity_scale,
@@ -226,7 +226,7 @@ def _scales(cell: Cell) -> dict[str, float]:
     }
 
 
-def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> None:
+def _follow(cell: BaseCell, trajectory: Trajectory, stop_force: float | None = None) -> None:
     """Run a trajectory; raises ArmStoppedError, with the arm held where it is, at a contact above
     `stop_force` N and where the gate refuses to go on."""
     for q, velocity in zip(trajectory.positions, trajectory.velocities):

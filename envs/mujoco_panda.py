@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pybullet_data
 
-from envs.kinematics import JOINT_LOWER, JOINT_TORQUE, JOINT_UPPER
+from envs.guarded_arm import GuardedArm
+from envs.kinematics import (
+    JOINT_LOWER,
+    JOINT_TORQUE,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    forward_kinematics,
+)
+from envs.panda import FINGER_SPEED, GRIP_COSINE, MAX_OPENING
+from envs.safety import ArmGate
 from utils.errors import UserError
 
 if TYPE_CHECKING:
@@ -23,6 +32,7 @@ if TYPE_CHECKING:
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 HAND, GRASP_TARGET = "panda_hand", "panda_grasptarget"
+_HAND_LINKS = ("panda_link7", "panda_link8", HAND)  # one link in PyBullet's cell
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
 
 
@@ -106,6 +116,7 @@ def panda_spec() -> mujoco.MjSpec:
         body.mass, body.ipos, body.fullinertia = inertial
         body.iquat = [1, 0, 0, 0]
         body.explicitinertial = True
+        body.gravcomp = 1.0  # Franka's controller carries the arm's own weight
     for i, name in enumerate(ARM_JOINTS):
         joint = spec.joint(name)
         joint.range = [JOINT_LOWER[i], JOINT_UPPER[i]]  # the URDF's are wider
@@ -164,43 +175,166 @@ def _urdf() -> str:
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-class MujocoPanda:
-    """The Panda alone in MuJoCo: `model` and `data` are MuJoCo's own."""
+class MujocoPanda(GuardedArm):
+    """The Panda in MuJoCo with the commands of `envs.panda.Panda`; model and data are MuJoCo's.
 
-    def __init__(self, spec: mujoco.MjSpec | None = None):
-        self._mujoco = load_mujoco()
-        self.model = (spec or panda_spec()).compile()
+    gate: what every command to the arm passes. dt: s, a control period, in which MuJoCo takes
+    `substeps` steps of its own. grip_force: N a finger. Raises UserError without MuJoCo.
+    """
+
+    def __init__(
+        self,
+        gate: ArmGate,
+        spec: mujoco.MjSpec | None = None,
+        dt: float = 1 / 240,
+        substeps: int = 2,
+        grip_force: float = 10.0,
+    ):
+        self._mujoco, self.gate = load_mujoco(), gate
+        spec = spec or panda_spec()
+        spec.option.timestep = dt / substeps
+        self.dt, self.substeps, self.grip_force = dt, substeps, grip_force
+        self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
-        self._arm = [self.model.joint(name).qposadr[0] for name in ARM_JOINTS]
-        self._fingers = [self.model.joint(name).qposadr[0] for name in FINGER_JOINTS]
+        joints = [self.model.joint(name) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
+        self._places = [joint.qposadr[0] for joint in joints]
+        self._speeds = [joint.dofadr[0] for joint in joints]
+        bodies = [self.model.body(i) for i in range(self.model.nbody)]
+        self._links = {body.name: body.id for body in bodies if body.name.startswith("panda_")}
+        self.links = list(self._links.values())  # MuJoCo's numbers of the robot's bodies
+        self._is_robot = np.isin(self.model.geom_bodyid, self.links)
+        self.limit_speed(JOINT_VELOCITY.max())
+        self.place(np.zeros(7))
+
+    # --- State --------------------------------------------------------------------------------
 
     @property
     def q(self) -> np.ndarray:
         """(7,) joint positions, rad."""
-        return self.data.qpos[self._arm].copy()
+        return self.data.qpos[self._places[:7]].copy()
 
     @property
     def opening(self) -> float:
         """Distance between the fingertips, m."""
-        return float(self.data.qpos[self._fingers].sum())
+        return float(self.data.qpos[self._places[7:]].sum())
 
-    def place(self, q: np.ndarray, opening: float = 0.08) -> None:
-        """Put the robot at joint positions q (7,) and an opening in metres, at rest."""
-        self.data.qpos[self._arm], self.data.qpos[self._fingers] = q, opening / 2
-        self.data.qvel[:] = 0
-        self.command(q, opening)
-        self._mujoco.mj_forward(self.model, self.data)
-
-    def command(self, q: np.ndarray, opening: float) -> None:
-        """Targets of the servos: q (7,) rad, opening in metres."""
-        self.data.ctrl[:7], self.data.ctrl[7] = q, opening
-
-    def step(self, count: int = 1) -> None:
-        """Advance by so many of the model's time steps."""
-        self._mujoco.mj_step(self.model, self.data, count)
+    def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
+        return self.q, self.data.qvel[self._speeds[:7]].copy(), self.opening
 
     def pose(self, body: str) -> np.ndarray:
         """(4, 4) pose in W of a link's frame, by its name in the URDF."""
         T, found = np.eye(4), self.data.body(body)
         T[:3, :3], T[:3, 3] = found.xmat.reshape(3, 3), found.xpos
         return T
+
+    def tip_pose(self) -> np.ndarray:
+        """(4, 4) T_WE."""
+        return forward_kinematics(self.q)
+
+    # --- Motion -------------------------------------------------------------------------------
+
+    def place(self, q: np.ndarray, opening: float = MAX_OPENING) -> None:
+        """Put the robot at joint positions q (7,) and an opening in metres, at rest."""
+        self.data.qpos[self._places] = [*q, opening / 2, opening / 2]
+        self.data.qvel[:] = 0
+        self._stay(q)
+        self.command_gripper(opening)
+        self.data.ctrl[:7], self.data.ctrl[7] = q, opening
+        self._mujoco.mj_forward(self.model, self.data)
+
+    def limit_speed(self, speed: float) -> None:
+        """No joint is driven faster than `speed` rad/s; the servos themselves are not held back."""
+        self._fastest = np.minimum(JOINT_VELOCITY, speed)
+
+    def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        self._goal, self._speed = np.asarray(q, dtype=float), None
+        # The servo's damping brakes the wanted motion, too: stiffness x this takes it back.
+        self._reference = self._goal + _DAMPING_RATIO_OF_STIFFNESS * np.asarray(velocity)
+
+    def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
+        self._goal = np.asarray(q, dtype=float)
+        self._reference, self._speed = self.q, np.minimum(self._fastest, speeds)
+
+    def command_gripper(self, opening: float, force: float | None = None) -> None:
+        """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
+        force = self.grip_force if force is None else force
+        self.model.actuator_forcerange[7] = [-force, force]
+        self._opening = min(max(float(opening), 0.0), MAX_OPENING)
+
+    def step(self, count: int = 1) -> None:
+        """Advance by so many control periods."""
+        for _ in range(count):
+            control, reach = self.data.ctrl, 2 * FINGER_SPEED * self.dt
+            control[7] += min(max(self._opening - control[7], -reach), reach)
+            control[:7] = self._arm_target()
+            self._mujoco.mj_step(self.model, self.data, self.substeps)
+
+    def _arm_target(self) -> np.ndarray:
+        if self._speed is None:
+            return self._reference
+        way = self._goal - self._reference
+        step = np.clip(way, -self._speed * self.dt, self._speed * self.dt)
+        self._reference = self._reference + step
+        return self._reference + _DAMPING_RATIO_OF_STIFFNESS * step / self.dt
+
+    # --- Contacts -----------------------------------------------------------------------------
+
+    def grip_forces(self, body: int) -> tuple[float, float]:
+        """Newtons with which the left and the right finger press a body towards each other.
+
+        A contact counts where `envs.panda.Panda.grip_forces` counts it.
+        """
+        closing, inwards = self.tip_pose()[:3, 1], []
+        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
+        for sign, name in zip((-1.0, 1.0), ("panda_leftfinger", "panda_rightfinger")):
+            force = 0.0
+            for number, normal in self._contacts_between(self._links[name], body):
+                share = sign * float(normal @ closing)
+                if share > GRIP_COSINE:
+                    force += share * self._normal_force(number)
+            inwards.append(force)
+        return inwards[0], inwards[1]
+
+    def holds(self, body: int, min_force: float = 0.1) -> bool:
+        """Whether both fingers grip the body with at least `min_force` newtons each."""
+        return min(self.grip_forces(body)) >= min_force
+
+    def touches(self) -> bool:
+        """Whether anything touches the robot."""
+        return len(self._robot_contacts()) > 0
+
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        hand = [self._links[name] for name in _HAND_LINKS]
+        numbers = self._robot_contacts()
+        bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
+        palm = numbers[np.isin(bodies, hand).any(axis=1)]
+        return any(self._normal_force(number) > 0 for number in palm)
+
+    def contact_force(self) -> float:
+        """Sum of the normal forces in newtons on the robot by what is not the robot."""
+        return sum(map(self._normal_force, self._robot_contacts()))
+
+    def meet(self, one: int, other: int) -> bool:
+        """Whether two bodies, by MuJoCo's numbers, touch."""
+        return any(True for _ in self._contacts_between(one, other))
+
+    def _robot_contacts(self) -> np.ndarray:
+        """Numbers of the contacts between the robot and anything else."""
+        ours = self._is_robot[self.data.contact.geom]
+        return np.flatnonzero(ours[:, 0] != ours[:, 1])
+
+    def _contacts_between(self, one: int, other: int):
+        """Number of each contact of two bodies, and its normal (3,) in W, into `other`."""
+        contact = self.data.contact
+        for number, bodies in enumerate(self.model.geom_bodyid[contact.geom].tolist()):
+            if bodies == [one, other]:
+                yield number, contact.frame[number, :3]
+            elif bodies == [other, one]:
+                yield number, -contact.frame[number, :3]
+
+    def _normal_force(self, number: int) -> float:
+        force = np.zeros(6)
+        self._mujoco.mj_contactForce(self.model, self.data, number, force)
+        return float(force[0])

@@ -1,7 +1,7 @@
 """A scene of the cell in MuJoCo: table, bin, objects and Panda where PyBullet's cell has them.
 
-Same sizes, masses, inertias and friction; contacts are MuJoCo's own. Camera poses and intrinsics
-are the cell's, see `camera_of`. Knows nothing of policies.
+Same sizes, masses, inertias and friction; contacts are MuJoCo's own. What happens in it is for
+`envs.mujoco_cell`.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.camera import Intrinsics
-from envs.mujoco_panda import MujocoPanda, load_mujoco, panda_spec
+from envs.mujoco_camera import add_view
+from envs.mujoco_panda import load_mujoco, panda_spec
 from envs.objects import ObjectModel
 from envs.scenes import Scene
 from envs.world import BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, GRAVITY, TABLE_CENTRE, TABLE_SIZE
-from utils.transforms import pose_matrix
 
 if TYPE_CHECKING:
     import mujoco
@@ -27,56 +26,39 @@ _TABLE_COLOUR, _BIN_COLOUR = (0.62, 0.60, 0.57, 1.0), (0.25, 0.35, 0.45, 1.0)
 _NO_FRICTION = 1e-5
 # m and dimensionless lengths of torsional and rolling friction, MuJoCo's defaults.
 _TORSION, _ROLLING = 0.005, 1e-4
+# s, in which a contact gets rid of a penetration. MuJoCo's default, 20 ms, is so soft that objects
+# of 30 g creep and turn in a grip of 10 N (by 1.6 mm in half a second, with this by 0.5 mm).
+_CONTACT_TIME = 0.005
 
 
-class MujocoScene(MujocoPanda):
-    """The Panda with a scene around it; `frequency` in Hz is that of the physics steps.
+def scene_spec(scene: Scene) -> mujoco.MjSpec:
+    """A model of Panda, table, bin and the scene's objects at their resting poses, with a camera.
 
-    Objects start at the scene's resting poses, the robot at `home` (7,) rad with an open hand.
-    Raises UserError without MuJoCo.
+    Bodies are called `table`, `bin0` to `bin3` and `object0` on. Raises UserError without MuJoCo.
     """
-
-    def __init__(self, scene: Scene, home: np.ndarray, frequency: int = 500):
-        mujoco = load_mujoco()
-        spec = panda_spec()
-        spec.option.timestep = 1 / frequency
-        spec.option.gravity = [0, 0, -GRAVITY]
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.impratio = 10  # of friction's stiffness: grasped objects creep less
-        for name in ("panda_leftfinger", "panda_rightfinger"):
-            for geom in spec.body(name).geoms:
-                geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
-        _box(
-            mujoco, spec, "table", [*(TABLE_SIZE / 2), _TABLE_THICKNESS / 2],
-            [*TABLE_CENTRE, -_TABLE_THICKNESS / 2], _TABLE_COLOUR,
-        )  # fmt: skip
-        for i, (size, position) in enumerate(_bin_walls()):
-            _box(mujoco, spec, f"bin{i}", size, position, _BIN_COLOUR)
-        for i, placed in enumerate(scene.placements):
-            _add_object(mujoco, spec, f"object{i}", placed.model, placed.position,
-                        placed.quaternion)  # fmt: skip
-        # The base stands on the table.
-        exclude = spec.add_exclude()
-        exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
-        super().__init__(spec)
-        self.count = len(scene.placements)
-        self.place(np.asarray(home, dtype=float))
-
-    def object_pose(self, index: int) -> np.ndarray:
-        """(4, 4) pose in W of an object's body frame, whose origin is its centre of mass."""
-        found = self.data.body(f"object{index}")
-        x, y, z, w = np.roll(found.xquat, -1)
-        return pose_matrix(found.xpos, (x, y, z, w))
-
-
-def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
-    """What MuJoCo calls the cell's camera: fovy in degrees, pos (3,) and mat (3, 3) in W, whose
-    columns are right, up and backwards."""
-    return {
-        "fovy": intrinsics.fov_deg,
-        "pos": T_WC[:3, 3].copy(),
-        "mat": T_WC[:3, :3] @ np.diag([1.0, -1.0, -1.0]),
-    }
+    mujoco = load_mujoco()
+    spec = panda_spec()
+    spec.option.gravity = [0, 0, -GRAVITY]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 100  # of friction's stiffness: grasped objects creep less
+    for name in ("panda_leftfinger", "panda_rightfinger"):
+        for geom in spec.body(name).geoms:
+            geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
+    _box(
+        mujoco, spec, "table", [*(TABLE_SIZE / 2), _TABLE_THICKNESS / 2],
+        [*TABLE_CENTRE, -_TABLE_THICKNESS / 2], _TABLE_COLOUR,
+    )  # fmt: skip
+    for i, (size, position) in enumerate(_bin_walls()):
+        _box(mujoco, spec, f"bin{i}", size, position, _BIN_COLOUR)
+    for i, placed in enumerate(scene.placements):
+        _add_object(mujoco, spec, f"object{i}", placed.model, placed.position, placed.quaternion)
+    # The base stands on the table.
+    exclude = spec.add_exclude()
+    exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
+    for geom in spec.geoms:
+        geom.solref[0] = _CONTACT_TIME
+    add_view(spec)
+    return spec
 
 
 def _box(mujoco, spec: mujoco.MjSpec, name: str, half_size, position, colour) -> None:

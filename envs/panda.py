@@ -17,32 +17,27 @@ import pybullet
 import pybullet_data
 from scipy.spatial.transform import Rotation
 
+from envs.guarded_arm import GuardedArm
 from envs.kinematics import (
-    CARTESIAN_ACCELERATION,
     JOINT_LOWER,
     JOINT_TORQUE,
     JOINT_UPPER,
     JOINT_VELOCITY,
     TOOL_LENGTH,
-    Trajectory,
-    UnreachableError,
-    forward_kinematics,
-    inverse_kinematics,
-    rotation_vector,
-    time_path,
 )
-from envs.safety import ArmGate, ArmStoppedError, contact_reason
+from envs.safety import ArmGate
 from utils.files import write_atomic
 
 MAX_OPENING = 0.08  # m between the fingertips
 FINGER_SPEED = 0.05  # m/s a finger, from the Franka Hand's product manual
+GRIP_COSINE = np.cos(np.radians(70))  # of the steepest contact normal that counts as a grip
 
 # Link numbers in the model that `panda_urdf` writes; the hand is part of the last arm link.
 ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
 
-class Panda:
+class Panda(GuardedArm):
     """The robot's body in one physics client.
 
     position_gain, velocity_gain, gripper_gain: factors on the motors' gains. latency: physics steps
@@ -116,34 +111,6 @@ class Panda:
         self._clock += count
         return count
 
-    def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s.
-        Gives the q that was sent: another one where the gate has slowed the arm. Raises
-        ArmStoppedError, the arm being told to stay where it is, where the gate lets nothing pass.
-        """
-        try:
-            q, velocity = self.gate.passed(q, velocity)
-        except ArmStoppedError:
-            self.hold()
-            raise
-        self._send_arm(q, velocity)
-        return q
-
-    def hold(self) -> None:
-        """Tell the arm to stay where it is, which is allowed everywhere."""
-        self._stay(self.q)
-
-    def stop_on_contact(self, limit: float) -> None:
-        """Hold the arm and raise ArmStoppedError if more than `limit` newtons press against it."""
-        reason = contact_reason(self.contact_force(), limit)
-        if reason is not None:
-            self.hold()
-            raise ArmStoppedError(reason, contact=True)
-
-    def _stay(self, q: np.ndarray) -> None:
-        self.gate.restart(q)
-        self._send_arm(q, np.zeros(7))
-
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         self._send(
             pybullet.setJointMotorControlArray, self.body, ARM, pybullet.POSITION_CONTROL,
@@ -153,12 +120,7 @@ class Panda:
             physicsClientId=self.client,
         )  # fmt: skip
 
-    def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
-        """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
-        nor than `speed` rad/s. Raises ArmStoppedError, and sends nothing, where the gate refuses
-        q."""
-        self.gate.admit(q)
-        speeds = [min(limit, speed) for limit in self.gate.speeds]
+    def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
         self._send(self._drive, q.tolist(), speeds, self.position_gain * _DRIVE_GAIN)
 
     def _drive(self, q: list[float], speeds: list[float], gain: float) -> None:
@@ -218,45 +180,6 @@ class Panda:
         """Distance between the fingertips in metres."""
         return self.joint_state()[2]
 
-    def joint_move(self, start: np.ndarray, goal: np.ndarray, **scales: float) -> Trajectory:
-        """The quickest synchronous motion between joint positions (7,) within all limits."""
-        waypoints = np.linspace(start, goal, 2)
-        return time_path(
-            waypoints, np.array([0.0, 1.0]), dt=self.dt,
-            max_speed=np.inf, max_acceleration=np.inf, **scales,
-        )  # fmt: skip
-
-    def straight_move(
-        self, start: np.ndarray, goal: np.ndarray, speed: float, rest: np.ndarray, **scales: float
-    ) -> Trajectory:
-        """E moves on a straight line from FK(start) to the pose `goal` (4, 4), turning evenly.
-
-        start: joint positions (7,). speed: peak Cartesian speed in m/s. Raises UnreachableError if
-        any point of the line cannot be reached or the arm would have to jump between postures.
-        """
-        T = forward_kinematics(start)
-        distance = float(np.linalg.norm(goal[:3, 3] - T[:3, 3]))
-        turn = rotation_vector(T[:3, :3].T @ goal[:3, :3])
-        # A radian counts as 0.2 m, so that a turn on the spot gets waypoints and time as well.
-        length = max(distance, 0.2 * float(np.linalg.norm(turn)), 1e-6)
-        count = max(2, int(np.ceil(length / _WAYPOINT_SPACING)) + 1)
-        waypoints = [np.asarray(start, dtype=float)]
-        for share in np.linspace(0, 1, count)[1:]:
-            pose = np.eye(4)
-            pose[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-            pose[:3, 3] = (1 - share) * T[:3, 3] + share * goal[:3, 3]
-            q = inverse_kinematics(pose, waypoints[-1], rest)
-            if abs(q - waypoints[-1]).max() > _MAX_JUMP:
-                raise UnreachableError(
-                    f"the straight line to {np.round(goal[:3, 3], 3).tolist()} m passes too near a "
-                    "singular posture of the arm; choose another approach"
-                )
-            waypoints.append(q)
-        return time_path(
-            np.array(waypoints), np.linspace(0, length, count), dt=self.dt,
-            max_speed=speed, max_acceleration=CARTESIAN_ACCELERATION, **scales,
-        )  # fmt: skip
-
     def grip_forces(self, body: int) -> tuple[float, float]:
         """Newtons with which the left and the right finger press a body towards each other.
 
@@ -281,7 +204,7 @@ class Panda:
                 share = -sign * (
                     normal[0] * closing[0] + normal[1] * closing[1] + normal[2] * closing[2]
                 )
-                if share > _GRIP_COSINE:
+                if share > GRIP_COSINE:
                     force += share * contact[9]
             inwards.append(force)
         return inwards[0], inwards[1]
@@ -310,11 +233,8 @@ class Panda:
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
 _POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
-_GRIP_COSINE = np.cos(np.radians(70))
 _STATE_JOINTS = [*ARM, *FINGERS]
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
-_WAYPOINT_SPACING = 0.01  # m
-_MAX_JUMP = 0.3  # rad between neighbouring waypoints
 
 
 def panda_urdf(cache_dir: Path, fine: bool) -> Path:

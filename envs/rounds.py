@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from envs.base_cell import BaseCell, PhysicsError
 from envs.beliefs import CameraBeliefs, teach
-from envs.cell import Cell, PhysicsError
 from envs.challenges import CHALLENGES
 from envs.disturbances import disturbed
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
@@ -33,7 +33,7 @@ ROOM_OVER_TOUCH = 0.004  # m
 
 
 def run_round(
-    cell: Cell,
+    cell: BaseCell,
     scene: Scene,
     plan: Callable[[RGBDFrame], list[Grasp]],
     *,
@@ -110,7 +110,7 @@ def run_round(
     )  # fmt: skip
 
 
-def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
+def believed(cell: BaseCell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
     """A frame of the cell's camera, taken now, with the camera where it is believed to be. An image
     in which no table is found cannot be levelled."""
     mount, T_WE = cell.config.camera.mount, forward_kinematics(cell.robot.q)

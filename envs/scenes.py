@@ -25,7 +25,8 @@ _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
 _PILE_WALLS = {"half_size": 0.12, "height": 0.30, "thickness": 0.02}  # m
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
 _PACKED_GAP = 0.004  # m, least distance between neighbours
-_REST_SPEED = 0.01  # m/s or (times 10) rad/s under which an object counts as resting
+REST_SPEED = 0.01  # m/s or (times 10) rad/s under which an object counts as resting
+LOOK_EVERY = 12  # steps between two looks at whether objects rest
 _TRIES = 50
 
 
@@ -97,13 +98,14 @@ def make_scene(
 def settle(client: int, bodies: list[int], config: Config, looks: int = 1) -> bool:
     """Step until the bodies rest; False if they still move after scene.settle_seconds.
 
-    looks: how many times in a row, 12 steps apart, they must be found at rest. One look cannot tell
-    a body that rests from one that begins to topple or turns round at the top of a bounce.
+    looks: how many times in a row, LOOK_EVERY steps apart, they must be found at rest. One look
+    cannot tell a body that rests from one that begins to topple or turns round at the top of a
+    bounce.
     """
     found = 0
     for step in range(int(config.scene.settle_seconds * config.sim.frequency)):
         pybullet.stepSimulation(physicsClientId=client)
-        if step % 12 == 11:
+        if step % LOOK_EVERY == LOOK_EVERY - 1:
             found = found + 1 if all(_resting(client, body) for body in bodies) else 0
             if found == looks:
                 return True
@@ -112,7 +114,7 @@ def settle(client: int, bodies: list[int], config: Config, looks: int = 1) -> bo
 
 def _resting(client: int, body: int) -> bool:
     linear, angular = pybullet.getBaseVelocity(body, physicsClientId=client)
-    return max(map(abs, linear)) < _REST_SPEED and max(map(abs, angular)) < 10 * _REST_SPEED
+    return max(map(abs, linear)) < REST_SPEED and max(map(abs, angular)) < 10 * REST_SPEED
 
 
 def _inside(position, config: Config) -> bool:

@@ -22,6 +22,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pybullet
 
+from envs.base_cell import BaseCell
 from envs.camera import Intrinsics, render
 from envs.cell import Cell
 from envs.objects import load_object_set
@@ -38,15 +39,18 @@ _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 
 class Studio:
     """Takes pictures of a cell. Close it, or use it in a `with` block."""
 
-    def __init__(self, cell: Cell, width: int = 640, height: int = 480):
+    def __init__(self, cell: BaseCell, width: int = 640, height: int = 480):
         self._cell = cell
-        self._twin = Cell(cell.config, fine=True)
+        # Only PyBullet's cell has detailed meshes to show; another shows itself.
+        self._twin = Cell(cell.config, fine=True) if isinstance(cell, Cell) else None
         self._intrinsics = Intrinsics(width, height, fov_deg=45.0, near=0.05, far=5.0)
         self._T_WC = look_at(SCENIC_EYE, SCENIC_TARGET)
 
     def picture(self) -> np.ndarray:
         """(H, W, 3) uint8 picture of the cell as it is now."""
         cell, twin = self._cell, self._twin
+        if twin is None:
+            return cell.image(self._intrinsics, self._T_WC, _LIGHT).rgb
         if twin.scene is not cell.scene:
             twin.build(cell.scene)
         joints = [*ARM, *FINGERS]
@@ -59,7 +63,8 @@ class Studio:
         return render(twin.client, self._intrinsics, self._T_WC, twin.renderer, _LIGHT).rgb
 
     def close(self) -> None:
-        self._twin.close()
+        if self._twin is not None:
+            self._twin.close()
 
     def __enter__(self) -> Studio:
         return self
@@ -71,14 +76,14 @@ class Studio:
 class Film:
     """Films a cell from now on, at `rate` pictures a second of simulated time, until written."""
 
-    def __init__(self, cell: Cell, rate: int = 6, width: int = 480, height: int = 368):
+    def __init__(self, cell: BaseCell, rate: int = 6, width: int = 480, height: int = 368):
         self._cell, self._rate = cell, rate
         self._studio = Studio(cell, width, height)
         self._pictures: list[np.ndarray] = []
         self._every = max(1, round(1 / (rate * cell.dt)))
         cell.on_step = self._on_step
 
-    def _on_step(self, cell: Cell) -> None:
+    def _on_step(self, cell: BaseCell) -> None:
         if cell.steps % self._every == 0:
             self._pictures.append(self._studio.picture())
 

@@ -59,28 +59,27 @@ def median_plate_length(samples: Sequence[RealSample]) -> float:
 
 @torch.inference_mode()
 def best_rectangle(
-    model: GraspNet, sample: RealSample, view: View, plate_length: float
+    model: GraspNet, sample: RealSample, view: View, plate_length: float | None
 ) -> tuple[GraspRectangle, float]:
     """The network's best grasp on an image, in that image's pixels, and its quality.
 
-    plate_length: pixels of the image, what the rectangle measures across the closing line. The
-    model has to be in evaluation mode.
+    plate_length: pixels of the image, what the rectangle measures across the closing line; None:
+    half of the opening. The model has to be in evaluation mode.
     """
     rgb, depth, _ = view.warp(sample)
     device = next(model.parameters()).device
     x = to_input(rgb, depth)[None].to(device, memory_format=torch.channels_last)
     found = find_peaks(*model(x), BEST)
     zoom = view.size / view.side
-    there = GraspRectangle(
-        found.pixel[0], float(found.angle[0]),
-        max(float(found.width[0]) / view.metres_per_pixel, 1e-3), plate_length * zoom,
-    )  # fmt: skip
+    opening = max(float(found.width[0]) / view.metres_per_pixel, 1e-3)
+    plates = opening / 2 if plate_length is None else plate_length * zoom
+    there = GraspRectangle(found.pixel[0], float(found.angle[0]), opening, plates)
     back = np.linalg.inv(view.matrix(sample.depth.shape))
     return there.transformed(back), float(found.quality[0])
 
 
 def judge(
-    model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float
+    model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float | None
 ) -> list[Judged]:
     """The rectangle metric of the best grasp on every image; the model ends in evaluation mode."""
     model.eval()

@@ -13,6 +13,7 @@ from envs.cell import Cell
 from envs.objects import load_object_set
 from envs.panda import ARM, FINGERS
 from envs.scenes import make_scene
+from envs.worlds import make_cell
 from utils.config import load_config
 from utils.config_schema import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
@@ -508,3 +509,36 @@ def test_automatic_ranges_learn_from_episodes():
     assert info["randomization"]["bound"] is not None
     assert not last["is_success"] and adaptive.width < width
     env.close()
+
+
+def test_parts_are_drawn_alone(wild, cell):
+    """What is not varied is as it is; what is varied is what it would be with everything."""
+    settings = wild.randomization
+    both = DomainRandomizer(cell, settings).randomize(seed=5)
+    physics, vision = (
+        DomainRandomizer(cell, settings.model_copy(update={"parts": (part,)})).randomize(seed=5)
+        for part in ("physics", "vision")
+    )
+    assert physics["physics"] == both["physics"] and physics["vision"] == {}
+    assert physics["colours"] is None and not physics["shadow"] and not physics["depth_noise"]
+    assert set(physics["textures"]) == {None}
+    assert vision["physics"] == {} and set(vision["vision"]) == set(VISION)
+    assert vision["colours"] == both["colours"] and vision["textures"] == both["textures"]
+
+
+def test_physics_alone_does_not_change_the_picture(wild, cell):
+    before = cell.frame()
+    settings = wild.randomization.model_copy(update={"parts": ("physics",)})
+    DomainRandomizer(cell, settings).randomize(seed=5)
+    after = cell.frame()
+    assert np.array_equal(before.rgb, after.rgb) and np.array_equal(before.depth, after.depth)
+
+
+def test_an_evaluation_meets_the_same_world_for_every_policy(scene):
+    config = load_config(None, [*EXTREME, "evaluate.randomise=true"])
+    with make_cell(config) as cell:
+        frictions = []
+        for _ in range(2):
+            cell.build(scene)
+            frictions.append(pybullet.getDynamicsInfo(cell.bodies[0], -1, cell.client)[1])
+    assert frictions[0] == frictions[1] != scene.placements[0].model.friction

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pybullet
 import pytest
 import torch
 
@@ -29,6 +30,7 @@ from envs.data_generation import (
     label_scene,
     missing_shards,
     object_sets,
+    with_other_physics,
 )
 from envs.objects import ObjectError
 from envs.scenes import SceneError
@@ -462,6 +464,26 @@ def test_without_randomisation_the_plain_camera_sees_plain_objects(tiny_data, ce
     random = load_config(None, [*tiny_data[1], "data.executed_share=0"])
     first, _ = next(label_scene(random, scene, "primitives", cell))
     assert not np.allclose(first.frame.T_WC, expected.T_WC)
+
+
+def test_physics_of_labels(tiny_data, cell_with_scene):
+    """Friction 0.7 to 1.3 of the object's own, mass 0.5 to 1.5, inertia with it; each frame others;
+    what is labelled is what is simulated."""
+    cell, scene = cell_with_scene
+    config = load_config(None, [*tiny_data[1], "data.randomise_physics=true"])
+    first, again, second = (with_other_physics(scene, config, number) for number in (0, 0, 1))
+    for old, new, same, other in zip(*(s.placements for s in (scene, first, again, second))):
+        heavier = new.model.mass / old.model.mass
+        assert 0.7 <= new.model.friction / old.model.friction <= 1.3 and 0.5 <= heavier <= 1.5
+        np.testing.assert_allclose(new.model.inertia, heavier * old.model.inertia)
+        assert (new.model.friction, new.model.mass) == (same.model.friction, same.model.mass)
+        assert new.model.friction != other.model.friction
+        assert new.model.parts is old.model.parts
+    cell.build(first)
+    for number, solid in enumerate(cell.truth().objects):
+        simulated = pybullet.getDynamicsInfo(cell.bodies[number], -1, cell.client)
+        assert solid.friction == simulated[1] == first.placements[number].model.friction
+        assert simulated[0] == pytest.approx(first.placements[number].model.mass)
 
 
 def test_a_grasp_that_blows_up_the_simulation_has_failed(cell_with_scene, monkeypatch):

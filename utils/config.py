@@ -44,6 +44,7 @@ from utils.config_schema import (
     ServoConfig,
     SimConfig,
     TrainConfig,
+    TransferPolicy,
     WorkspaceConfig,
 )
 from utils.errors import UserError, did_you_mean
@@ -66,6 +67,7 @@ __all__ = [
     "ServoConfig",
     "SimConfig",
     "TrainConfig",
+    "TransferPolicy",
     "WorkspaceConfig",
     "changed_keys",
     "dump_config",

@@ -190,12 +190,39 @@ class EvaluateConfig(Section):
     scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(_no_repeats)]
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
     rounds: Count
+    randomise: bool
     workers: Count | None
     max_failures: Count
     videos: Annotated[int, Field(ge=0)]
     film_format: Literal["mp4", "gif"]
     gallery: Annotated[int, Field(ge=0)]
     name: Name | None
+
+
+TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell"]
+
+
+class TransferPolicy(NamedTuple):
+    """A row of the transfer report. policy, training: what the reader is told. planner: as in
+    evaluate.policies. train_with: the command that makes the planner's file."""
+
+    policy: str
+    training: str
+    planner: str
+    train_with: str | None
+
+
+TransferRow = Annotated[
+    tuple[Name, Name, Name, Name | None],
+    Field(strict=False, description="a list of policy, training, planner, command or null"),
+    AfterValidator(lambda values: TransferPolicy(*values)),
+]
+
+
+class TransferConfig(Section):
+    policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(_no_repeats)] | None
+    worlds: Annotated[tuple[TransferWorld, ...], Several, AfterValidator(_no_repeats)]
+    cornell: Annotated[Path, Field(strict=False)] | None
 
 
 class DataConfig(Section):
@@ -210,6 +237,7 @@ class DataConfig(Section):
     object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
     max_objects: Annotated[int, Field(ge=2, le=12)]
     randomise: bool
+    randomise_physics: bool
     executed_share: Annotated[float, Field(ge=0, le=1)]
     workers: Count | None
 
@@ -443,6 +471,7 @@ class AdaptiveConfig(Section):
 
 
 class RandomizationConfig(Section):
+    parts: Annotated[tuple[Literal["physics", "vision"], ...], Several, AfterValidator(_no_repeats)]
     physics: PhysicsRangesConfig
     vision: VisionRangesConfig
     colour_share: Fraction
@@ -452,12 +481,19 @@ class RandomizationConfig(Section):
     depth_noise_share: Fraction
     adaptive: AdaptiveConfig
 
+    @model_validator(mode="after")
+    def _adaptive_ranges_are_of_physics(self) -> RandomizationConfig:
+        if self.adaptive.enabled and "physics" not in self.parts:
+            raise ValueError("adaptive ranges are those of physics: add it to parts")
+        return self
+
 
 class Config(Section):
     """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
+    world: Literal["pybullet", "mujoco"]
     sim: SimConfig
     robot: RobotConfig
     camera: CameraConfig
@@ -471,6 +507,7 @@ class Config(Section):
     data: DataConfig
     train: TrainConfig
     evaluate: EvaluateConfig
+    transfer: TransferConfig
     env: EnvConfig
     rl: RLConfig
     randomization: RandomizationConfig

@@ -67,8 +67,9 @@ class DomainRandomizer:
         self._arm, self._fingers = tuple(arm), tuple(fingers)
         self._seeds = np.random.default_rng(seed)
         self.textures = TextureRandomizer(settings.texture_folder)
-        self._limits = _ranges(settings.physics)
-        self._vision = _ranges(settings.vision)
+        self._varies_view = "vision" in settings.parts
+        self._limits = _ranges(settings.physics) if "physics" in settings.parts else {}
+        self._vision = _ranges(settings.vision) if self._varies_view else {}
         self.adaptive = None
         if settings.adaptive.enabled:
             self.adaptive = AdaptiveRanges(self._limits, settings.adaptive)
@@ -153,14 +154,17 @@ class DomainRandomizer:
             self.textures.draw(rng) if coloured and rng.random() < settings.texture_share else None
             for _ in range(count + 1)
         ]
+        shadow, noisy = rng.random(2) < (settings.shadow_share, settings.depth_noise_share)
+        if not self._varies_view:
+            coloured, textures, shadow, noisy = False, [None] * (count + 1), False, False
         return {
             "version": _VERSION,
             "seed": seed,
             "bound": None if bound is None else list(bound),
             "colours": colours if coloured else None,
             "textures": textures,
-            "shadow": int(rng.random() < settings.shadow_share),
-            "depth_noise": bool(rng.random() < settings.depth_noise_share),
+            "shadow": int(shadow),
+            "depth_noise": bool(noisy),
             "physics": _draws(physics, rng, sizes, "episode"),
             "vision": _draws(self._vision, rng, sizes, "episode"),
             "each_step": {

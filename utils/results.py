@@ -360,14 +360,14 @@ def format_table(rows: Sequence[Row]) -> str:
     if any(row.turn_ms_p95 is not None for row in rows):  # of a closed loop
         for line, cell in zip([header, *lines], ["turn ms, 95 %", *map(turn_ms_in_words, rows)]):
             line.insert(-1, cell)
-    return _aligned(header, lines, to_the_right=(5, 6))
+    return aligned(header, lines, to_the_right=(5, 6))
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     """Paired differences in points as aligned text on stdout; nothing if there are none."""
     if comparisons:
         header = ("paired difference", "scenario", "objects", "success", "cleared", "rounds")
-        print("\n" + _aligned(header, [_difference_cells(pair) for pair in comparisons]))
+        print("\n" + aligned(header, [_difference_cells(pair) for pair in comparisons]))
 
 
 def _difference_cells(pair: Comparison) -> tuple[str, ...]:
@@ -382,9 +382,10 @@ def _difference_cells(pair: Comparison) -> tuple[str, ...]:
     return (*names, points(pair.success), points(pair.cleared), rounds)
 
 
-def _aligned(
+def aligned(
     header: Sequence[str], lines: Sequence[Sequence[str]], to_the_right: Sequence[int] = ()
 ) -> str:
+    """Lines of cells under a header, as text in columns of even width."""
     lines = [header, *lines]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])

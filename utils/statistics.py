@@ -1,4 +1,4 @@
-"""How sure a rate is: intervals for one policy and for the difference between two.
+"""How sure a rate is, how two policies differ, and how well one world foretells another.
 
 This module knows numbers only, nothing of grasps or simulators.
 """
@@ -82,6 +82,46 @@ def paired_difference_interval(
     tail = (1 - confidence) / 2
     low, high = np.quantile(rates_a - rates_b, [tail, 1 - tail])
     return Difference(float(value), float(low), float(high), len(a))
+
+
+def pearson_correlation(a: ArrayLike, b: ArrayLike) -> float | None:
+    """Pearson's r of two lists of numbers (N,): 1 where one grows in a line with the other.
+
+    None where it is undefined: fewer than two numbers, or a list that never changes. Raises
+    ValueError on lists that do not pair up.
+    """
+    a, b = _paired("pearson_correlation", a, b)
+    if len(a) < 2:
+        return None
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(np.clip(a @ b / size, -1.0, 1.0)) if size > 1e-12 else None
+
+
+def mean_maximum_rank_violation(real: ArrayLike, simulated: ArrayLike) -> float | None:
+    """How badly a simulation mixes up the order of policies, 0 (not at all) to 1.
+
+    real, simulated: (N,) success rates of N policies in both worlds. Where the simulation orders
+    two policies otherwise than they really are, the violation is the real difference of their
+    rates; of each policy the worst counts, and of these the mean. Li et al., "Evaluating real-world
+    robot manipulation policies in simulation" (SIMPLER, CoRL 2024), section 3.2. None for no
+    policy. Raises ValueError on lists that do not pair up.
+    """
+    real, simulated = _paired("mean_maximum_rank_violation", real, simulated)
+    if len(real) == 0:
+        return None
+    behind = real[:, None] < real[None, :]
+    mixed_up = (simulated[:, None] < simulated[None, :]) != behind
+    return float((np.abs(real[:, None] - real[None, :]) * mixed_up).max(axis=1).mean())
+
+
+def _paired(name: str, a: ArrayLike, b: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if a.ndim != 1 or a.shape != b.shape:
+        raise ValueError(f"{name}: need two lists of one length, got shapes {a.shape}, {b.shape}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError(f"{name}: the numbers must be finite")
+    return a, b
 
 
 def _counts(outcomes: ArrayLike) -> np.ndarray:

@@ -1,0 +1,160 @@
+"""What RGB-D cameras see of a MuJoCo world, drawn without a window by MuJoCo's OpenGL renderer.
+
+The same camera model, depth and light settings as `envs.camera` has for PyBullet. Knows nothing of
+robots, objects or tasks.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from envs.camera import DEFAULT_LIGHT, Image, Intrinsics
+from envs.mujoco_panda import load_mujoco
+from utils.errors import UserError
+
+if TYPE_CHECKING:
+    import mujoco
+
+CAMERA, LIGHT = "camera", "light"  # names in the model
+_MOST_SHAPES = 2000  # in one picture
+
+
+def add_view(spec: mujoco.MjSpec) -> None:
+    """Add to a model the camera and the light that `MujocoCamera` puts in place."""
+    spec.worldbody.add_camera(name=CAMERA)
+    light = spec.worldbody.add_light(name=LIGHT)
+    light.type = load_mujoco().mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.visual.quality.offsamples = 0  # mixed pixels would have mixed depths and numbers
+
+
+class MujocoCamera:
+    """Takes pictures of one model, made with `add_view`, in the state that `data` has.
+
+    Raises UserError where OpenGL cannot draw without a window. Close it before the next one.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._mujoco, self._model, self._data = load_mujoco(), model, data
+        _gl_context().make_current()
+        self._scene = self._mujoco.MjvScene(model, _MOST_SHAPES)
+        self._context = self._mujoco.MjrContext(
+            model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value
+        )
+        self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._context.readDepthMap = self._mujoco.mjtDepthMap.mjDEPTH_ZEROFAR  # exact far away
+        self._camera, self._option = self._mujoco.MjvCamera(), self._mujoco.MjvOption()
+        self._camera.type = self._mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.camera(CAMERA).id
+
+    def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
+        """What a camera at T_WC (4, 4) sees; its `bodies` are MuJoCo's numbers, -1 for none.
+
+        light: changes of `envs.camera.DEFAULT_LIGHT`, in its words.
+        """
+        mujoco, model, data = self._mujoco, self._model, self._data
+        near, far = intrinsics.near, intrinsics.far
+        extent = model.stat.extent
+        model.vis.map.znear, model.vis.map.zfar = near / extent, far / extent
+        _shine(model, DEFAULT_LIGHT | (light or {}))
+        place = camera_of(intrinsics, T_WC)
+        number = self._camera.fixedcamid
+        model.cam_fovy[number] = place["fovy"]
+        mujoco.mj_kinematics(model, data)  # a step leaves poses one step behind
+        mujoco.mj_camlight(model, data)
+        data.cam_xpos[number] = place["pos"]
+        data.cam_xmat[number] = place["mat"].ravel()
+        mujoco.mjv_updateScene(
+            model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        rgb, _ = self._draw(intrinsics, as_numbers=False)
+        colours, inverse = self._draw(intrinsics, as_numbers=True)
+        # With the far plane at 0, what is stored is linear in one over the depth.
+        depth = near * far / (near + (far - near) * inverse)
+        nothing = inverse <= 0
+        rgb[nothing], depth[nothing] = 255, 0.0  # empty space is white in PyBullet, black here
+        return Image(rgb, depth.astype(np.float32), self._bodies(colours))
+
+    def _draw(self, intrinsics: Intrinsics, as_numbers: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Colours (H, W, 3) uint8 and the depth buffer (H, W), or numbers of shapes as colours."""
+        mujoco, width, height = self._mujoco, intrinsics.width, intrinsics.height
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            self._scene.flags[flag] = as_numbers
+        _gl_context().make_current()
+        if (self._context.offWidth, self._context.offHeight) != (width, height):
+            mujoco.mjr_resizeOffscreen(width, height, self._context)
+        whole = mujoco.MjrRect(0, 0, width, height)
+        rgb = np.empty((height, width, 3), np.uint8)
+        depth = np.empty((height, width), np.float32)
+        mujoco.mjr_render(whole, self._scene, self._context)
+        mujoco.mjr_readPixels(rgb, depth, whole, self._context)
+        return rgb[::-1].copy(), depth[::-1].astype(float)  # OpenGL's first row is the lowest
+
+    def _bodies(self, colours: np.ndarray) -> np.ndarray:
+        """(H, W) numbers of the bodies whose shapes were drawn, from the shapes' colours."""
+        body_of = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for shape in self._scene.geoms[: self._scene.ngeom]:
+            if shape.segid >= 0 and shape.objtype == self._mujoco.mjtObj.mjOBJ_GEOM:
+                body_of[shape.segid + 1] = self._model.geom_bodyid[shape.objid]
+        return body_of[colours.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16])]
+
+    def close(self) -> None:
+        if self._context is not None:
+            _gl_context().make_current()
+            self._context.free()
+            self._context = None
+
+
+def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
+    """What MuJoCo calls the cell's camera: fovy in degrees, pos (3,) and mat (3, 3) in W, whose
+    columns are right, up and backwards."""
+    return {
+        "fovy": intrinsics.fov_deg,
+        "pos": T_WC[:3, 3].copy(),
+        "mat": T_WC[:3, :3] @ np.diag([1.0, -1.0, -1.0]),
+    }
+
+
+def _shine(model: mujoco.MjModel, light: dict) -> None:
+    """Light settings in PyBullet's words: its direction is that towards the light."""
+    direction, colour = (np.array(light[k], float) for k in ("lightDirection", "lightColor"))
+    number = model.light(LIGHT).id
+    model.light_dir[number] = -direction / np.linalg.norm(direction)
+    model.light_pos[number] = light["lightDistance"] * -model.light_dir[number]
+    model.light_ambient[number] = light["lightAmbientCoeff"] * colour
+    model.light_diffuse[number] = light["lightDiffuseCoeff"] * colour
+    model.light_specular[number] = light["lightSpecularCoeff"] * colour
+    model.light_castshadow[number] = bool(light["shadow"])
+    for part in ("ambient", "diffuse", "specular"):
+        setattr(model.vis.headlight, part, [0.0, 0.0, 0.0])
+
+
+@functools.cache
+def _gl_context():
+    """One OpenGL context for all cameras of the process.
+
+    Where no screen is named, EGL, which needs none: MuJoCo itself asks for a window unless the
+    environment variable MUJOCO_GL says otherwise when it is imported.
+    """
+    mujoco = load_mujoco()
+    headless = not (os.environ.get("DISPLAY") or os.environ.get("MUJOCO_GL"))
+    try:
+        if headless and sys.platform == "linux":
+            from mujoco.egl import GLContext
+        else:
+            GLContext = mujoco.GLContext
+        context = GLContext(64, 64)
+        context.make_current()
+    except Exception as error:  # of OpenGL's many: its loaders raise what they like
+        raise UserError(
+            f"world=mujoco: no OpenGL context to draw with ({type(error).__name__}: {error}); "
+            "install libegl1 (Mesa's needs no graphics card), or set MUJOCO_GL to egl, osmesa or "
+            "glfw"
+        ) from error
+    atexit.register(context.free)
+    return context

@@ -1,0 +1,54 @@
+"""The simulators that a cell can be built in, chosen by the config's key `world`."""
+
+from __future__ import annotations
+
+from envs.base_cell import BaseCell
+from envs.cell import Cell
+from envs.challenges import CHALLENGES
+from envs.mujoco_cell import MujocoCell
+from utils.config import Config, with_settings
+from utils.domain_randomization import DomainRandomizer
+from utils.errors import UserError
+from utils.results import OPEN_LOOP
+
+WORLDS = {"pybullet": Cell, "mujoco": MujocoCell}
+
+
+def make_cell(config: Config) -> BaseCell:
+    """A cell in the configured world; with evaluate.randomise, one that differs from scene to scene
+    by what the section `randomization` says, the same way for the same scene."""
+    check_world(config)
+    cell = WORLDS[config.world](config)
+    if config.evaluate.randomise:
+        randomizer = DomainRandomizer(cell, config.randomization)
+        cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
+    return cell
+
+
+def in_world(config: Config, world: str) -> Config:
+    """The config of an evaluation in a world of the transfer report: `pybullet`, `mujoco`, or
+    `outside`, which is PyBullet changed by the section `randomization`."""
+    config = with_settings(config, "evaluate", {"randomise": world == "outside"})
+    return config.model_copy(update={"world": "mujoco" if world == "mujoco" else "pybullet"})
+
+
+def check_world(config: Config) -> None:
+    """Raise UserError for what is to be evaluated and cannot be had in the configured world."""
+    if config.world == "pybullet":
+        return
+    plan = config.evaluate
+    if plan.randomise:
+        raise UserError("evaluate.randomise=true changes PyBullet's physics; use world=pybullet")
+    plain = [name for name, challenge in CHALLENGES.items() if challenge.plain]
+    for scenario in plan.scenarios:
+        if scenario not in plain:
+            raise UserError(
+                f"evaluate.scenarios: {scenario} disturbs the cell, which world={config.world} "
+                f"cannot; there are {', '.join(plain)}, or use world=pybullet"
+            )
+    for controller in plan.controllers or (config.grasp.controller,):
+        if controller != OPEN_LOOP:
+            raise UserError(
+                f"controller {controller} needs the wrist camera of world=pybullet; use it or "
+                f"evaluate.controllers={OPEN_LOOP}"
+            )
