@@ -19,6 +19,7 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
 from envs.approach import Outline
 from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
+from envs.grasp_goals import GraspGoals
 from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -54,6 +55,7 @@ _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _NEAR_SIDE, _NEAR_HEIGHT = 0.04, (0.01, 0.10)  # m, of episodes that begin near an object
 _NEAR = 0.03  # m, see `object_offset`
+_LEANING = 0.2  # rad that an object may lean before its grasps from above are looked for again
 _GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
@@ -88,8 +90,9 @@ class RobotGraspingEnv(gymnasium.Env):
         Phi = (1 - tanh(3 w) / 2 - tanh(20 w) / 2) / 4    while nothing is gripped
         Phi = (1 + h) / 2                                 while both fingers grip the object
 
-    where w is the way in metres that the hand has to go to be around the nearest object, see
-    `envs.approach`, and h in [0, 1] is how far the object has risen from where it rested at reset
+    where w is the way in metres that the hand has to go: with `goal` "object" to be around the
+    nearest object, see `envs.approach`; with "grasp" to the nearest grasp that the only object
+    offers, see `envs.grasp_goals`; and h in [0, 1] is how far the object has risen from where it rested at reset
     towards `lift_height`. The two tanh pay for coming near from afar, and for the last centimetre.
 
     `sparse`: 1 at success, else 0.
@@ -103,7 +106,7 @@ class RobotGraspingEnv(gymnasium.Env):
     refused), `scene_seed`; and what no robot is told: `grasped`, `object_position` (3,), and of the
     same nearest object `object_offset` (6,), from E to its centre along E's axes, in metres and as
     tanh(metres / 0.03), which tells the last centimetres finely, and `object_outline` (9,), see
-    `envs.approach`.
+    `envs.approach`; with `goal` "grasp" also `grasp_goal` (11,), see `envs.grasp_goals`.
 
     Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
     file, or None for the defaults. Any key of the config's `env` section can be given by name:
@@ -194,6 +197,7 @@ class RobotGraspingEnv(gymnasium.Env):
         )
         self.cell.load(scene)
         self._outlines = [Outline(placement.model.parts) for placement in scene.placements]
+        self._goals = self._goals_now() if self.settings.goal == "grasp" else None
         q = self.cell.home.copy()
         if start == "near":
             q = self._near_an_object()
@@ -228,6 +232,9 @@ class RobotGraspingEnv(gymnasium.Env):
             return inverse_kinematics(T, self.cell.home, self.cell.home)
         except UnreachableError:
             return self.cell.home.copy()
+
+    def _goals_now(self) -> GraspGoals:
+        return GraspGoals(self.cell.truth(), self.cell.object_pose(0))
 
     def step(
         self, action: np.ndarray
@@ -394,17 +401,23 @@ class RobotGraspingEnv(gymnasium.Env):
         self._object_positions, self._object_position = positions, positions[nearest]
         self._nearest = nearest
         self._T_WE = forward_kinematics(q)
-        self._view = self._outlines[nearest].seen_from(cell.object_pose(nearest), self._T_WE)
+        T_WO = cell.object_pose(nearest)
+        self._view = self._outlines[nearest].seen_from(T_WO, self._T_WE)
         touches = cell.robot.touches()
         if touches and self._calm:
             cell.wake()
             self._calm = False
         self._grasped = touches and cell.robot.holds(cell.bodies[nearest])
+        if self._goals is not None:
+            if not self._grasped and self._goals.tilt(T_WO) > _LEANING:
+                self._goals = self._goals_now()
+            self._goal_view = self._goals.seen_from(T_WO, self._T_WE)
 
     def _progress(self) -> float:
         """The potential Phi in [0, 1]; see the class."""
         if not self._grasped:
-            way = self._view.way_to_grasp(float(self._state[14]))
+            view = self._view if self._goals is None else self._goal_view
+            way = view.way_to_grasp(float(self._state[14]))
             return 0.25 - (math.tanh(3.0 * way) + math.tanh(20.0 * way)) / 8
         rest = self._resting_heights[self._nearest]
         way = max(self.settings.lift_height - rest, _SHORTEST_LIFT)
@@ -434,7 +447,8 @@ class RobotGraspingEnv(gymnasium.Env):
         }
 
     def _info(self, reason: str | None) -> dict[str, Any]:
-        return {
+        goal = {} if self._goals is None else {"grasp_goal": self._goal_view.told()}
+        return goal | {
             "is_success": reason == "success",
             "reason": reason,
             "object_position": self._object_position.copy(),

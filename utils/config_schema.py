@@ -257,6 +257,7 @@ class EnvConfig(Section):
     objects: ObjectSet
     scenario: Scenario
     reward: Literal["dense", "sparse"]
+    goal: Literal["object", "grasp"]
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
     lift_height: Annotated[float, Field(gt=0, le=0.4)]
@@ -266,6 +267,12 @@ class EnvConfig(Section):
     joint_step: Positive
     gripper_step: Positive
     near_share: Annotated[float, Field(ge=0, le=1)]
+
+    @model_validator(mode="after")
+    def _goals_of_one_object(self) -> EnvConfig:
+        if self.goal == "grasp" and self.scenario != "isolated":
+            raise ValueError("goal 'grasp' is for one object: it needs scenario 'isolated'")
+        return self
 
 
 EnvArgument = Annotated[
