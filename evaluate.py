@@ -36,9 +36,11 @@ from envs.cell import Cell
 from envs.challenges import CHALLENGES
 from envs.execution import GraspOutcome
 from envs.objects import ObjectSet, load_object_set, prepare
+from envs.policy_approach import SCENARIOS, TOLD_A_ROBOT, PolicyApproach, nowhere_yet
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
+from models.grasp_policy import SavedPolicy, load_policy
 from models.planners import make_planner
 from utils.config import OBJECT_SETS, Config, load_config, parse_args, run_script
 from utils.errors import UserError
@@ -47,6 +49,7 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.overlay import contact_sheet, draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
+    OPEN_LOOP,
     RoundRecord,
     append_round,
     compare,
@@ -64,6 +67,8 @@ from utils.runs import check_writable, git_state, new_run_folder
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 MOST_FAILURES = 24  # on failures.png
+LEARNED = "ppo"
+SHIPPED = Path(__file__).resolve().parent / "checkpoints" / "ppo_box.pt"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -104,7 +109,44 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def check_policies(config: Config) -> None:
     """Raise UserError for a policy that does not exist or a network that cannot be loaded."""
     for name in config.evaluate.policies:
-        make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+        if is_learned(name):
+            check_learned(name, config)
+        else:
+            make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+
+
+def is_learned(name: str) -> bool:
+    """Whether a policy is one of train_rl.py's, which sees and moves in turns and plans nothing."""
+    return name == LEARNED or name.startswith(f"{LEARNED}:")
+
+
+@functools.cache
+def learned(name: str) -> SavedPolicy:
+    """The policy `ppo`, as shipped, or `ppo:FILE.pt`."""
+    _, _, file = name.partition(":")
+    return load_policy(Path(file) if file else SHIPPED)
+
+
+def check_learned(name: str, config: Config) -> None:
+    """Raise UserError for a policy that cannot be loaded or cannot play what is asked for."""
+    policy, plan = learned(name), config.evaluate
+    told = [part.key for part in policy.layout.state if part.key not in TOLD_A_ROBOT]
+    if told:
+        raise UserError(
+            f"evaluate.policies: {name} was trained to be told {', '.join(told)}, which no robot "
+            "knows; score it with benchmarks.bench_policy"
+        )
+    for scenario in plan.scenarios:
+        if scenario not in SCENARIOS:
+            raise UserError(
+                f"evaluate.policies: {name} takes one object that stays where it is, so that it "
+                f"cannot play {scenario!r}; allowed with it are evaluate.scenarios="
+                f"{','.join(SCENARIOS)}"
+            )
+    if any(controller != OPEN_LOOP for _, controller in contestants(config)):
+        raise UserError(
+            f"evaluate.controllers: {name} is its own controller; use {OPEN_LOOP} with it"
+        )
 
 
 def workspace_of(config: Config) -> Workspace:
@@ -327,8 +369,12 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     workspace = workspace_of(config)
     rounds, pictures, films = [], [], []
     for planner_name, controller in task.policies:
-        policy = contestant(planner_name, controller)
-        planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
+        policy, approach = contestant(planner_name, controller), None
+        if is_learned(planner_name):
+            approach = _approach_of(planner_name)
+            planner = nowhere_yet
+        else:
+            planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
         privileged = getattr(planner, "needs_truth", False)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
@@ -341,6 +387,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
                 cell, scene, planner, policy=planner_name, objects=task.objects,
                 max_failures=config.evaluate.max_failures, scenario=task.scenario,
                 controller=controller, with_truth=privileged, on_attempt=keep,
+                approach_by=approach,
             )
         )  # fmt: skip
         if film is not None:
@@ -350,6 +397,13 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
             film.write(path)
             films.append((path, f"{policy} on {task.scenario}"))
     return rounds, pictures, films
+
+
+@functools.cache
+def _approach_of(name: str) -> PolicyApproach:
+    """In this worker's cell."""
+    policy = learned(name)
+    return PolicyApproach(_worker_cell, policy, policy.config)
 
 
 def picture(

@@ -15,7 +15,7 @@ from utils.descents import LabelSettings, judge, undersides
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace
 from utils.height_map import height_map_from_scene
 
-ANGLES = 18  # closing lines that are tried, over half a turn
+ANGLES = 12  # closing lines that are tried, over half a turn
 MOST = 64  # goals of one object
 
 _HAND = GripperGeometry()
@@ -26,7 +26,7 @@ _DARING = replace(
     max_wedge=np.deg2rad(45), wedge_scale=0.6, tilt_scale=1.0,
 )  # fmt: skip
 _GOOD = 0.85
-_CELL = 0.0015  # m, of the height map; a goal is tried for every second cell along and across
+_CELL = 0.002  # m, of the height map; a goal is tried for every second cell along and across
 _AROUND = 0.12  # m of map around the object: half the palm, at any angle
 _ROOM = 0.005  # m between each open finger and the object
 _LEAST_ROOM = 0.003
@@ -83,27 +83,32 @@ class GraspGoals:
         price = np.hypot(offset[:, 0], offset[:, 1]) + _TURN * abs(turn) + self._price
         best = int(price.argmin())
         up = T_WO[2]
-        top = float((self._points @ up[:3]).max() + up[3] - T_WE[2, 3])
-        return GoalView(
-            offset[best], float(turn[best]), float(self._narrow[best]), float(self._wide[best]), top
-        )
+        top = float((self._points @ up[:3]).max() + up[3])
+        narrow, wide = float(self._narrow[best]), float(self._wide[best])
+        return GoalView(offset[best], float(turn[best]), narrow, wide, top, float(T_WE[2, 3]))
 
 
 class GoalView:
     """A grasp as seen from the hand. offset: (3,) m from E to it along E's axes. turn: rad in
     (-pi/2, pi/2] about E's z from the closing line to the grasp's. narrow, wide: m, the openings
-    between which the hand can come down. top: m, the object's highest point over E."""
+    between which the hand can come down. top, hand: m, heights in W of the object's highest point
+    and of E."""
 
-    def __init__(self, offset: np.ndarray, turn: float, narrow: float, wide: float, top: float):
-        self.offset, self.turn, self.narrow, self.wide, self.top = offset, turn, narrow, wide, top
+    def __init__(
+        self, offset: np.ndarray, turn: float, narrow: float, wide: float, top: float, hand: float
+    ):
+        self.offset, self.turn, self.narrow, self.wide = offset, turn, narrow, wide
+        self.top, self.hand = top, hand
 
     def told(self) -> np.ndarray:
-        """(11,): the offset in metres and as tanh(metres / 0.03), which tells the last centimetres
-        finely; sine and cosine of twice the turn, as half a turn changes nothing; the openings
-        between which to come down, and the top, m."""
+        """(11,): the offset sideways in metres, and all of it as tanh(metres / 0.03), which tells
+        the last centimetres finely; sine and cosine of twice the turn, as half a turn changes
+        nothing; the openings between which to come down, and the heights in W of grasp and top, m.
+        Over the table, as what does not depend on the hand is quicker to learn to see."""
         near = np.tanh(self.offset / 0.03)
         turn = math.sin(2 * self.turn), math.cos(2 * self.turn)
-        return np.array([*self.offset, *near, *turn, self.narrow, self.wide, self.top])
+        height = self.hand - self.offset[2]
+        return np.array([*self.offset[:2], *near, *turn, self.narrow, self.wide, height, self.top])
 
     def way_to_grasp(self, opening: float) -> float:
         """Metres that the hand, open by `opening` metres, has yet to go until it is at the grasp:
@@ -122,7 +127,7 @@ class GoalView:
             (opening - self.wide) / _EDGE,
         )
         closed = min(max(closed, 0.0), 1.0)
-        height = (1 - closed) * -float(self.offset[2]) + closed * (self.top + _OVER)
+        height = (1 - closed) * -float(self.offset[2]) + closed * (self.top - self.hand + _OVER)
         return math.hypot(x, y) + abs(height) + _TURN * abs(self.turn) + missing
 
 
@@ -137,10 +142,13 @@ def _search(scene: SceneGeometry, settings: LabelSettings) -> np.ndarray:
     around = Workspace(tuple((low + high) / 2), float((high - low).max()), scene.table_height)
     heights = height_map_from_scene(scene, around, _CELL, _AROUND)
     under = undersides(scene, heights)
-    row, column = (at[::1] for at in np.nonzero(heights.label[::2, ::2] >= 0))
+    row, column = np.nonzero(heights.label[::2, ::2] >= 0)
     row, column = 2 * row, 2 * column
     surface = np.column_stack(
-        [heights.origin + heights.cell * np.stack([column, row], axis=-1), heights.height[row, column]]
+        [
+            heights.origin + heights.cell * np.stack([column, row], axis=-1),
+            heights.height[row, column],
+        ]
     )
     rise = surface[:, 2] - scene.table_height
     surface = surface[rise > settings.table_clearance + settings.min_engagement]

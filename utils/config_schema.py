@@ -305,18 +305,22 @@ class RLConfig(Section):
     max_gradient_norm: Positive
     estimate_epochs: Count
     estimate_lr: Positive
+    estimate_memory: Annotated[int, Field(ge=0)]
+    estimate_recall: Count
     normalise_observations: bool
     normalise_rewards: bool
     squash: bool
     initial_log_std: Annotated[float, Field(ge=-5, le=2)]
     conv_channels: Annotated[tuple[Count, ...], Several]
     image_feature_dim: Count
+    relief: bool
     hidden_dim: Count
     hidden_layers: Count
     activation: Literal["tanh", "relu", "elu"]
     initial: Annotated[Path, Field(strict=False)] | None
     evaluate_every: Count
     evaluation_episodes: Count
+    films: Annotated[int, Field(ge=0)]
     target_success: Share | None
     target_return: float | None
     device: Name
