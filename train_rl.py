@@ -5,8 +5,8 @@
     torchrun --nproc_per_node=2 train_rl.py --config configs/ppo.yaml
 
 Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
-rl.films=N, films of N episodes in runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit
-on the same device and number of processes.
+rl.films=N, films of N episodes in runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on
+from last.pt, bit for bit on the same device and number of processes.
 
 No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
 all environments begin new episodes from seeds that follow from the run's seed and the number of

@@ -23,7 +23,7 @@ _STRICT = LabelSettings()
 # For what offers nothing better, such as a bowl upside down.
 _DARING = replace(
     _STRICT, table_clearance=0.002, min_engagement=0.003, clearance=0.001, room=0.003,
-    max_wedge=np.deg2rad(45), wedge_scale=0.6, tilt_scale=1.0,
+    max_wedge=np.deg2rad(38), wedge_scale=0.6, tilt_scale=1.0,
 )  # fmt: skip
 _GOOD = 0.85
 _CELL = 0.002  # m, of the height map; a goal is tried for every second cell along and across

@@ -117,9 +117,10 @@ ESTIMATED = [
 ]  # fmt: skip
 
 
-def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch):
+@pytest.mark.parametrize("memory", [0, 48])
+def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory):
     monkeypatch.chdir(tmp_path)
-    whole = [*POINT, *ESTIMATED, "rl.total_steps=128"]
+    whole = [*POINT, *ESTIMATED, "rl.total_steps=128", f"rl.estimate_memory={memory}"]
     assert train_rl.main([*whole, "rl.name=whole"]) == 0
     (run,) = Path("runs/train_rl").glob("*-whole")
     expected = load_checkpoint(run / "last.pt", KIND)["model"]
@@ -438,7 +439,9 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
     assert same(dict(first["model"]), dict(load_checkpoint(run / "last.pt", KIND)["model"]))
 
 
-@pytest.mark.parametrize("name", ["ppo", "ppo_state", "ppo_primitives", "ppo_random_urdfs"])
+@pytest.mark.parametrize(
+    "name", ["ppo", "ppo_state", "ppo_primitives", "ppo_primitives_state", "ppo_random_urdfs"]
+)
 def test_shipped_configs_are_valid(name):
     config = load_config(REPOSITORY / "configs" / f"{name}.yaml")
     hidden = {*(config.rl.privileged_observations or ()), *(config.rl.estimated_observations or ())}
