@@ -101,9 +101,11 @@ def test_a_square_tube_is_taken_by_its_walls():
 
 
 def test_what_offers_no_good_grasp_is_taken_through_the_middle():
-    """A block of 20 cm fits in no direction."""
+    """A drum of 20 cm fits in no direction and has no corners."""
     T_WO = pose([0.5, 0.0, 0.05], 0.0)
-    goals = goals_of([CORNERS * (0.1, 0.1, 0.05)], T_WO)
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rim = [np.column_stack([np.cos(angle), np.sin(angle), 0 * angle + s]) for s in (-0.5, 0.5)]
+    goals = goals_of([0.1 * np.concatenate(rim)], T_WO)
     view = goals.seen_from(T_WO, hand([0.5, 0.0, 0.3], 0.0))
     np.testing.assert_allclose(view.offset[:2], 0.0, atol=1e-9)
     assert len(goals) == 1 and view.wide == pytest.approx(0.08)
