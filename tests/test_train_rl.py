@@ -11,12 +11,14 @@ import sys
 import time
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_rl
+from envs.films import film_episode
 from envs.vector import WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy
 from models.ppo import KIND
@@ -449,3 +451,14 @@ def test_shipped_configs_are_valid(name):
     if not name.endswith("_state"):
         assert hidden and hidden < truth, "what only the critic is told"
         assert not truth & set(config.rl.policy_observations)
+
+
+def test_episodes_are_filmed(tmp_path):
+    """One picture at the start, one after each of three steps, and the last one for a while."""
+    config = load_config(None, ["env.observations=state", "env.max_steps=3", "sim.renderer=tiny"])
+    env = make_env(config, render_mode="rgb_array")
+    path = tmp_path / "films" / "0.mp4"
+    assert film_episode(env, lambda observation: np.zeros(7), 0, path) == "max_steps"
+    env.close()
+    pictures = iio.imread(path)
+    assert pictures.shape == (1 + 3 + 6, 480, 640, 3) and pictures.std() > 20
