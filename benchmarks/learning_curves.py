@@ -1,4 +1,4 @@
-"""Learning curves of train_rl.py's runs: python -m benchmarks.learning_curves FILE.png RUN [RUN ...]
+"""Learning curves of train_rl.py: python -m benchmarks.learning_curves FILE.png RUN [RUN ...]
 
 A line for each run: success of the training's own episodes (with exploration noise, and half of
 them begun near the object where the config says so), smoothed over 5,000 steps, and the
