@@ -35,7 +35,9 @@ from tqdm import tqdm
 from envs.base_cell import BaseCell
 from envs.challenges import CHALLENGES
 from envs.execution import GraspOutcome
+from envs.learned_policies import approach_by, check_learned, is_learned
 from envs.objects import ObjectSet, load_object_set, prepare
+from envs.policy_approach import nowhere_yet
 from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
@@ -132,7 +134,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def check_policies(config: Config) -> None:
     """Raise UserError for a policy that does not exist or a network that cannot be loaded."""
     for name in config.evaluate.policies:
-        make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+        if is_learned(name):
+            controllers = [controller for _, controller in contestants(config)]
+            check_learned(name, config.evaluate.scenarios, controllers)
+        else:
+            make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
 
 
 def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
@@ -404,8 +410,11 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
     workspace = workspace_of(config)
     rounds, pictures, films = [], [], []
     for planner_name, controller in task.policies:
-        policy = contestant(planner_name, controller)
-        planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
+        policy, approach = contestant(planner_name, controller), None
+        if is_learned(planner_name):
+            approach, planner = approach_by(planner_name, cell), nowhere_yet
+        else:
+            planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
         privileged = getattr(planner, "needs_truth", False)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
@@ -418,6 +427,7 @@ def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[P
                 cell, scene, planner, policy=planner_name, objects=task.objects,
                 max_failures=config.evaluate.max_failures, scenario=task.scenario,
                 controller=controller, with_truth=privileged, on_attempt=keep,
+                approach_by=approach,
             )
         )  # fmt: skip
         if film is not None:

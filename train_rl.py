@@ -4,9 +4,9 @@
     python train_rl.py rl.env_id=Pendulum-v1 rl.gamma=0.9 rl.total_steps=200000
     torchrun --nproc_per_node=2 train_rl.py --config configs/ppo.yaml
 
-Leaves best.pt (chosen by evaluations), last.pt, results.json and TensorBoard events in
-runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit
-on the same device and number of processes.
+Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
+rl.films=N, films of N episodes in runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on
+from last.pt, bit for bit on the same device and number of processes.
 
 No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
 all environments begin new episodes from seeds that follow from the run's seed and the number of
@@ -24,6 +24,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,8 @@ import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.vector import VectorEnvs, WorkerError, vector_envs
+from envs.films import film_episode
+from envs.vector import VectorEnvs, WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, policy_for
 from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
@@ -44,6 +46,7 @@ from models.rollouts import (
     Episode,
     NotFinite,
     RolloutCollector,
+    act,
     derived_seeds,
     evaluate_policy,
 )
@@ -55,7 +58,15 @@ from utils.results import write_json_atomic
 from utils.runs import git_state, new_run_folder
 from utils.stopwatch import Stopwatch
 
-FREE_TO_CHANGE = ("name", "device", "parallel", "worker_timeout", "target_success", "target_return")
+FREE_TO_CHANGE = (
+    "name",
+    "films",
+    "device",
+    "parallel",
+    "worker_timeout",
+    "target_success",
+    "target_return",
+)
 TRAINING, EVALUATION, LEARNING = range(3)  # purposes of seeds, which never share any
 
 
@@ -72,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         if us.leads:
             save_results(run, history)
+            film(config, run, ppo)
             if not finished:
                 print(f"stopped; go on after {history[-1]['step']:,} steps with --resume {run}")
     return 0 if finished else 130
@@ -179,6 +191,7 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                     place = (config.seed, TRAINING, us.rank, ppo.updates)
                     collector.restart(derived_seeds(envs.num_envs, *place))
                     ppo.rewards.restart()
+                    ppo.memory.clear()
                 place = (config.seed, LEARNING, us.rank, ppo.updates)
                 ppo.generator.manual_seed(derived_seeds(1, *place)[0])
                 begun = time.perf_counter()
@@ -224,6 +237,25 @@ def evaluate(
             else []
         )
     return {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
+
+
+def film(config: Config, run: Path, ppo: GraspPPO) -> None:
+    """The first `rl.films` episodes of the evaluations, played by the policy as it is now."""
+    if config.rl.films:
+        env = make_env(config, render_mode="rgb_array")
+        seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
+        for number, seed in enumerate(seeds[: config.rl.films]):
+            path = run / "films" / f"{number}.mp4"
+            reason = film_episode(env, partial(act_on_one, ppo), seed, path)
+            print(f"{path}: {reason}")
+        env.close()
+
+
+def act_on_one(ppo: GraspPPO, observation: Any) -> np.ndarray:
+    """(A,) the deterministic action for one observation of one environment."""
+    seen = ppo.layout.read_one(observation)
+    latent = act(ppo.network, seen, None, ppo.team.device).to(ppo.team.device)
+    return ppo.network.action(latent)[0].cpu().numpy()
 
 
 def from_all(us: Team, episodes: list[Episode]) -> list[Episode]:

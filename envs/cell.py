@@ -170,6 +170,11 @@ class Cell(BaseCell):
             raise PhysicsError(f"object {index} has a non-finite position: {position}")
         return position, quaternion
 
+    def speed(self, index: int) -> float:
+        """m/s of an object's centre of mass."""
+        velocity, _ = pybullet.getBaseVelocity(self.bodies[index], physicsClientId=self.client)
+        return math.hypot(*velocity)
+
     def held_object(self) -> int | None:
         """The object that both fingers grip, or None."""
         return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)

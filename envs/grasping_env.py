@@ -6,6 +6,7 @@ A policy moves the Panda a little at a time and is rewarded for lifting an objec
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import sys
@@ -19,6 +20,7 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
 from envs.approach import Outline
 from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
+from envs.grasp_goals import GraspGoals
 from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -31,12 +33,13 @@ from envs.kinematics import (
     pose_error,
     rotation_matrix,
 )
-from envs.objects import load_object_set
+from envs.objects import ObjectSet, load_object_set
 from envs.panda import MAX_OPENING
 from envs.scenes import make_scene
 from envs.studio import Studio
 from envs.world import on_table
 from utils.config import Config, load_config, with_settings
+from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
 
 _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
@@ -54,6 +57,8 @@ _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _NEAR_SIDE, _NEAR_HEIGHT = 0.04, (0.01, 0.10)  # m, of episodes that begin near an object
 _NEAR = 0.03  # m, see `object_offset`
+# An object that has tipped over, which offers other grasps: leaning this much, and this slow.
+_LEANING, _STILL = 0.2, 0.05  # rad, m/s
 _GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
@@ -88,9 +93,11 @@ class RobotGraspingEnv(gymnasium.Env):
         Phi = (1 - tanh(3 w) / 2 - tanh(20 w) / 2) / 4    while nothing is gripped
         Phi = (1 + h) / 2                                 while both fingers grip the object
 
-    where w is the way in metres that the hand has to go to be around the nearest object, see
-    `envs.approach`, and h in [0, 1] is how far the object has risen from where it rested at reset
-    towards `lift_height`. The two tanh pay for coming near from afar, and for the last centimetre.
+    where w is the way in metres that the hand has to go: with `goal` "object" to be around the
+    nearest object, see `envs.approach`; with "grasp" to the nearest grasp that the only object
+    offers, see `envs.grasp_goals`; and h in [0, 1] is how far the object has risen from where it
+    rested at reset towards `lift_height`. The two tanh pay for coming near from afar, and for the
+    last centimetre.
 
     `sparse`: 1 at success, else 0.
 
@@ -103,11 +110,12 @@ class RobotGraspingEnv(gymnasium.Env):
     refused), `scene_seed`; and what no robot is told: `grasped`, `object_position` (3,), and of the
     same nearest object `object_offset` (6,), from E to its centre along E's axes, in metres and as
     tanh(metres / 0.03), which tells the last centimetres finely, and `object_outline` (9,), see
-    `envs.approach`.
+    `envs.approach`; with `goal` "grasp" also `grasp_goal` (11,), see `envs.grasp_goals`.
 
     Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
     file, or None for the defaults. Any key of the config's `env` section can be given by name:
-    `gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")`.
+    `gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")`. `cell`: play
+    in this one, which others load scenes into and close, by `take_over` instead of `reset`.
     `reset(options={"scene_seed": n})` asks for one scene; the option "start" says where the hand
     begins: "home", or "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is
     easier. Without it a share `near_share` of the episodes begins near.
@@ -119,6 +127,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self,
         render_mode: str | None = None,
         config: Config | Path | str | None = None,
+        cell: Cell | None = None,
         **settings: Any,
     ):
         self._closed = True  # until everything below has been built
@@ -133,17 +142,16 @@ class RobotGraspingEnv(gymnasium.Env):
         self.metadata = self.metadata | {
             "render_fps": round(self.config.sim.frequency / self.settings.substeps)
         }
-        self.objects = load_object_set(
-            self.settings.objects,
-            cache_dir=self.config.cache_folder,
-            **self.config.objects.model_dump(),
+        self.objects = _object_set(
+            self.settings.objects, self.config.cache_folder, self.config.objects
         )
         if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             raise UserError(
                 "render_mode='human' opens a window and there is no display here; "
                 "use render_mode='rgb_array'"
             )
-        self.cell = Cell(self.config, gui=render_mode == "human")
+        self._borrowed = cell is not None
+        self.cell = cell or Cell(self.config, gui=render_mode == "human")
         self._studio: Studio | None = None
         self._running = False
         self._closed = False
@@ -193,13 +201,33 @@ class RobotGraspingEnv(gymnasium.Env):
             self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
         )
         self.cell.load(scene)
-        self._outlines = [Outline(placement.model.parts) for placement in scene.placements]
         q = self.cell.home.copy()
+        self._know_the_objects()
         if start == "near":
             q = self._near_an_object()
             self.cell.robot.place(q)
-        self.cell.robot.limit_speed(_FASTEST)
         self._calm = self.cell.calm()  # until the robot first touches something, see `_look`
+        return self._begin(q)
+
+    def take_over(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode in the cell as it is, the arm at rest; `hand_over` gives it back."""
+        self._scene_seed, self._calm = self.cell.scene.seed, False
+        self._know_the_objects()
+        return self._begin(self.cell.robot.q)
+
+    def hand_over(self) -> None:
+        """Let others move the arm again, as fast as it can."""
+        self._running = False
+        self.cell.robot.limit_speed(JOINT_VELOCITY.max())
+
+    def _know_the_objects(self) -> None:
+        placements = self.cell.scene.placements
+        self._outlines = [Outline(placement.model.parts) for placement in placements]
+        self._goals = self._goals_now() if self.settings.goal == "grasp" else None
+
+    def _begin(self, q: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode with the arm at joint positions q (7,)."""
+        self.cell.robot.limit_speed(_FASTEST)
         self._servo = ServoStep(q)  # at the commanded joint positions
         self._T_command = self._servo.reached
         self._opening_command = MAX_OPENING
@@ -228,6 +256,9 @@ class RobotGraspingEnv(gymnasium.Env):
             return inverse_kinematics(T, self.cell.home, self.cell.home)
         except UnreachableError:
             return self.cell.home.copy()
+
+    def _goals_now(self) -> GraspGoals:
+        return GraspGoals(self.cell.truth(), self.cell.object_pose(0))
 
     def step(
         self, action: np.ndarray
@@ -281,7 +312,8 @@ class RobotGraspingEnv(gymnasium.Env):
             self._closed = True
             if self._studio is not None:
                 self._studio.close()
-            self.cell.close()
+            if not self._borrowed:
+                self.cell.close()
 
     def get_gripper_width(self) -> float:
         """Distance between the fingertips in metres."""
@@ -397,17 +429,24 @@ class RobotGraspingEnv(gymnasium.Env):
         distances = [math.dist(position, self._tip) for position in positions]
         self._nearest = nearest = distances.index(min(distances))
         self._object_positions, self._object_position = positions, positions[nearest]
-        self._view = self._outlines[nearest].seen_from(poses[nearest], self._T_WE)
+        T_WO = poses[nearest]
+        self._view = self._outlines[nearest].seen_from(T_WO, self._T_WE)
         touches = cell.robot.touches()
         if touches and self._calm:
             cell.wake()
             self._calm = False
         self._grasped = touches and cell.robot.holds(cell.bodies[nearest])
+        if self._goals is not None:
+            leaning = not self._grasped and self._goals.tilt(T_WO) > _LEANING
+            if leaning and cell.speed(nearest) < _STILL:
+                self._goals = self._goals_now()
+            self._goal_view = self._goals.seen_from(T_WO, self._T_WE)
 
     def _progress(self) -> float:
         """The potential Phi in [0, 1]; see the class."""
         if not self._grasped:
-            way = self._view.way_to_grasp(float(self._state[14]))
+            view = self._view if self._goals is None else self._goal_view
+            way = view.way_to_grasp(float(self._state[14]))
             return 0.25 - (math.tanh(3.0 * way) + math.tanh(20.0 * way)) / 8
         rest = self._resting_heights[self._nearest]
         way = max(self.settings.lift_height - rest, _SHORTEST_LIFT)
@@ -440,7 +479,8 @@ class RobotGraspingEnv(gymnasium.Env):
         offset = np.empty(6)
         offset[:3] = self._view.offset
         np.tanh(self._view.offset / _NEAR, out=offset[3:])
-        return {
+        goal = {} if self._goals is None else {"grasp_goal": self._goal_view.told()}
+        return goal | {
             "is_success": reason == "success",
             "reason": reason,
             "object_position": self._object_position,
@@ -468,6 +508,12 @@ def _checked_options(options: dict[str, Any] | None, drawn: int) -> tuple[int, s
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
         raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
     return int(seed), start
+
+
+@functools.lru_cache(maxsize=4)
+def _object_set(name: str, cache_dir: Path, settings: ObjectsConfig) -> ObjectSet:
+    """One for all environments of a process: each object is made once, which takes a while."""
+    return load_object_set(name, cache_dir=cache_dir, **settings.model_dump())
 
 
 def _camera_of_env(config: Config) -> Config:

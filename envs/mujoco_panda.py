@@ -218,6 +218,11 @@ class MujocoPanda(GuardedArm):
         """Distance between the fingertips, m."""
         return float(self.data.qpos[self._places[7:]].sum())
 
+    def state(self) -> list[float]:
+        """Joint positions (7, rad), joint velocities (7, rad/s) and the gripper's opening (m)."""
+        q, velocity, opening = self.joint_state()
+        return [*q.tolist(), *velocity.tolist(), opening]
+
     def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
         return self.q, self.data.qvel[self._speeds[:7]].copy(), self.opening

@@ -21,6 +21,7 @@ from envs.disturbances import disturbed
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
 from envs.grasp_loop import ClosedLoop
 from envs.kinematics import forward_kinematics
+from envs.policy_approach import PolicyApproach
 from envs.scenes import Scene
 from utils.results import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
 from utils.servo_errors import TargetLostError
@@ -44,13 +45,14 @@ def run_round(
     controller: str = OPEN_LOOP,
     with_truth: bool = False,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
+    approach_by: PolicyApproach | None = None,
 ) -> RoundRecord:
     """Load a scene and let a planner work on it; the record of what happened.
 
     policy, objects: names for the record. scenario: a key of CHALLENGES, what happens besides;
     None: the scene's layout. controller: how the arm gets to the grasps. with_truth: the planner is
     privileged. on_attempt is called after every executed grasp with the frame it was planned on
-    (for pictures).
+    (for pictures). approach_by: a policy that finds its grasps on the way, whatever is planned.
     """
     scenario = scenario or scene.layout
     challenge = CHALLENGES[scenario]
@@ -78,8 +80,12 @@ def run_round(
                 # What is worked out of an image late is what a late image would have been worth.
                 late = challenge.latency + cell.config.grasp.compute_seconds
                 approach = ClosedLoop(cell, controller, seen, beliefs, taught, late)
+            elif approach_by is not None:
+                approach = approach_by
             with disturbed(cell, challenge.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
+            if approach_by is not None and approach_by.closed_at is not None:
+                grasp = approach_by.closed_at
             on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
             attempts.append(
                 AttemptRecord(

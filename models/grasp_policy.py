@@ -36,6 +36,10 @@ __all__ = [
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
+RELIEF_SCALE, RELIEF_LIMIT = (
+    0.03,
+    5.0,
+)  # m to which a relief is scaled; and how far, scaled, it goes
 PIXEL_STEP = 4  # of pixels whose statistics are taken, along rows and columns; others are alike
 LOG_2PI = math.log(2 * math.pi)
 
@@ -87,7 +91,9 @@ class GraspPolicyNetwork(nn.Module):
     layers. image_channels: 4 for RGB-D; 0 for a policy without an image. privileged_dim: numbers
     that only the critic sees (asymmetric actor-critic, Pinto et al., RSS 2018).
     conv_channels: of the encoder's 3x3 convolutions with stride 2. squash: see ActionDistribution.
-    normalise: by running statistics, see `observe`.
+    normalise: by running statistics, see `observe`. relief: the encoder also sees how far each
+    pixel stands out of the image's median depth (that of the table, mostly): a centimetre there is
+    little in the depth of half a metre. The last image channel is then the depth.
 
     estimated_dim: of the privileged numbers, the first so many are estimated from image and state
     by layers of their own, the `eyes`: encoder and estimator. Policy and critic then see these
@@ -115,6 +121,7 @@ class GraspPolicyNetwork(nn.Module):
         normalise: bool = True,
         initial_log_std: float = 0.0,
         estimated_dim: int = 0,
+        relief: bool = False,
     ):
         super().__init__()
         self.model_args = {
@@ -123,15 +130,16 @@ class GraspPolicyNetwork(nn.Module):
             "privileged_dim": privileged_dim, "conv_channels": list(conv_channels),
             "hidden_layers": hidden_layers, "activation": activation, "squash": squash,
             "normalise": normalise, "initial_log_std": initial_log_std,
-            "estimated_dim": estimated_dim,
+            "estimated_dim": estimated_dim, "relief": relief,
         }  # fmt: skip
         self.squash, self.normalise, self.estimated_dim = squash, normalise, estimated_dim
+        self.relief = relief
         self.image_norm = ObservationNormaliser(image_channels)
         self.state_norm = ObservationNormaliser(state_dim)
         self.privileged_norm = ObservationNormaliser(privileged_dim)
         self.encoder = None
         if image_channels:
-            self.encoder = encoder(image_channels, conv_channels, image_feature_dim)
+            self.encoder = encoder(image_channels + relief, conv_channels, image_feature_dim)
         seen = state_dim + (image_feature_dim if image_channels else 0)
         widths, kind = [hidden_dim] * hidden_layers, ACTIVATIONS[activation]
         self.estimator = None
@@ -220,9 +228,10 @@ class GraspPolicyNetwork(nn.Module):
         state = self._normalised_state(state)
         if self.encoder is None:
             return state
-        if self.normalise:
-            image = self.image_norm(image.movedim(1, -1)).movedim(-1, 1)
-        return torch.cat([self.encoder(image), state], -1)
+        parts = [self.image_norm(image.movedim(1, -1)).movedim(-1, 1) if self.normalise else image]
+        if self.relief:
+            parts.append(relief_of(image[:, -1:]))
+        return torch.cat([self.encoder(torch.cat(parts, 1)), state], -1)
 
     def _distribution(self, features: torch.Tensor) -> ActionDistribution:
         log_std = self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
@@ -234,6 +243,14 @@ class GraspPolicyNetwork(nn.Module):
                 privileged = self.privileged_norm(privileged)
             features = torch.cat([features, privileged], -1)
         return self.value_head(self.critic(features)).squeeze(-1)
+
+
+def relief_of(depth: torch.Tensor) -> torch.Tensor:
+    """(B, 1, H, W) how far each pixel is nearer than the image's median depth, scaled and limited,
+    from depths (B, 1, H, W) in metres."""
+    some = depth[:, :, ::PIXEL_STEP, ::PIXEL_STEP].flatten(1)
+    rise = some.median(1).values[:, None, None, None] - depth
+    return (rise / RELIEF_SCALE).clamp(-RELIEF_LIMIT, RELIEF_LIMIT)
 
 
 def encoder(channels: int, conv_channels: Sequence[int], features: int) -> nn.Sequential:
@@ -299,6 +316,7 @@ def policy_for(
         settings.normalise_observations,
         settings.initial_log_std,
         sum(int(np.prod(part.shape)) for part in estimated),
+        settings.relief,
     )
     network.action_low.copy_(low)
     network.action_high.copy_(high)
@@ -307,11 +325,12 @@ def policy_for(
 
 class SavedPolicy(NamedTuple):
     """network: in evaluation mode. layout: what it sees of an environment's observations. extra:
-    anything else plain that was saved."""
+    anything else plain that was saved. config: that of its training, as plain data."""
 
     network: GraspPolicyNetwork
     layout: ObservationLayout
     extra: dict
+    config: dict
 
     def __call__(self, observation: dict[str, np.ndarray] | np.ndarray) -> np.ndarray:
         """(A,) the deterministic action for one observation of one environment."""
@@ -327,4 +346,5 @@ def load_policy(path: Path | str) -> SavedPolicy:
     network = GraspPolicyNetwork(**checkpoint["model_args"])
     load_weights(network, checkpoint, path)
     extra = checkpoint["extra"]
-    return SavedPolicy(network.eval(), ObservationLayout.from_plain(extra["layout"]), extra)
+    layout = ObservationLayout.from_plain(extra["layout"])
+    return SavedPolicy(network.eval(), layout, extra, checkpoint["config"])

@@ -155,4 +155,5 @@ def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed
         return PLANNERS[name](gripper, workspace, seed)
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
-    raise unknown_choice("evaluate.policies", name, [*PLANNERS, "a GraspNet checkpoint FILE.pt"])
+    others = ("a GraspNet checkpoint FILE.pt", "ppo", "ppo:FILE.pt")
+    raise unknown_choice("evaluate.policies", name, [*PLANNERS, *others])

@@ -20,7 +20,8 @@ from torch import nn
 from models.normalisers import RewardScaler
 from models.observations import ObservationLayout, Observations
 from models.ranks import ALONE, average, gather, share_weights
-from models.rollouts import NotFinite, Rollout
+from models.rollouts import NotFinite, Rollout, joined
+from models.step_memory import StepMemory
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import Config, RLConfig
 from utils.errors import UserError
@@ -82,6 +83,8 @@ class GraspPPO:
         self.rewards = RewardScaler(settings.gamma).to(team.device)
         self.updates = 0
         self.generator = torch.Generator()
+        # Not in a checkpoint: cleared at every one, so that going on from it is as going on.
+        self.memory = StepMemory(settings.estimate_memory)
         share_weights(team, network)
         eyes = self.network.eyes()
         theirs = {id(p) for p in eyes}
@@ -161,9 +164,8 @@ class GraspPPO:
         """
         for group in self.eyes_optimizer.param_groups:
             group["lr"] = self.settings.estimate_lr * left
-        watched = []
-        steps, epochs = rollout.latents.shape[:2].numel(), self.settings.estimate_epochs
-        for seen in self._minibatches(self._flat(rollout), steps, epochs):
+        watched, new = [], self._flat(rollout)
+        for seen in self._new_and_remembered(new):
             estimate = self.network.estimate(seen.image(), seen.state)
             truth = self.network.truth(seen.privileged)
             loss = F.smooth_l1_loss(estimate, truth, beta=ESTIMATE_BETA)
@@ -172,7 +174,16 @@ class GraspPPO:
                 raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
             self.eyes_optimizer.step()
             watched.append(loss.detach())
+        self.memory.add(new)
         return gather(self.team, torch.stack(watched).mean()).mean().item()
+
+    def _new_and_remembered(self, new: Observations) -> Iterator[Observations]:
+        """Minibatches of a rollout's steps (B, ...), each with `estimate_recall` times as many from
+        rollouts before it, as soon as there are some."""
+        settings = self.settings
+        for seen in self._minibatches(new, len(new.state), settings.estimate_epochs):
+            count = settings.estimate_recall * len(seen.state)
+            yield joined([seen, self.memory.draw(count, self.generator)]) if self.memory else seen
 
     def gradient(self, loss: torch.Tensor, weights: nn.Parameter | None = None) -> float:
         """Put the gradient of a loss, averaged over the team, in `grad` of the weights (None: those

@@ -136,6 +136,12 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
     ("arguments", "message"),
     [
         (["evaluate.policies=heuristik"], "heuristic"),
+        (["evaluate.policies=ppo", "evaluate.scenarios=pile"], "allowed with it are"),
+        (["evaluate.policies=ppo:none.pt", "evaluate.scenarios=isolated"], "none.pt"),
+        (
+            ["evaluate.policies=ppo", "evaluate.scenarios=static", "evaluate.controllers=ibvs"],
+            "its own controller",
+        ),
         (["evaluate.roundz=3"], "evaluate.rounds"),
         (["evaluate.rounds=many"], "evaluate.rounds"),
         (["evaluate.object_sets=no/such/folder"], "no/such/folder"),

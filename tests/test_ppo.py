@@ -19,6 +19,7 @@ from models.grasp_policy import (
     GraspPPO,
     load_policy,
     policy_for,
+    relief_of,
 )
 from models.normalisers import LARGEST, ObservationNormaliser, RewardScaler
 from models.observations import ObservationLayout, Observations
@@ -31,6 +32,7 @@ from models.rollouts import (
     derived_seeds,
     evaluate_policy,
 )
+from models.step_memory import StepMemory
 from tests.test_train_graspnet import same
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
@@ -657,3 +659,37 @@ def test_checkpoints_that_do_not_fit(tmp_path):
     save_checkpoint(path, kind="graspnet", model_args={}, model=ppo.network)
     with pytest.raises(UserError, match="kind 'graspnet'"):
         load_policy(path)
+
+
+def test_relief_is_how_far_pixels_stand_out():
+    """3 cm over the table is 1, whatever the table's depth; more than 15 cm is cut off."""
+    depth = torch.full((2, 1, 16, 16), 0.5)
+    depth[1] = 0.2
+    depth[:, :, 4:8, 4:8] -= 0.03
+    depth[0, :, 12, 12] -= 0.4
+    relief = relief_of(depth)
+    torch.testing.assert_close(relief[:, :, 5, 5], torch.ones(2, 1))
+    assert relief[0, 0, 0, 0] == 0 and relief[0, 0, 12, 12] == 5
+
+
+def test_the_memory_holds_the_latest_steps():
+    memory, generator = StepMemory(5), torch.Generator().manual_seed(0)
+
+    def steps(*numbers: float) -> Observations:
+        column = torch.tensor(numbers)[:, None]
+        return Observations((column[:, None, None].byte(),), column, -column)
+
+    for part in (steps(0, 1, 2), steps(3, 4, 5, 6)):
+        memory.add(part)
+    drawn = memory.draw(200, generator)
+    assert len(memory) == 5 and set(drawn.state.flatten().tolist()) == {2, 3, 4, 5, 6}
+    assert torch.equal(drawn.images[0].flatten().float(), drawn.state.flatten())
+    assert torch.equal(drawn.privileged, -drawn.state)
+    memory.add(steps(*range(10, 20)))
+    assert set(memory.draw(200, generator).state.flatten().tolist()) == set(range(15, 20))
+    memory.clear()
+    memory.add(steps(7))
+    assert memory.draw(3, generator).state.flatten().tolist() == [7, 7, 7]
+    none = StepMemory(0)
+    none.add(steps(1, 2))
+    assert not none

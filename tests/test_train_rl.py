@@ -11,12 +11,14 @@ import sys
 import time
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_rl
+from envs.films import film_episode
 from envs.vector import WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy
 from models.ppo import KIND
@@ -117,9 +119,10 @@ ESTIMATED = [
 ]  # fmt: skip
 
 
-def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch):
+@pytest.mark.parametrize("memory", [0, 48])
+def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory):
     monkeypatch.chdir(tmp_path)
-    whole = [*POINT, *ESTIMATED, "rl.total_steps=128"]
+    whole = [*POINT, *ESTIMATED, "rl.total_steps=128", f"rl.estimate_memory={memory}"]
     assert train_rl.main([*whole, "rl.name=whole"]) == 0
     (run,) = Path("runs/train_rl").glob("*-whole")
     expected = load_checkpoint(run / "last.pt", KIND)["model"]
@@ -438,11 +441,24 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
     assert same(dict(first["model"]), dict(load_checkpoint(run / "last.pt", KIND)["model"]))
 
 
-@pytest.mark.parametrize("name", ["ppo", "ppo_state", "ppo_primitives", "ppo_random_urdfs"])
+@pytest.mark.parametrize(
+    "name", ["ppo", "ppo_state", "ppo_primitives", "ppo_primitives_state", "ppo_random_urdfs"]
+)
 def test_shipped_configs_are_valid(name):
     config = load_config(REPOSITORY / "configs" / f"{name}.yaml")
     hidden = {*(config.rl.privileged_observations or ()), *(config.rl.estimated_observations or ())}
-    truth = {"object_position", "object_offset", "object_outline", "grasped"}
-    if name != "ppo_state":
-        assert hidden == truth - {"object_position"}, "what only the critic is told"
+    truth = {"object_position", "object_offset", "object_outline", "grasp_goal", "grasped"}
+    if not name.endswith("_state"):
+        assert hidden and hidden < truth, "what only the critic is told"
         assert not truth & set(config.rl.policy_observations)
+
+
+def test_episodes_are_filmed(tmp_path):
+    """One picture at the start, one after each of three steps, and the last one for a while."""
+    config = load_config(None, ["env.observations=state", "env.max_steps=3", "sim.renderer=tiny"])
+    env = make_env(config, render_mode="rgb_array")
+    path = tmp_path / "films" / "0.mp4"
+    assert film_episode(env, lambda observation: np.zeros(7), 0, path) == "max_steps"
+    env.close()
+    pictures = iio.imread(path)
+    assert pictures.shape == (1 + 3 + 6, 480, 640, 3) and pictures.std() > 20

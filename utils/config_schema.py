@@ -286,6 +286,7 @@ class EnvConfig(Section):
     objects: ObjectSet
     scenario: Scenario
     reward: Literal["dense", "sparse"]
+    goal: Literal["object", "grasp"]
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
     lift_height: Annotated[float, Field(gt=0, le=0.4)]
@@ -295,6 +296,12 @@ class EnvConfig(Section):
     joint_step: Positive
     gripper_step: Positive
     near_share: Annotated[float, Field(ge=0, le=1)]
+
+    @model_validator(mode="after")
+    def _goals_of_one_object(self) -> EnvConfig:
+        if self.goal == "grasp" and self.scenario != "isolated":
+            raise ValueError("goal 'grasp' is for one object: it needs scenario 'isolated'")
+        return self
 
 
 EnvArgument = Annotated[
@@ -327,18 +334,22 @@ class RLConfig(Section):
     max_gradient_norm: Positive
     estimate_epochs: Count
     estimate_lr: Positive
+    estimate_memory: Annotated[int, Field(ge=0)]
+    estimate_recall: Count
     normalise_observations: bool
     normalise_rewards: bool
     squash: bool
     initial_log_std: Annotated[float, Field(ge=-5, le=2)]
     conv_channels: Annotated[tuple[Count, ...], Several]
     image_feature_dim: Count
+    relief: bool
     hidden_dim: Count
     hidden_layers: Count
     activation: Literal["tanh", "relu", "elu"]
     initial: Annotated[Path, Field(strict=False)] | None
     evaluate_every: Count
     evaluation_episodes: Count
+    films: Annotated[int, Field(ge=0)]
     target_success: Share | None
     target_return: float | None
     device: Name

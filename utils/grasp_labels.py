@@ -1,12 +1,9 @@
 """Dense grasp labels: quality and opening for every pixel and angle bin, from the true geometry.
 
 A label answers "what if the hand came straight down here?": fingertips `grasp_depth` below the
-pixel's surface point, closing line along the bin's image angle. It is judged on the exact height
-map (vertical lines against the true solids), turned so that the closing line runs along its rows:
-sliding maxima give what is in the way of fingers and palm, rows of heights give the contacts. What
-lies under an overhang counts as matter for the descent, and for the contacts down to the lowest
-point of the object. Whoever turns a pixel into a grasp must use
-`grasp_below_surface`, so that hand and label agree on the depth.
+pixel's surface point, closing line along the bin's image angle. It is judged by `utils.descents`
+on the exact height map (vertical lines against the true solids). Whoever turns a pixel into a grasp
+must use `grasp_below_surface`, so that hand and label agree on the depth.
 
 This module knows no simulator and no network.
 """
@@ -18,44 +15,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from utils.geometry import GripperGeometry, SceneGeometry, Workspace, intersect_lines
-from utils.height_map import HeightMap, height_map_from_scene
+from utils.descents import LabelSettings, grasp_depth, judge, undersides
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import height_map_from_scene
 from utils.transforms import Grasp, ImageGrasp, RGBDFrame, image_to_grasp
 
+SETTINGS = LabelSettings()
 _ROBOT = -2  # in RGBDFrame.segmentation
-_REACH = 0.108  # m of map around every grasp: half the palm's length and a little
-_SMALLEST_HALF = 0.004  # m, half the smallest opening that is tried
-_TOUCH = 0.0025  # m, a line across the pad nearer than this to its face is in touch
 ANGLE_BINS = 18  # bin k is centred at k * 10 degrees of ImageGrasp.angle
-
-
-@dataclass(frozen=True)
-class LabelSettings:
-    """What makes a label; metres and radians unless said.
-
-    The defaults were chosen by executing labelled grasps on training scenes, which
-    `python -m benchmarks.bench_labels` repeats: of quality `positive` and above, 95 % and more
-    succeed. The depth is a compromise: deeper grips better, shallower reaches more of a pile (at
-    2 cm 76 of 84 objects in 20 scenes have a feasible grasp; at 1.5 cm 77, at 2.5 cm 73).
-    """
-
-    depth: float = 0.020  # fingertips below the visible surface, where the table leaves room
-    table_clearance: float = 0.004  # under the fingertips
-    min_engagement: float = 0.006  # the surface must rise this far over the fingertips
-    clearance: float = 0.002  # over whatever lies under fingers and palm
-    room: float = 0.005  # between each open finger and what it descends beside
-    min_room: float = 0.002  # the same where neighbours or the largest opening leave no more
-    side_margin: float = 0.001  # across, beside the fingers
-    max_wedge: float = np.deg2rad(30)  # half the angle between the faces, whatever the friction
-    # Scales of the Gaussian factors of quality.
-    wedge_scale: float = 0.35
-    turn_scale: float = 0.30
-    tilt_scale: float = 0.50
-    mass_across_scale: float = 0.030
-    mass_along_scale: float = 0.080
-    mass_up_scale: float = 0.080
-    off_centre_scale: float = 0.025
-    positive: float = 0.6  # labels of at least this quality count as grasps that succeed
 
 
 @dataclass(frozen=True)
@@ -71,23 +38,13 @@ class GraspLabels:
     valid: np.ndarray
 
 
-def grasp_depth(surface_height, table_height: float, settings: LabelSettings = LabelSettings()):
-    """How far the fingertips' lowest point goes below a visible surface (...), metres.
-
-    `settings.depth`, but never nearer to the table than `settings.table_clearance`. Heights are z
-    in W; accepts arrays. Not positive where nothing stands on the table.
-    """
-    lowest = table_height + settings.table_clearance
-    return np.minimum(settings.depth, np.asarray(surface_height) - lowest)
-
-
 def grasp_below_surface(
     grasp: ImageGrasp,
     K: np.ndarray,
     T_WC: np.ndarray,
     table_height: float,
     gripper: GripperGeometry,
-    settings: LabelSettings = LabelSettings(),
+    settings: LabelSettings = SETTINGS,
 ) -> Grasp:
     """The world grasp that a label stands for; `grasp.depth` is that of the visible surface.
 
@@ -109,7 +66,7 @@ def dense_labels(
     frame: RGBDFrame,
     gripper: GripperGeometry,
     workspace: Workspace,
-    settings: LabelSettings = LabelSettings(),
+    settings: LabelSettings = SETTINGS,
     cell: float = 0.001,
     margin: float = 0.08,
 ) -> GraspLabels:
@@ -138,38 +95,18 @@ def dense_labels(
     if len(u) and frame.truth.objects:
         # A quarter of a cell more makes the count odd: a cell, not a corner, in the middle.
         heights = height_map_from_scene(frame.truth, workspace, cell, margin + cell / 4)
-        under = _undersides(frame.truth, heights)
+        under = undersides(frame.truth, heights)
         start, step, turn_of_bin = _world_turns(frame, u, v)
         surface = points[v, u]
-        judged = np.stack([
-            _judge(surface, start + k * step, heights, under, frame.truth, gripper, settings)
+        judged = [
+            judge(surface, start + k * step, heights, under, frame.truth, gripper, settings)
             for k in range(ANGLE_BINS)
-        ])  # fmt: skip
-        found = judged[turn_of_bin, :, np.arange(len(u))]  # (18, N, 2)
-        quality[:, v, u], width[:, v, u] = found[..., 0], found[..., 1]
+        ]
+        each = np.arange(len(u))
+        quality[:, v, u] = np.stack([found.quality for found in judged])[turn_of_bin, each]
+        width[:, v, u] = 2 * np.stack([found.half for found in judged])[turn_of_bin, each]
         quality = np.cbrt(quality * (0.6 + 0.4 * _support(quality > 0)))
     return GraspLabels(quality, width, valid)
-
-
-def _undersides(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
-    """(R, C) float32 lowest matter, z in W, of the object that is on top in each cell; the table's
-    height where there is none. Pads close on nothing below it."""
-    under = np.full(heights.height.shape, np.inf)
-    for number, thing in enumerate(scene.objects):
-        for solid in thing.solids:
-            low, high = solid.vertices[:, :2].min(axis=0), solid.vertices[:, :2].max(axis=0)
-            (top, bottom), (left, right) = (heights.index(np.stack([low, high]))[i] for i in (0, 1))
-            label = heights.label[top : bottom + 1, left : right + 1]
-            row, column = (
-                at + first for at, first in zip(np.nonzero(label == number), (top, left))
-            )
-            if len(row) == 0:
-                continue
-            xy = heights.origin + heights.cell * np.stack([column, row], axis=-1)
-            lines = np.column_stack([xy, np.zeros(len(xy))])
-            enter = intersect_lines(solid, lines, (0.0, 0.0, 1.0)).enter
-            under[row, column] = np.minimum(under[row, column], enter)
-    return np.where(np.isfinite(under), under, heights.table_height).astype(np.float32)
 
 
 def _support(feasible: np.ndarray) -> np.ndarray:
@@ -192,288 +129,3 @@ def _world_turns(frame: RGBDFrame, u: np.ndarray, v: np.ndarray) -> tuple[float,
     step = np.copysign(np.pi / ANGLE_BINS, np.sin(2 * (angle[1, -1] - start)))
     turns = np.rint((angle[:, :-1] - start) / step).astype(int)
     return start, step, np.mod(turns, ANGLE_BINS)
-
-
-@dataclass(frozen=True)
-class _TurnedMap:
-    """The height map around some points, with the closing line along its rows.
-
-    Steps are `cell` along (columns) and 2 * cell across (rows). height, label: (R, C). row, column:
-    (N,) int32, where the points lie; there are `_REACH` metres of map on all sides of them.
-    """
-
-    height: np.ndarray
-    under: np.ndarray
-    label: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
-    cell: float
-
-    @staticmethod
-    def around(
-        xy: np.ndarray,
-        heights: HeightMap,
-        under: np.ndarray,
-        along: np.ndarray,
-        across: np.ndarray,
-    ) -> _TurnedMap:
-        cell, middle = heights.cell, (heights.height.shape[0] - 1) / 2
-        from_middle = (xy - heights.origin) / cell - middle
-        column = np.rint(from_middle @ along).astype(np.int32)
-        row = np.rint(from_middle @ across / 2).astype(np.int32)
-        reach = int(_REACH / cell)
-        first_column, first_row = column.min() - reach, row.min() - reach // 2
-        column, row = column - first_column, row - first_row
-        size = (int(column.max()) + reach + 1, int(row.max()) + reach // 2 + 1)
-        warp = np.column_stack(
-            [along, 2 * across, middle + first_column * along + 2 * first_row * across]
-        )
-        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        height, under, label = (
-            cv2.warpAffine(image, warp, size, flags=flags, borderValue=outside)
-            for image, outside in (
-                (heights.height, heights.table_height),
-                (under, heights.table_height),
-                (heights.label.astype(np.int16), -1),
-            )
-        )
-        return _TurnedMap(height, under, label, row, column, cell)
-
-    def highest(self, left: float, right: float, half_across: float) -> np.ndarray:
-        """(R, C) sliding maximum from `left` to `right` along and +-half_across across, metres."""
-        first, last = round(left / self.cell), round(right / self.cell)
-        rows = int(np.ceil(half_across / (2 * self.cell) - 0.25))
-        kernel = np.ones((2 * rows + 1, last - first + 1), np.uint8)
-        return cv2.dilate(self.height, kernel, anchor=(-first, rows))
-
-    def at(self, image: np.ndarray, index: np.ndarray, rows, columns) -> np.ndarray:
-        """Values (M, ...) of an (R, C) image at the points `index` (M,), moved by whole rows and
-        columns, each of shape (1, ...) or (M, ...)."""
-        shift = np.asarray(rows * image.shape[1] + columns)
-        flat = self.row[index] * image.shape[1] + self.column[index]
-        return np.take(image, flat.reshape(-1, *(1,) * (shift.ndim - 1)) + shift)
-
-
-def _judge(
-    surface: np.ndarray,
-    angle: float,
-    heights: HeightMap,
-    under: np.ndarray,
-    scene: SceneGeometry,
-    gripper: GripperGeometry,
-    settings: LabelSettings,
-) -> np.ndarray:
-    """(2, N) quality of each by itself and width of grasps at surface points (N, 3) in W that close
-    along the world angle `angle`."""
-    along = np.array([np.cos(angle), np.sin(angle)])
-    across = np.array([-along[1], along[0]])
-    turned = _TurnedMap.around(surface[:, :2], heights, under, along, across)
-    depth = grasp_depth(surface[:, 2], heights.table_height, settings)
-    tip = (surface[:, 2] - depth).astype(np.float32)
-    limit = tip - settings.clearance
-
-    palm = _palm_sill(turned, gripper)
-    index = np.nonzero(palm[turned.row // 2, turned.column // 4] <= limit)[0]
-    index, half = _opening(turned, index, limit, gripper, settings)
-    result = np.zeros((2, len(surface)), np.float32)
-    if len(index) == 0:
-        return result
-    face = _faces(turned, index, tip[index], half, gripper)
-    offset = heights.centres[face.label] - np.column_stack([surface[index, :2], tip[index]])
-    friction = np.array([thing.friction for thing in scene.objects])[face.label]
-    quality = _quality(
-        face, offset[:, :2] @ along, offset[:, :2] @ across, offset[:, 2], friction, half,
-        gripper, settings,
-    )  # fmt: skip
-    result[0, index] = quality
-    result[1, index] = np.where(quality > 0, 2 * half, 0)
-    return result
-
-
-def _palm_sill(turned: _TurnedMap, gripper: GripperGeometry) -> np.ndarray:
-    """(R / 2, C / 4) height in W over which the fingertips must stay for the palm to be clear."""
-    rows, columns = (n - n % k for n, k in zip(turned.height.shape, (2, 4)))
-    coarse = turned.height[:rows, :columns].reshape(rows // 2, 2, columns // 4, 4).max(axis=(1, 3))
-    length = 2 * int(np.ceil(gripper.palm_half_length / (4 * turned.cell))) + 1
-    sills, inner = [], 0.0
-    for outer in (gripper.palm_outline[2][0], 0.025, gripper.palm_outline[-1][0]):
-        wide = 2 * int(np.ceil(outer / (4 * turned.cell))) + 1
-        sills.append(
-            cv2.dilate(coarse, np.ones((wide, length), np.uint8)) - gripper.palm_underside(inner)
-        )
-        inner = outer
-    sill = np.maximum.reduce(sills)
-    return np.pad(sill, ((0, 1), (0, 1)), mode="edge").astype(np.float32)
-
-
-def _finger_sills(
-    turned: _TurnedMap, gripper: GripperGeometry, settings: LabelSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """(R, C) each: height in W over which the fingertips must stay if the left (right) pad's face
-    comes down at that cell; includes `min_room` on the face's side."""
-    half = gripper.finger_half_width + settings.side_margin
-    outline = np.array(gripper.finger_outline)[:, 0]
-    ends = (outline[2] + 0.0015, 0.020, 0.023, outline[-1])
-    left, right, start = [], [], 0.0
-    for end in ends:
-        above = np.float32(gripper.finger_underside(start))
-        right.append(turned.highest(-settings.min_room, end, half) - above)
-        left.append(turned.highest(-end, settings.min_room, half) - above)
-        start = end
-    return np.maximum.reduce(left), np.maximum.reduce(right)
-
-
-def _opening(
-    turned: _TurnedMap,
-    index: np.ndarray,
-    limit: np.ndarray,
-    gripper: GripperGeometry,
-    settings: LabelSettings,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The points of `index` (M,) where both fingers can come down, and half the smallest opening.
-
-    Plus what is missing to `room`, as far as the fingers are clear there and the hand opens so far.
-    """
-    left, right = _finger_sills(turned, gripper, settings)
-    last = round(gripper.max_opening / 2 / turned.cell)
-    steps = np.arange(int(_SMALLEST_HALF / turned.cell), last + 1, dtype=np.int32)
-    at_left = turned.at(left, index, 0, -steps[None])
-    sill = np.maximum(at_left, turned.at(right, index, 0, steps[None]))
-    clear = sill <= limit[index, None]
-    some = clear.any(axis=1)
-    index, clear = index[some], clear[some]
-    rows, first = np.arange(len(index)), clear.argmax(axis=1)
-    chosen, open_ = first, np.ones(len(index), bool)
-    for more in range(1, round((settings.room - settings.min_room) / turned.cell) + 1):
-        wider = np.minimum(first + more, len(steps) - 1)
-        open_ &= clear[rows, wider]
-        chosen = np.where(open_, wider, chosen)
-    # Half a cell from centres to edges, and a quarter that the worse of two rounded sides adds.
-    return index, ((steps[chosen] - 0.75) * turned.cell).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class _Faces:
-    """What the closing pads of M grasps meet; lengths in metres, angles in radians.
-
-    touched: (M,) both pads meet matter of one object, `label`. left, right: (M,) the contacts along
-    the closing line from the pixel. engagement: how far the matter between rises over the tips.
-    wedge: half the angle between the faces in plan view. turn: mean angle of the faces to the pads.
-    tilt: mean angle of the faces from the vertical. cover: smaller share of a pad in touch.
-    """
-
-    touched: np.ndarray
-    label: np.ndarray
-    left: np.ndarray
-    right: np.ndarray
-    engagement: np.ndarray
-    wedge: np.ndarray
-    turn: np.ndarray
-    tilt: np.ndarray
-    cover: np.ndarray
-
-
-def _faces(
-    turned: _TurnedMap,
-    index: np.ndarray,
-    tip: np.ndarray,
-    half: np.ndarray,
-    gripper: GripperGeometry,
-) -> _Faces:
-    """Lines along the closing direction, spread over the pad's width, against the height map."""
-    cell = turned.cell
-    reach = round(float(half.max()) / cell)
-    steps = np.arange(-reach, reach + 1, dtype=np.int32)
-    spread = np.linspace(-1, 1, 5) * 0.92 * gripper.pad_half_width
-    lines = np.rint(spread / (2 * cell)).astype(np.int32)
-    v = lines * np.float32(2 * cell)
-    height = turned.at(turned.height, index, lines[None, :, None], steps)  # (M, 5, S)
-    under = turned.at(turned.under, index, lines[None, :, None], steps)
-    met = under < (tip + 0.6 * gripper.pad_height)[:, None, None]  # not under an overhang
-    met &= np.abs(steps * cell) < half[:, None, None]
-    height = np.where(met, height, -np.inf)
-    engagement = height.max(axis=(1, 2)) - tip
-    upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
-    low, high = (_first_matter(height, z) for z in (tip + 0.001, upper))
-    offset = (steps - np.float32(0.5)) * np.float32(cell)
-    at_low, at_high = (
-        (np.where(hit, offset[first], np.inf), np.where(hit, offset[last] + cell, -np.inf))
-        for hit, first, last in (low, high)
-    )
-    left, right = at_low[0].min(axis=1), at_low[1].max(axis=1)
-    touched = low[0].any(axis=1) & high[0].any(axis=1)
-    left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
-    gaps = at_low[0] - left[:, None], right[:, None] - at_low[1]
-    (slope_left, cover_left), (slope_right, cover_right) = (_fit_face(gap, v) for gap in gaps)
-    yaw_left, yaw_right = np.arctan(slope_left), np.arctan(slope_right)
-    rise = upper - tip - 0.001
-    back_left = np.maximum(at_high[0].min(axis=1) - left, 0)
-    back_right = np.maximum(right - at_high[1].max(axis=1), 0)
-    with np.errstate(invalid="ignore"):
-        tilt = (np.arctan2(back_left, rise) + np.arctan2(back_right, rise)) / 2
-    inner = np.int32(2)
-    labels = np.concatenate([
-        np.where(gap < _TOUCH, turned.at(turned.label, index, lines[None], steps[end] + inward), -2)
-        for gap, end, inward in zip(gaps, low[1:], (inner, -inner))
-    ], axis=1)  # fmt: skip
-    label = np.maximum(labels.max(axis=1), 0)
-    touched &= ((labels == label[:, None]) | (labels == -2)).all(axis=1)
-    return _Faces(
-        touched, label, left, right, engagement, np.abs(yaw_left + yaw_right) / 2,
-        (yaw_left - yaw_right) / 2, tilt, np.minimum(cover_left, cover_right),
-    )  # fmt: skip
-
-
-def _first_matter(height: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Whether lines (M, L, S) rise over a level (M,), and the first and last place, (M, L) each."""
-    matter = height > level[:, None, None]
-    first = matter.argmax(axis=2)
-    last = height.shape[2] - 1 - matter[:, :, ::-1].argmax(axis=2)
-    return matter.any(axis=2), first, last
-
-
-def _fit_face(gap: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope (M,) of the gaps (M, L) between pad and face over the places v (L,) across the pad, by
-    least squares over those under 8 mm; and the share (M,) of lines in touch."""
-    weight = (gap < 0.008).astype(np.float32)
-    gap = np.where(gap < 0.008, gap, 0)
-    total = np.maximum(weight.sum(axis=1), 1)
-    spread = weight * (v - ((weight @ v) / total)[:, None])
-    variance = spread @ v
-    slope = (spread * gap).sum(axis=1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < _TOUCH)).mean(axis=1)
-
-
-def _quality(
-    face: _Faces,
-    mass_along: np.ndarray,
-    mass_across: np.ndarray,
-    mass_up: np.ndarray,
-    friction: np.ndarray,
-    half: np.ndarray,
-    gripper: GripperGeometry,
-    settings: LabelSettings,
-) -> np.ndarray:
-    """(M,) in [0, 1]: 0 unless both pads press on one object inside its friction cone (Nguyen 1988,
-    two soft contacts; the fingers' own friction is 1), else a product of how well each thing is.
-
-    mass_*: (M,) the held object's centre of mass, seen from between the fingertips' lowest points.
-    """
-    middle = (face.left + face.right) / 2
-    room = half - np.maximum(-face.left, face.right)
-    cone = np.minimum(np.arctan(friction), settings.max_wedge)
-    quality = np.exp(
-        -((face.wedge / settings.wedge_scale) ** 2)
-        - (face.turn / settings.turn_scale) ** 2
-        - (face.tilt / settings.tilt_scale) ** 2
-        - (mass_across / settings.mass_across_scale) ** 2
-        - ((mass_along - middle) / settings.mass_along_scale) ** 2
-        - ((mass_up - gripper.pad_height / 2) / settings.mass_up_scale) ** 2
-        - (middle / settings.off_centre_scale) ** 2
-    )
-    quality *= 0.6 + 0.4 * face.cover
-    quality *= np.clip(face.engagement / settings.depth, 0.4, 1)
-    quality *= np.interp(room, (settings.min_room, settings.room), (0.8, 1.0))
-    feasible = face.touched & (face.engagement >= settings.min_engagement)
-    feasible &= (face.wedge < cone) & (face.tilt < cone)
-    return np.where(feasible, quality, 0)

@@ -1,0 +1,80 @@
+"""A learned policy at work in the cell: it brings the hand around an object and closes it.
+
+The rest of the attempt, and who says whether it succeeded, is the same as for planned grasps
+(`envs.execution`). A policy is any callable from an observation of `RobotGraspingEnv` to an action.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from envs.cell import Cell, PhysicsError
+from envs.execution import Around, GraspFailure
+from envs.grasping_env import RobotGraspingEnv
+from envs.kinematics import forward_kinematics
+from utils.config import with_settings
+from utils.transforms import Grasp, RGBDFrame
+
+TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper")
+_SURE = 3  # looks in a row at which something must be gripped: a first touch may slip
+SCENARIOS = ("isolated", "static")  # one object, which stays where it is
+
+
+class PolicyApproach:
+    """An `envs.execution.Approach`. trained: sections env and camera of the config that the policy
+    was trained with, as plain data; what it lives in besides is the cell's.
+
+    It ends when both fingers have gripped something for a quarter of a second, which a gripper
+    feels; from there the object is held, lifted and judged as any other. closed_at: where that was,
+    None until then.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        policy: Callable[[dict[str, np.ndarray]], np.ndarray],
+        trained: dict[str, dict[str, Any]],
+    ):
+        # No reward is asked for; the objects are those of the cell.
+        plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
+        config = with_settings(cell.config, "camera", trained["camera"])
+        self.env = RobotGraspingEnv(config=with_settings(config, "env", plain), cell=cell)
+        self.policy = policy
+        self.closed_at: Grasp | None = None
+
+    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+        """Raises GraspFailure when nothing is gripped in as many actions as in training."""
+        self.closed_at, ended, gripped = None, False, 0
+        try:
+            observation, info = self.env.take_over()
+            while not ended and gripped < _SURE:
+                action = self.policy({**info, **observation})
+                observation, _, terminated, truncated, info = self.env.step(action)
+                ended = terminated or truncated
+                gripped = gripped + 1 if info["grasped"] else 0
+                if gripped == 1:
+                    self.closed_at = _grasp_of(cell)
+        finally:
+            self.env.hand_over()
+        if info["reason"] == "physics":
+            raise PhysicsError("the simulation blew up while a policy was acting")
+        if not info["grasped"]:
+            self.closed_at = None
+            raise GraspFailure("stopped", detail=f"gripped nothing ({info['reason']})")
+        return Around(cell.step, None)
+
+
+def nowhere_yet(frame: RGBDFrame) -> list[Grasp]:
+    """The plan of a policy that makes none: something to be named until it has closed the hand."""
+    return [Grasp(np.array([0.5, 0.0, 0.0]), 0.0, 0.0, 0.0)]
+
+
+def _grasp_of(cell: Cell) -> Grasp:
+    """The hand's pose as a planar grasp."""
+    T_WE = forward_kinematics(cell.robot.q)
+    angle = math.atan2(T_WE[1, 1], T_WE[0, 1]) % math.pi
+    return Grasp(T_WE[:3, 3].copy(), angle, cell.robot.opening, 1.0)
