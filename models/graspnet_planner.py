@@ -10,6 +10,7 @@ of the depth image is, and what a hole in it. Nothing but the RGB-D image is see
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -63,11 +64,16 @@ class GraspNetPlanner:
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel, *_ = self.network
+        table, highest = self.workspace.table_height, -np.inf
         if not known_depth(frame.depth).all():  # no rendering, but what a camera measured
-            frame = table_in_holes(depth_by_colour(frame), self.workspace.table_height)
+            measured = table_in_holes(frame, table)
+            highest = height_map_from_frame(measured, self.workspace).ceiling
+            frame = table_in_holes(depth_by_colour(frame), table)
         knows_centres = model.centre_head is not None
         scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
         heights = height_map_from_frame(frame, self.workspace)
+        # Colours tell where edges are, but not what else a hole may hide.
+        heights = replace(heights, ceiling=np.maximum(heights.ceiling, highest))
 
         def value(candidates: Candidates) -> np.ndarray:
             xy, (along, _) = candidates.xy, candidates.axes()
