@@ -3,14 +3,13 @@
 A network names places well to a few millimetres; fingers need better than that beside an object.
 So the antipodal search of the other planners proposes exact poses, and what the network says of
 their places and angles ranks them: before they are measured on the height map, so that few have to
-be, and after. Its votes for centres of mass tell the objects apart; the colours tell where an edge
-of the depth image is, and what a hole in it. Nothing but the RGB-D image is seen.
+be, and after. Its votes for centres of mass tell the objects apart, and the colours what a hole in
+the depth image is. Nothing but the RGB-D image is seen.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,11 +21,10 @@ from models.candidates import Candidates
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.instances import labelled_by_centres
 from models.prediction import scaled_maps
-from utils.depth_edges import depth_by_colour
 from utils.depth_holes import table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame
-from utils.transforms import Grasp, RGBDFrame, known_depth, project
+from utils.transforms import Grasp, RGBDFrame, project
 
 # Half the heuristic's angles: turning onto the faces and the network make up for it. What belongs
 # together is known better than by height alone.
@@ -64,16 +62,10 @@ class GraspNetPlanner:
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel, *_ = self.network
-        table, highest = self.workspace.table_height, -np.inf
-        if not known_depth(frame.depth).all():  # no rendering, but what a camera measured
-            measured = table_in_holes(frame, table)
-            highest = height_map_from_frame(measured, self.workspace).ceiling
-            frame = table_in_holes(depth_by_colour(frame), table)
+        frame = table_in_holes(frame, self.workspace.table_height)
         knows_centres = model.centre_head is not None
         scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
         heights = height_map_from_frame(frame, self.workspace)
-        # Colours tell where edges are, but not what else a hole may hide.
-        heights = replace(heights, ceiling=np.maximum(heights.ceiling, highest))
 
         def value(candidates: Candidates) -> np.ndarray:
             xy, (along, _) = candidates.xy, candidates.axes()
