@@ -215,6 +215,11 @@ def announce(config: Config, run: Path, device: str) -> None:
 def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
     """The same policies on the same scenes in every world, and how well one foretells another."""
     worlds, policies = config.transfer.worlds, config.transfer.policies
+    if any(controller != OPEN_LOOP for _, controller in contestants(config)):
+        raise UserError(
+            "transfer.policies: the report compares open loops; leave evaluate.controllers null "
+            "and grasp.controller open_loop"
+        )
     planners = list(dict.fromkeys(who.planner for who in policies if is_trained(who)))
     config_of = {
         world: with_settings(in_world(config, world), "evaluate", {"policies": planners})
@@ -244,6 +249,8 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
         if error is not None or interrupted:
             break
     for planner in planners if samples and PHOTOGRAPHS in worlds else []:
+        if is_learned(planner):
+            continue
         network = make_planner(planner, GripperGeometry(), workspace_of(config), config.seed)
         if isinstance(network, GraspNetPlanner):
             judged = judge_photographs(network.network, samples)
@@ -268,7 +275,8 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
 
 def is_trained(who: TransferPolicy) -> bool:
     """Whether a row of the report can be scored: what is no file needs no training."""
-    return Path(who.planner).suffix != ".pt" or Path(who.planner).exists()
+    file = Path(who.planner.partition(":")[2] if is_learned(who.planner) else who.planner)
+    return file.suffix != ".pt" or file.exists()
 
 
 # --- Running rounds in worker processes -----------------------------------------------------
@@ -381,10 +389,12 @@ def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progre
 
 def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
     plan = config.evaluate
+    policies = [contestant(*pair) for pair in contestants(config)]
+    known = record.policy in policies  # a resumed report may have lost the weights of one
     return (
         plan.object_sets.index(record.objects),
         plan.scenarios.index(record.scenario),
-        [contestant(*pair) for pair in contestants(config)].index(record.policy),
+        policies.index(record.policy) if known else len(policies),
         record.seed,
     )
 

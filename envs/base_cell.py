@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from envs.camera import Image, Intrinsics
-from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
+from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.safety import ArmGate
 from envs.scenes import Scene
 from envs.world import on_table
@@ -51,6 +51,13 @@ class BaseCell(ABC):
             raise UserError(
                 f"robot.home {list(config.robot.home)} is outside the Panda's joint limits, "
                 f"{JOINT_LOWER.tolist()} to {JOINT_UPPER.tolist()} rad"
+            )
+        tip, lower, upper = tip_position(config.robot.home), *_box(config)
+        if not all(low <= place <= high for place, low, high in zip(tip, lower, upper)):
+            raise UserError(
+                f"robot.home has the fingertips at {[round(at, 3) for at in tip]} m, outside the "
+                f"box from safety.box_lower {lower} to safety.box_upper {upper}: the arm could not "
+                "come back there; widen the box"
             )
         config.make_cache_folder()
         self.scene: Scene | None = None
@@ -210,3 +217,7 @@ def wrist_mount(camera: CameraConfig) -> np.ndarray:
     T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     T[:3, 3] = camera.wrist_position
     return T
+
+
+def _box(config: Config) -> tuple[list[float], list[float]]:
+    return list(config.safety.box_lower), list(config.safety.box_upper)

@@ -135,7 +135,8 @@ def _pick(cell: BaseCell, grasp: Grasp, approach: Approach) -> int:
         raise GraspFailure("missed")
 
     lifted = (forward_kinematics(cell.robot.q) if around.pose is None else around.pose).copy()
-    lifted[2, 3] = max(grasp.position[2], 0.0) + settings.lift_height + 0.05
+    # A learned policy names no grasp beforehand: it counts where its hand has closed.
+    lifted[2, 3] = max(grasp.position[2], lifted[2, 3], 0.0) + settings.lift_height + 0.05
     _follow(cell, _line(cell, cell.robot.q, lifted))
     if not cell.is_lifted(index, settings.lift_height):
         raise GraspFailure("slipped", index)

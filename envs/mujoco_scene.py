@@ -1,6 +1,7 @@
 """A scene of the cell in MuJoCo: table, bin, objects and Panda where PyBullet's cell has them.
 
-Same sizes, masses, inertias and friction; contacts are MuJoCo's own. What happens in it is for
+Same sizes, masses, inertias, and friction with table and fingers (between two objects MuJoCo takes
+the larger coefficient, PyBullet the product); contacts are MuJoCo's own. What happens in it is for
 `envs.mujoco_cell`.
 """
 

@@ -12,6 +12,7 @@ from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_po
 from envs.safety import ArmGate, ArmStoppedError
 from envs.scenes import make_scene
 from utils.config import load_config
+from utils.errors import UserError
 from utils.transforms import Grasp
 
 DT = 1 / 240
@@ -144,3 +145,10 @@ def test_the_environment_does_not_leave_the_workspace():
     env.step(-action)
     assert env.step(-action)[-1]["reachable"], "the way back is open"
     env.close()
+
+
+def test_a_home_outside_the_box_is_refused():
+    """Home's fingertips are 0.485 m up: the arm could leave, and never come back."""
+    config = load_config(None, ["sim.renderer=tiny", "safety.box_upper=[0.8,0.55,0.4]"])
+    with pytest.raises(UserError, match="robot.home has the fingertips at .*0.485.* widen the box"):
+        Cell(config)
