@@ -346,10 +346,10 @@ class RobotGraspingEnv(gymnasium.Env):
         if self.settings.control == "joint":
             goal = self._servo.q + self.settings.joint_step * action[:7]
             goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
-            goal, _ = self._within_speed(goal)
-            self._reachable = self._allowed(goal)
+            servo = ServoStep(self._within_speed(goal)[0])
+            self._reachable = self._allowed(servo)
             if self._reachable:
-                self._servo = ServoStep(goal)
+                self._servo = servo
         else:
             self._follow(self._moved_pose(action))
         self.cell.robot.drive_arm_to(self._servo.q, self._speed)
@@ -389,7 +389,7 @@ class RobotGraspingEnv(gymnasium.Env):
             servo = ServoStep(goal)
             error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
             if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
-                self._reachable = self._allowed(goal)
+                self._reachable = self._allowed(servo)
                 if self._reachable:
                     self._servo, self._T_command = servo, wanted
                 return
@@ -397,9 +397,10 @@ class RobotGraspingEnv(gymnasium.Env):
             share *= slower
         self._reachable = False
 
-    def _allowed(self, goal: np.ndarray) -> bool:
-        """Whether a goal (7,) may be commanded: the arm is free, and its gate lets that pass."""
-        return not self._blocked(goal) and self.cell.robot.gate.refusal(goal) is None
+    def _allowed(self, goal: ServoStep) -> bool:
+        """Whether a goal may be commanded: the arm is free, and its gate lets that pass."""
+        tip = goal.reached[:3, 3]
+        return not self._blocked(goal.q) and self.cell.robot.gate.refusal(goal.q, tip) is None
 
     def _blocked(self, goal: np.ndarray) -> bool:
         """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""
@@ -479,8 +480,7 @@ class RobotGraspingEnv(gymnasium.Env):
         offset = np.empty(6)
         offset[:3] = self._view.offset
         np.tanh(self._view.offset / _NEAR, out=offset[3:])
-        goal = {} if self._goals is None else {"grasp_goal": self._goal_view.told()}
-        return goal | {
+        info = {
             "is_success": reason == "success",
             "reason": reason,
             "object_position": self._object_position,
@@ -492,6 +492,9 @@ class RobotGraspingEnv(gymnasium.Env):
             "reachable": bool(self._reachable),
             "scene_seed": self._scene_seed,
         }
+        if self._goals is not None:
+            info["grasp_goal"] = self._goal_view.told()
+        return info
 
 
 def _checked_options(options: dict[str, Any] | None, drawn: int) -> tuple[int, str | None]:

@@ -81,10 +81,11 @@ class ArmGate:
         self._tip = tip_position(self._q)
         self._judged = self._q, (None, self._tip)  # the last question and its answer
 
-    def refusal(self, q: np.ndarray) -> str | None:
-        """Why joint references q (7,), rad, may not be sent; None where they may."""
+    def refusal(self, q: np.ndarray, tip: np.ndarray | None = None) -> str | None:
+        """Why joint references q (7,), rad, may not be sent; None where they may. tip: (3,) m, where
+        they bring E, for who knows that already."""
         angles = q.tolist()
-        self._judged = angles, self._judge(angles)
+        self._judged = angles, self._judge(angles, None if tip is None else tuple(tip.tolist()))
         return self._judged[1][0]
 
     def passed(self, q: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,12 +114,14 @@ class ArmGate:
             raise ArmStoppedError(reason)
         self._q, self._tip = angles, tip
 
-    def _judge(self, q: list[float]) -> tuple[str | None, tuple[float, float, float]]:
+    def _judge(
+        self, q: list[float], tip: tuple | None = None
+    ) -> tuple[str | None, tuple[float, float, float]]:
         """Why not, and where E would be. A number that is not finite fails each comparison."""
         for number, (angle, before, (low, high)) in enumerate(zip(q, self._q, _JOINT_RANGES), 1):
             if not low <= angle <= high and not min(low, before) <= angle <= max(high, before):
                 return f"joint {number} would leave its limits ({angle:.3f} rad)", self._tip
-        tip = tip_position(q)
+        tip = tip_position(q) if tip is None else tip
         for axis, place, before, (low, high) in zip("xyz", tip, self._tip, self._box):
             if not low <= place <= high and not min(low, before) <= place <= max(high, before):
                 return f"the workspace ends here ({axis} = {place:.3f} m)", tip
