@@ -82,8 +82,8 @@ class ArmGate:
         self._judged = self._q, (None, self._tip)  # the last question and its answer
 
     def refusal(self, q: np.ndarray, tip: np.ndarray | None = None) -> str | None:
-        """Why joint references q (7,), rad, may not be sent; None where they may. tip: (3,) m, where
-        they bring E, for who knows that already."""
+        """Why joint references q (7,), rad, may not be sent; None where they may. tip: (3,) m,
+        where they bring E, for who knows that already."""
         angles = q.tolist()
         self._judged = angles, self._judge(angles, None if tip is None else tuple(tip.tolist()))
         return self._judged[1][0]
