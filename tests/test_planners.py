@@ -16,7 +16,7 @@ def planner(name: str, seed: int = 0):
 
 
 def test_unknown_planner_is_refused_with_the_allowed_names() -> None:
-    with pytest.raises(ValueError, match="'grasp'.*heuristic, oracle, random"):
+    with pytest.raises(ValueError, match="'grasp'.*heuristic, oracle, ppo, ppo:FILE.pt, random"):
         planner("grasp")
 
 
