@@ -37,8 +37,9 @@ class BaseCell(ABC):
     """A simulated robot cell, whatever simulates it. Close it, or use it in a `with` block.
 
     dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
-    has the interface of `envs.panda.Panda`. remaining: numbers of the objects still in the game.
-    steps, frames: taken since the scene was built.
+    has the interface of `envs.panda.Panda`. bodies: the simulator's numbers of the objects.
+    remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
+    built.
     """
 
     client: int | None = None
@@ -97,12 +98,24 @@ class BaseCell(ABC):
         """(3,) centre of mass in W. Raises PhysicsError when it is not finite."""
 
     @abstractmethod
-    def held_object(self) -> int | None:
-        """The object that both fingers grip, or None."""
+    def speed(self, index: int) -> float:
+        """m/s of an object's centre of mass."""
 
     @abstractmethod
+    def touches_table(self, index: int) -> bool:
+        """Whether an object and the table are in contact."""
+
+    def held_object(self) -> int | None:
+        """The object that both fingers grip, or None."""
+        return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
+
     def is_lifted(self, index: int, height: float) -> bool:
         """Whether an object is gripped, off the table, and its centre of mass above `height` m."""
+        return bool(
+            self.object_position(index)[2] > height
+            and self.robot.holds(self.bodies[index])
+            and not self.touches_table(index)
+        )
 
     @abstractmethod
     def retire(self, index: int) -> None:

@@ -171,22 +171,14 @@ class Cell(BaseCell):
         return position, quaternion
 
     def speed(self, index: int) -> float:
-        """m/s of an object's centre of mass."""
         velocity, _ = pybullet.getBaseVelocity(self.bodies[index], physicsClientId=self.client)
         return math.hypot(*velocity)
 
-    def held_object(self) -> int | None:
-        """The object that both fingers grip, or None."""
-        return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
-
-    def is_lifted(self, index: int, height: float) -> bool:
-        """Whether an object is gripped, off the table, and its centre of mass above `height` m."""
-        body = self.bodies[index]
-        return bool(
-            self.object_position(index)[2] > height
-            and self.robot.holds(body)
-            and not pybullet.getContactPoints(body, self.table, physicsClientId=self.client)
+    def touches_table(self, index: int) -> bool:
+        contacts = pybullet.getContactPoints(
+            self.bodies[index], self.table, physicsClientId=self.client
         )
+        return bool(contacts)
 
     def retire(self, index: int) -> None:
         """Take an object out of the game: it stays visible where it is but collides no more."""

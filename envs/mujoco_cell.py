@@ -94,20 +94,11 @@ class MujocoCell(BaseCell):
         return position
 
     def speed(self, index: int) -> float:
-        """m/s of an object's centre of mass."""
         start = self._speeds[index]
         return math.hypot(*self.robot.data.qvel[start : start + 3])
 
-    def held_object(self) -> int | None:
-        return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
-
-    def is_lifted(self, index: int, height: float) -> bool:
-        body = self.bodies[index]
-        return bool(
-            self.object_position(index)[2] > height
-            and self.robot.holds(body)
-            and not self.robot.meet(body, self._table)
-        )
+    def touches_table(self, index: int) -> bool:
+        return self.robot.meet(self.bodies[index], self._table)
 
     def retire(self, index: int) -> None:
         model, body = self.robot.model, self.bodies[index]
