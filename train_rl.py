@@ -34,8 +34,9 @@ import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from envs.base_cell import camera_intrinsics, wrist_mount
 from envs.films import film_episode
-from envs.vector import VectorEnvs, WorkerError, make_env, vector_envs
+from envs.vector import OWN_ENVS, VectorEnvs, WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, policy_for
 from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
@@ -47,6 +48,7 @@ from models.rollouts import (
     NotFinite,
     RolloutCollector,
     act,
+    collect_looks,
     derived_seeds,
     evaluate_policy,
 )
@@ -67,7 +69,9 @@ FREE_TO_CHANGE = (
     "target_success",
     "target_return",
 )
-TRAINING, EVALUATION, LEARNING = range(3)  # purposes of seeds, which never share any
+# Purposes of seeds, which never share any; 3 is that of benchmarks.bench_policy.
+TRAINING, EVALUATION, LEARNING, LOOKING = 0, 1, 2, 4
+LOOKS = 32  # of an environment, before they are learned from: two scenes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -131,10 +135,26 @@ def make_ppo(config: Config, envs: VectorEnvs, us: Team) -> GraspPPO:
     )
     layout = ObservationLayout.of(envs.observation_space, settings.policy_observations, hidden)
     torch.manual_seed(config.seed)
-    network = policy_for(layout, envs.action_space, settings)
+    network = policy_for(layout, envs.action_space, settings, camera_of(config, layout))
     if settings.initial is not None:
         load_weights(network, load_checkpoint(settings.initial, KIND), settings.initial)
     return GraspPPO(network, layout, settings, us)
+
+
+def camera_of(config: Config, layout: ObservationLayout) -> dict[str, Any] | None:
+    """Of the hand, for eyes that look for a place in what it sees; None where there are none such.
+    Raises UserError for other cameras and images."""
+    if not config.rl.estimate_place:
+        return None
+    if config.rl.env_id not in OWN_ENVS or config.env.camera != "wrist":
+        raise UserError("rl.estimate_place needs the cell's wrist camera: set env.camera=wrist")
+    if not layout.images or layout.images[-1].key != "depth":
+        raise UserError(
+            "rl.estimate_place needs depth: name it last of the images in rl.policy_observations"
+        )
+    side = config.env.resolution
+    camera = config.camera.model_copy(update={"mount": "wrist", "width": side, "height": side})
+    return {"K": camera_intrinsics(camera).K.tolist(), "T_EC": wrist_mount(camera).tolist()}
 
 
 def open_run(config: Config) -> str:
@@ -177,6 +197,8 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
     per_update, total = settings.envs * settings.rollout_steps, updates(config)
     step = ppo.updates * per_update
     writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.leads else None
+    if config.rl.looks and not history:
+        learn_to_see(config, envs, ppo, watch, writer)
     bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
     try:
         with stop_on_interrupt() as interrupted, bar:
@@ -222,6 +244,32 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
             writer.close()
             print(shares_in_words(watch), flush=True)
     return True
+
+
+def learn_to_see(
+    config: Config, envs: VectorEnvs, ppo: GraspPPO, watch: Stopwatch, writer: SummaryWriter | None
+) -> None:
+    """Before anything is done, learn to estimate from rl.looks images of many scenes."""
+    us, settings = ppo.team, config.rl
+    chunks = -(-settings.looks // (settings.envs * LOOKS))
+    seeds: Sequence[int | None] = derived_seeds(envs.num_envs, config.seed, LOOKING, us.rank)
+    ppo.generator.manual_seed(derived_seeds(1, config.seed, LOOKING, us.rank)[0])
+    with envs.looking(), tqdm(
+        total=chunks * settings.envs * LOOKS, unit="look", disable=not us.leads
+    ) as bar:  # fmt: skip
+        for chunk in range(chunks):
+            with watch(SIMULATION):
+                looks = collect_looks(envs, ppo.layout, LOOKS, seeds)
+            with watch(NETWORK):
+                ppo.network.observe(looks, us)
+                new = ppo.estimate_loss(looks)  # before it learns from them
+                ppo.learn_to_see(looks, settings.looks_lr * (1 - chunk / chunks))
+            seeds = [None] * envs.num_envs
+            bar.update(settings.envs * LOOKS)
+            bar.set_postfix(loss=f"{new:.3g}")
+            if us.leads:
+                log(writer, (chunk + 1) * settings.envs * LOOKS, "looks", {"loss": new})
+    ppo.memory.clear()
 
 
 def evaluate(

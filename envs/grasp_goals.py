@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,16 @@ _TURN_SLACK, _TURN_EDGE = math.radians(12), math.radians(12)
 _OPENING_SLACK = 0.012  # m of opening that may be missing: the fingers' room on both sides
 
 
+class Grasp(NamedTuple):
+    """position: (3,) of E in W, m. angle: rad, of the closing line in W from its x axis. narrow,
+    wide: m, the openings between which the hand can come down."""
+
+    position: np.ndarray
+    angle: float
+    narrow: float
+    wide: float
+
+
 class GraspGoals:
     """Some grasps of one object, fixed to it.
 
@@ -72,6 +83,13 @@ class GraspGoals:
         """Radians by which the object at T_WO leans away from how it rested: beyond some degrees
         the goals are no grasps from above any more."""
         return math.acos(min(max(float(self._upright @ T_WO[2, :3]), -1.0), 1.0))
+
+    def grasp(self, index: int, T_WO: np.ndarray) -> Grasp:
+        """One of them, of the object at T_WO (4, 4)."""
+        position = T_WO[:3, :3] @ self._positions[index] + T_WO[:3, 3]
+        line = T_WO[:3, :3] @ self._lines[index]
+        openings = float(self._narrow[index]), float(self._wide[index])
+        return Grasp(position, math.atan2(line[1], line[0]), *openings)
 
     def seen_from(self, T_WO: np.ndarray, T_WE: np.ndarray) -> GoalView:
         """The goal nearest to a hand at T_WE (4, 4), of the object at T_WO (4, 4)."""

@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
+from envs import hand_starts
 from envs.approach import Outline
 from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.grasp_goals import GraspGoals
@@ -55,7 +56,7 @@ _FASTEST = float(JOINT_VELOCITY.min())  # rad/s
 # motor asks for (3 % in free motion).
 _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
-_NEAR_SIDE, _NEAR_HEIGHT = 0.04, (0.01, 0.10)  # m, of episodes that begin near an object
+_LOOKS = 16  # from as many places at each scene: a place is quicker to reach than a scene to make
 _NEAR = 0.03  # m, see `object_offset`
 # An object that has tipped over, which offers other grasps: leaning this much, and this slow.
 _LEANING, _STILL = 0.2, 0.05  # rad, m/s
@@ -117,8 +118,9 @@ class RobotGraspingEnv(gymnasium.Env):
     `gymnasium.make("RobotGrasping-v0", observations=["state"], control="ee_planar")`. `cell`: play
     in this one, which others load scenes into and close, by `take_over` instead of `reset`.
     `reset(options={"scene_seed": n})` asks for one scene; the option "start" says where the hand
-    begins: "home", or "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is
-    easier. Without it a share `near_share` of the episodes begins near.
+    begins: "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is easier;
+    or "look", anywhere that an episode may lead to, to learn to see from: up to 16 looks one after
+    the other, without a seed, are at the same scene. Without it a share `near_share` of the episodes begins near.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
@@ -154,6 +156,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self.cell = cell or Cell(self.config, gui=render_mode == "human")
         self._studio: Studio | None = None
         self._running = False
+        self._looks_left = 0
         self._closed = False
         self._intrinsics = camera_intrinsics(self.config.camera)
         self._T_EC = wrist_mount(self.config.camera)
@@ -194,20 +197,29 @@ class RobotGraspingEnv(gymnasium.Env):
         self._running = False
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
-        self._scene_seed, start = _checked_options(options, drawn)
-        if start is None and self.settings.near_share > 0:
-            start = "near" if self.np_random.random() < self.settings.near_share else "home"
+        asked, start = _checked_options(options)
+        if start is None:
+            share = self.settings.near_share
+            start = "near" if share > 0 and self.np_random.random() < share else "home"
+        again = start == "look" and seed is None and asked is None
+        self._looks_left = self._looks_left - 1 if again else 0
+        if self._looks_left <= 0:
+            self._make_scene(drawn if asked is None else asked)
+            self._looks_left = _LOOKS if start == "look" else 0
+        if start == "home":
+            return self._begin(self.cell.home.copy())
+        q, opening = self._start_hand(start)
+        self.cell.robot.place(q, opening)
+        return self._begin(q, opening)
+
+    def _make_scene(self, seed: int) -> None:
+        self._scene_seed = seed
         scene = make_scene(
-            self.settings.scenario, self.objects, self._scene_seed, self.config, self.cell.client
+            self.settings.scenario, self.objects, seed, self.config, self.cell.client
         )
         self.cell.load(scene)
-        q = self.cell.home.copy()
         self._know_the_objects()
-        if start == "near":
-            q = self._near_an_object()
-            self.cell.robot.place(q)
         self._calm = self.cell.calm()  # until the robot first touches something, see `_look`
-        return self._begin(q)
 
     def take_over(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode in the cell as it is, the arm at rest; `hand_over` gives it back."""
@@ -225,12 +237,14 @@ class RobotGraspingEnv(gymnasium.Env):
         self._outlines = [Outline(placement.model.parts) for placement in placements]
         self._goals = self._goals_now() if self.settings.goal == "grasp" else None
 
-    def _begin(self, q: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode with the arm at joint positions q (7,)."""
+    def _begin(
+        self, q: np.ndarray, opening: float = MAX_OPENING
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode with the arm at joint positions q (7,), the gripper at `opening` m."""
         self.cell.robot.limit_speed(_FASTEST)
         self._servo = ServoStep(q)  # at the commanded joint positions
         self._T_command = self._servo.reached
-        self._opening_command = MAX_OPENING
+        self._opening_command = opening
         self._reachable = True
         self._steps = 0
         self._held_steps = 0
@@ -242,20 +256,26 @@ class RobotGraspingEnv(gymnasium.Env):
             self.render()
         return self._observation(), self._info(None)
 
-    def _near_an_object(self) -> np.ndarray:
-        """Joint positions (7,) for the hand a little over one of the objects, turned at random."""
-        T = forward_kinematics(self.cell.home)
+    def _start_hand(self, start: str) -> tuple[np.ndarray, float]:
+        """Joint positions (7,) and opening to begin with "near" one of the objects, or to "look" at
+        one from; those of home where the arm does not reach what was drawn."""
+        T_home = forward_kinematics(self.cell.home)
         index = int(self.np_random.integers(len(self._outlines)))
         T_WO = self.cell.object_pose(index)
-        top = self._outlines[index].seen_from(T_WO, T).top + T[2, 3]
-        T[:2, 3] = T_WO[:2, 3] + self.np_random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
-        T[2, 3] = top + self.np_random.uniform(*_NEAR_HEIGHT)
-        turn = self.np_random.uniform(-np.pi / 4, np.pi / 4)
-        T[:3, :3] = rotation_matrix(np.array([0.0, 0.0, turn])) @ T[:3, :3]
+        top = self._outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
+        opening = MAX_OPENING
+        if start == "near":
+            T = hand_starts.near(T_home, T_WO[:2, 3], top, self.np_random)
+        else:
+            grasp = None
+            if self._goals is not None:
+                grasp = self._goals.grasp(self.np_random.integers(len(self._goals)), T_WO)
+            T, opening = hand_starts.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
+            T[:3, 3] = np.clip(T[:3, 3], self._lowest, self._highest)
         try:
-            return inverse_kinematics(T, self.cell.home, self.cell.home)
+            return inverse_kinematics(T, self.cell.home, self.cell.home), opening
         except UnreachableError:
-            return self.cell.home.copy()
+            return self.cell.home.copy(), opening
 
     def _goals_now(self) -> GraspGoals:
         return GraspGoals(self.cell.truth(), self.cell.object_pose(0))
@@ -268,6 +288,7 @@ class RobotGraspingEnv(gymnasium.Env):
             raise ClosedEnvironmentError("step() after close(): make a new environment")
         if not self._running:
             raise ResetNeeded("step() needs a running episode: call reset() first")
+        self._looks_left = 0  # an action may change the scene
         self._command(self._checked(action))
         self.cell.step(self.settings.substeps)
         self._steps += 1
@@ -497,17 +518,19 @@ class RobotGraspingEnv(gymnasium.Env):
         return info
 
 
-def _checked_options(options: dict[str, Any] | None, drawn: int) -> tuple[int, str | None]:
-    """The scene's seed that reset's options ask for, else the one drawn; and where to start, None
-    if they leave it open. Raises UserError."""
+def _checked_options(options: dict[str, Any] | None) -> tuple[int | None, str | None]:
+    """The scene's seed that reset's options ask for, and where to start; None for what they leave
+    open. Raises UserError."""
     options = dict(options or {})
-    seed, start = options.pop("scene_seed", drawn), options.pop("start", None)
+    seed, start = options.pop("scene_seed", None), options.pop("start", None)
     if options:
         raise UserError(
             f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start'"
         )
-    if start not in (None, "home", "near"):
-        raise UserError(f"reset: start must be 'home' or 'near', got {start!r}")
+    if start not in (None, "home", "near", "look"):
+        raise UserError(f"reset: start must be 'home', 'near' or 'look', got {start!r}")
+    if seed is None:
+        return None, start
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
         raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
     return int(seed), start

@@ -29,7 +29,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from utils.config import Config
 from utils.errors import UserError
 
-OWN_ENV = "RobotGrasping-v0"  # is given the whole config
+OWN_ENVS = "RobotGrasping-v0", "RandomizedGrasping-v0"  # are given the whole config
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
@@ -65,7 +65,7 @@ class VectorEnvs:
     def __init__(self, config: Config, count: int):
         self.num_envs = count
         self._options: dict[str, Any] = {}
-        self._own = config.rl.env_id == OWN_ENV
+        self._own = config.rl.env_id in OWN_ENVS
         self._timeout = config.rl.worker_timeout
         makers = [partial(make_env, config, index) for index in range(count)]
         self._parallel = config.rl.parallel and count > 1
@@ -102,6 +102,13 @@ class VectorEnvs:
     def at_full_difficulty(self) -> Iterator[None]:
         """Episodes begun in here are as hard as the task, whatever makes training easier."""
         self._options = {"start": "home"} if self._own else {}
+        yield
+        self._options = {}
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """Restarts in here put the hand anywhere that an episode may lead to, only to look."""
+        self._options = {"start": "look"}
         yield
         self._options = {}
 
@@ -185,7 +192,7 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         arguments[name] = yaml.safe_load(value)
     if render_mode is not None:  # panda-gym does not take None
         arguments["render_mode"] = render_mode
-    if settings.env_id == OWN_ENV:
+    if settings.env_id in OWN_ENVS:
         arguments["config"] = config
     try:
         env = gymnasium.make(settings.env_id, disable_env_checker=True, **arguments)

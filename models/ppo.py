@@ -29,7 +29,6 @@ from utils.errors import UserError
 KIND = "grasp_policy"
 ADAM_EPSILON = 1e-5  # Huang et al., "The 37 implementation details of PPO" (2022), detail 3
 SMALLEST_DEVIATION = 1e-8  # of advantages, so that equal ones do not divide by zero
-ESTIMATE_BETA = 0.1  # of the normalised error, from which on the estimates' loss is linear
 KL_SLACK = 1.5  # an update stops beyond this many times the target, as in OpenAI's baselines
 
 
@@ -143,7 +142,10 @@ class GraspPPO:
             if self._too_far(losses.approx_kl):
                 break
             self.optimizer.step()
-        seeing = {} if self.eyes is None else {"estimate_loss": self._learn_to_see(rollout, left)}
+        seeing = {}
+        if self.eyes is not None:
+            rate = self.settings.estimate_lr * left
+            seeing["estimate_loss"] = self.learn_to_see(self._flat(rollout), rate)
         # Only now, so that all of the rollout and its update saw the same normalised numbers.
         self.network.observe(self._flat(rollout), self.team)
         self.updates += 1
@@ -157,18 +159,14 @@ class GraspPPO:
             **seeing,
         }
 
-    def _learn_to_see(self, rollout: Rollout, left: float) -> float:
-        """Bring the network's estimates closer to the truth; the mean loss.
-
-        left: share of the learning rate that annealing has left.
-        """
+    def learn_to_see(self, new: Observations, rate: float) -> float:
+        """Bring the network's estimates closer to the truth for observations (B, ...) and some that
+        are remembered; the mean loss. rate: of learning."""
         for group in self.eyes_optimizer.param_groups:
-            group["lr"] = self.settings.estimate_lr * left
-        watched, new = [], self._flat(rollout)
+            group["lr"] = rate
+        watched = []
         for seen in self._new_and_remembered(new):
-            estimate = self.network.estimate(seen.image(), seen.state)
-            truth = self.network.truth(seen.privileged)
-            loss = F.smooth_l1_loss(estimate, truth, beta=ESTIMATE_BETA)
+            loss = self.network.estimate_loss(seen.image(), seen.state, seen.privileged)
             norm = self.gradient(loss, self.eyes)
             if not math.isfinite(norm):
                 raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
@@ -177,8 +175,17 @@ class GraspPPO:
         self.memory.add(new)
         return gather(self.team, torch.stack(watched).mean()).mean().item()
 
+    @torch.no_grad()
+    def estimate_loss(self, seen: Observations) -> float:
+        """What the estimates for observations (B, ...) are worth now."""
+        size, losses = self.settings.batch_size, []
+        for start in range(0, len(seen.state), size):
+            part = seen.rows(slice(start, start + size)).map(lambda p: p.to(self.team.device))
+            losses.append(self.network.estimate_loss(part.image(), part.state, part.privileged))
+        return gather(self.team, torch.stack(losses).mean()).mean().item()
+
     def _new_and_remembered(self, new: Observations) -> Iterator[Observations]:
-        """Minibatches of a rollout's steps (B, ...), each with `estimate_recall` times as many from
+        """Minibatches of steps (B, ...), each with `estimate_recall` times as many from
         rollouts before it, as soon as there are some."""
         settings = self.settings
         for seen in self._minibatches(new, len(new.state), settings.estimate_epochs):

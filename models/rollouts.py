@@ -151,6 +151,21 @@ def act(
         return latent.cpu()
 
 
+def collect_looks(
+    envs: VectorEnvs, layout: ObservationLayout, count: int, seeds: Sequence[int | None]
+) -> Observations:
+    """(count * N, ...) what N environments show at the beginning of `count` episodes each; the
+    first ones have these seeds. Raises NotFinite."""
+    looks = layout.empty(count, envs.num_envs)
+    for number in range(count):
+        observation = envs.restart(seeds if number == 0 else [None] * envs.num_envs)
+        bad = layout.bad_number(observation)
+        if bad is not None:
+            raise NotFinite(f"the observation {bad[0]!r} of environment {bad[1]} is not finite")
+        layout.write(observation, looks.map(lambda part: part[number]))  # noqa: B023
+    return looks.map(lambda part: part.flatten(0, 1))
+
+
 def joined(parts: Sequence[Observations]) -> Observations:
     """Batches behind one another."""
     return Observations(

@@ -444,8 +444,38 @@ def test_episodes_can_begin_near_an_object(make):
         np.testing.assert_allclose(env.cell.robot.q, before, atol=0.02)
     _, at_home = env.reset(seed=0, options={"start": "home"})
     assert at_home["end_effector_position"][2] > 0.4
-    with pytest.raises(UserError, match="start must be 'home' or 'near', got 'here'"):
+    with pytest.raises(UserError, match="start must be 'home', 'near' or 'look', got 'here'"):
         env.reset(options={"start": "here"})
+
+
+def test_looks_are_from_many_places_at_each_scene(make):
+    env = make(control="ee_planar", goal="grasp")
+    look = {"start": "look"}
+    infos = [env.reset(seed=3 if n == 0 else None, options=look)[1] for n in range(33)]
+    scenes = [info["scene_seed"] for info in infos]
+    assert scenes == [scenes[0]] * 16 + [scenes[16]] * 16 + [scenes[32]]
+    assert len(set(scenes)) == 3
+    for first in (0, 16):
+        objects = np.array([info["object_position"] for info in infos[first : first + 16]])
+        assert np.ptp(objects, axis=0).max() == 0, "the scene as it was"
+    hands = np.array([info["end_effector_position"] for info in infos[:32]])
+    assert (np.ptp(hands, axis=0) > 0.1).all()
+    assert np.ptp([info["gripper"][0] for info in infos]) > 0.04
+    again = [env.reset(seed=3 if n == 0 else None, options=look)[1] for n in range(2)]
+    for info, before in zip(again, infos):
+        np.testing.assert_array_equal(info["grasp_goal"], before["grasp_goal"])
+
+
+def test_an_action_or_a_scene_that_is_asked_for_ends_the_looks_at_one(make):
+    env = make(control="ee_planar")
+    _, first = env.reset(seed=3, options={"start": "look"})
+    _, second = env.reset(options={"start": "look"})
+    assert second["scene_seed"] == first["scene_seed"]
+    env.step(np.array([0, 0, 0, 0, 1.0]))
+    _, third = env.reset(options={"start": "look"})
+    assert third["scene_seed"] != first["scene_seed"]
+    _, asked = env.reset(options={"start": "look", "scene_seed": 7})
+    assert asked["scene_seed"] == 7
 
 
 def test_moves_along_the_axes_of_the_hand(make):

@@ -336,6 +336,9 @@ class RLConfig(Section):
     estimate_lr: Positive
     estimate_memory: Annotated[int, Field(ge=0)]
     estimate_recall: Count
+    estimate_place: bool
+    looks: Annotated[int, Field(ge=0)]
+    looks_lr: Positive
     normalise_observations: bool
     normalise_rewards: bool
     squash: bool
@@ -362,6 +365,12 @@ class RLConfig(Section):
                 raise ValueError(f"estimated_observations: the policy sees {name!r} already")
             if name in (self.privileged_observations or ()):
                 raise ValueError(f"{name!r} is both in estimated_ and privileged_observations")
+        return self
+
+    @model_validator(mode="after")
+    def _eyes_have_something_to_learn(self) -> RLConfig:
+        if not self.estimated_observations and (self.estimate_place or self.looks):
+            raise ValueError("estimate_place and looks need estimated_observations")
         return self
 
     @model_validator(mode="after")
