@@ -34,9 +34,8 @@ import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.base_cell import camera_intrinsics, wrist_mount
 from envs.films import film_episode
-from envs.vector import OWN_ENVS, VectorEnvs, WorkerError, make_env, vector_envs
+from envs.vector import VectorEnvs, WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, policy_for
 from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
@@ -135,26 +134,10 @@ def make_ppo(config: Config, envs: VectorEnvs, us: Team) -> GraspPPO:
     )
     layout = ObservationLayout.of(envs.observation_space, settings.policy_observations, hidden)
     torch.manual_seed(config.seed)
-    network = policy_for(layout, envs.action_space, settings, camera_of(config, layout))
+    network = policy_for(layout, envs.action_space, settings)
     if settings.initial is not None:
         load_weights(network, load_checkpoint(settings.initial, KIND), settings.initial)
     return GraspPPO(network, layout, settings, us)
-
-
-def camera_of(config: Config, layout: ObservationLayout) -> dict[str, Any] | None:
-    """Of the hand, for eyes that look for a place in what it sees; None where there are none such.
-    Raises UserError for other cameras and images."""
-    if not config.rl.estimate_place:
-        return None
-    if config.rl.env_id not in OWN_ENVS or config.env.camera != "wrist":
-        raise UserError("rl.estimate_place needs the cell's wrist camera: set env.camera=wrist")
-    if not layout.images or layout.images[-1].key != "depth":
-        raise UserError(
-            "rl.estimate_place needs depth: name it last of the images in rl.policy_observations"
-        )
-    side = config.env.resolution
-    camera = config.camera.model_copy(update={"mount": "wrist", "width": side, "height": side})
-    return {"K": camera_intrinsics(camera).K.tolist(), "T_EC": wrist_mount(camera).tolist()}
 
 
 def open_run(config: Config) -> str:

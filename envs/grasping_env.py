@@ -120,7 +120,8 @@ class RobotGraspingEnv(gymnasium.Env):
     `reset(options={"scene_seed": n})` asks for one scene; the option "start" says where the hand
     begins: "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is easier;
     or "look", anywhere that an episode may lead to, to learn to see from: up to 16 looks one after
-    the other, without a seed, are at the same scene. Without it a share `near_share` of the episodes begins near.
+    the other, without a seed, are at the same scene. Without it a share `near_share` of the
+    episodes begins near.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}

@@ -17,10 +17,8 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from models.layers import encoder, initialised, layers
 from models.normalisers import ObservationNormaliser
 from models.observations import ObservationLayout, Observations
-from models.place_eyes import PlaceEyes
 from models.ppo import KIND, GraspPPO
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config_schema import RLConfig
@@ -37,6 +35,7 @@ __all__ = [
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
+POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
 PIXEL_STEP = 4  # of pixels whose statistics are taken, along rows and columns; others are alike
 ESTIMATE_BETA = 0.1  # of the normalised error, from which on the estimates' loss is linear
@@ -98,7 +97,7 @@ class GraspPolicyNetwork(nn.Module):
     by layers of their own, the `eyes`: encoder and estimator. Policy and critic then see these
     estimates in the image's place, as given numbers: what the eyes learn they learn from
     `estimate_loss` alone, which is to be brought down while there is a simulator to tell the truth.
-    The policy never sees it. camera: None, or of `PlaceEyes`, which then are the eyes.
+    The policy never sees it.
 
     Weights start orthogonal, with gain sqrt 2, or 0.01 for the mean and 1 for the value, so that a
     new policy acts around 0 (Huang et al., "The 37 implementation details of PPO", 2022).
@@ -121,7 +120,6 @@ class GraspPolicyNetwork(nn.Module):
         initial_log_std: float = 0.0,
         estimated_dim: int = 0,
         relief: bool = False,
-        camera: dict | None = None,
     ):
         super().__init__()
         self.model_args = {
@@ -130,23 +128,20 @@ class GraspPolicyNetwork(nn.Module):
             "privileged_dim": privileged_dim, "conv_channels": list(conv_channels),
             "hidden_layers": hidden_layers, "activation": activation, "squash": squash,
             "normalise": normalise, "initial_log_std": initial_log_std,
-            "estimated_dim": estimated_dim, "relief": relief, "camera": camera,
+            "estimated_dim": estimated_dim, "relief": relief,
         }  # fmt: skip
         self.squash, self.normalise, self.estimated_dim = squash, normalise, estimated_dim
-        self.relief, self.image_channels, self.by_place = relief, image_channels, camera is not None
+        self.relief = relief
         self.image_norm = ObservationNormaliser(image_channels)
         self.state_norm = ObservationNormaliser(state_dim)
         self.privileged_norm = ObservationNormaliser(privileged_dim)
         self.encoder = None
-        if image_channels and not self.by_place:
+        if image_channels:
             self.encoder = encoder(image_channels + relief, conv_channels, image_feature_dim)
         seen = state_dim + (image_feature_dim if image_channels else 0)
         widths, kind = [hidden_dim] * hidden_layers, ACTIVATIONS[activation]
         self.estimator = None
-        if self.by_place:
-            self.estimator = PlaceEyes(image_channels + relief, state_dim, estimated_dim, camera)
-            seen = state_dim + estimated_dim
-        elif estimated_dim:
+        if estimated_dim:
             last = initialised(nn.Linear(hidden_dim, estimated_dim), 1.0)
             self.estimator = nn.Sequential(*layers([seen, hidden_dim], nn.ReLU), last)
             seen = state_dim + estimated_dim
@@ -191,8 +186,6 @@ class GraspPolicyNetwork(nn.Module):
 
     def estimate(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
         """(B, E) estimates of the first privileged numbers, in the scale of `truth`."""
-        if self.by_place:
-            return self.estimator(*self._shown(image, state))
         return self.estimator(self._seen(image, state))
 
     def estimate_loss(
@@ -201,8 +194,6 @@ class GraspPolicyNetwork(nn.Module):
         """Scalar: how far the estimates are from the truth, which is among the privileged numbers
         (B, P)."""
         truth = self.truth(privileged)
-        if self.by_place:
-            return self.estimator.loss(*self._shown(image, state), privileged[:, :2], truth)
         return F.smooth_l1_loss(self.estimate(image, state), truth, beta=ESTIMATE_BETA)
 
     def truth(self, privileged: torch.Tensor) -> torch.Tensor:
@@ -227,7 +218,7 @@ class GraspPolicyNetwork(nn.Module):
         """Take a rollout's observations into the statistics by which they are normalised."""
         if not self.normalise:
             return
-        if self.image_channels:
+        if self.encoder is not None:
             some = [i[:, ::PIXEL_STEP, ::PIXEL_STEP] for i in observations.images]
             pixels = observations._replace(images=tuple(some)).image().movedim(1, -1)
             self.image_norm.update(pixels.flatten(0, -2), team)
@@ -243,18 +234,10 @@ class GraspPolicyNetwork(nn.Module):
         state = self._normalised_state(state)
         if self.encoder is None:
             return state
-        return torch.cat([self.encoder(self._normalised_image(image)), state], -1)
-
-    def _shown(self, image: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """What PlaceEyes are shown."""
-        return self._normalised_image(image), image[:, -1], self._normalised_state(state)
-
-    def _normalised_image(self, image: torch.Tensor) -> torch.Tensor:
-        """(B, C, H, W), with one channel more where the relief is seen."""
         parts = [self.image_norm(image.movedim(1, -1)).movedim(-1, 1) if self.normalise else image]
         if self.relief:
             parts.append(relief_of(image[:, -1:]))
-        return torch.cat(parts, 1)
+        return torch.cat([self.encoder(torch.cat(parts, 1)), state], -1)
 
     def _distribution(self, features: torch.Tensor) -> ActionDistribution:
         log_std = self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
@@ -276,16 +259,36 @@ def relief_of(depth: torch.Tensor) -> torch.Tensor:
     return (rise / RELIEF_SCALE).clamp(-RELIEF_LIMIT, RELIEF_LIMIT)
 
 
+def encoder(channels: int, conv_channels: Sequence[int], features: int) -> nn.Sequential:
+    """(B, channels, H, W) to (B, features), for images of any size."""
+    parts: list[nn.Module] = []
+    for before, after in zip([channels, *conv_channels], conv_channels):
+        parts += [initialised(nn.Conv2d(before, after, 3, stride=2), math.sqrt(2)), nn.ReLU()]
+    parts += [nn.AdaptiveAvgPool2d(POOLED), nn.Flatten()]
+    return nn.Sequential(*parts, *layers([conv_channels[-1] * POOLED**2, features], nn.ReLU))
+
+
+def layers(widths: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    """Fully connected layers, each with its activation."""
+    parts: list[nn.Module] = []
+    for before, after in zip(widths, widths[1:]):
+        parts += [initialised(nn.Linear(before, after), math.sqrt(2)), activation()]
+    return nn.Sequential(*parts)
+
+
+def initialised(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Linear | nn.Conv2d:
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
 # --- Fitted to an environment, and from a file --------------------------------------------------
 
 
 def policy_for(
-    layout: ObservationLayout,
-    action_space: spaces.Space,
-    settings: RLConfig,
-    camera: dict | None = None,
+    layout: ObservationLayout, action_space: spaces.Space, settings: RLConfig
 ) -> GraspPolicyNetwork:
-    """A new network for an environment's observations and actions; camera: see GraspPolicyNetwork.
+    """A new network for an environment's observations and actions.
 
     Raises UserError for actions that are not a vector of real numbers, or without bounds where
     they would have to be squashed.
@@ -320,7 +323,6 @@ def policy_for(
         settings.initial_log_std,
         sum(int(np.prod(part.shape)) for part in estimated),
         settings.relief,
-        camera,
     )
     network.action_low.copy_(low)
     network.action_high.copy_(high)

@@ -336,7 +336,6 @@ class RLConfig(Section):
     estimate_lr: Positive
     estimate_memory: Annotated[int, Field(ge=0)]
     estimate_recall: Count
-    estimate_place: bool
     looks: Annotated[int, Field(ge=0)]
     looks_lr: Positive
     normalise_observations: bool
@@ -368,9 +367,9 @@ class RLConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _eyes_have_something_to_learn(self) -> RLConfig:
-        if not self.estimated_observations and (self.estimate_place or self.looks):
-            raise ValueError("estimate_place and looks need estimated_observations")
+    def _looks_teach_something(self) -> RLConfig:
+        if self.looks and not self.estimated_observations:
+            raise ValueError("looks are to learn estimates from: name estimated_observations")
         return self
 
     @model_validator(mode="after")
