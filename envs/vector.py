@@ -107,8 +107,8 @@ class VectorEnvs:
 
     @contextmanager
     def looking(self) -> Iterator[None]:
-        """Restarts in here put the hand anywhere that an episode may lead to, only to look."""
-        self._options = {"start": "look"}
+        """Episodes begun in here, which are not played, begin anywhere that one may lead to."""
+        self._options = {"start": "look"} if self._own else {}
         yield
         self._options = {}
 
