@@ -2,7 +2,8 @@
 
 Same environments and number of them, same network and hyper-parameters, no normalising; every seed
 of both in a process of its own, one after the other and in turn. The final return is the mean over
-deterministic episodes of the last policy, from seeds that both are given.
+deterministic episodes of the last policy, from seeds that both are given. How fast the environments
+are with nobody learning bounds what any trainer can reach.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if options.run:
         who, seed = options.run
-        print(json.dumps(vars(TRAIN[who](options.env[0], int(seed), options.steps))))
+        print(json.dumps(RUN[who](options.env[0], int(seed), options.steps)))
         return
     seeds = 2 if options.quick else options.seeds
     metrics = []
@@ -96,7 +97,7 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
     results: dict[str, list[Result]] = {who: [] for who in TRAIN}
     for seed in range(seeds):
         for who in list(TRAIN)[:: 1 if seed % 2 else -1]:  # who is first alternates
-            results[who].append(in_own_process(env, who, seed, steps))
+            results[who].append(Result(**in_own_process(env, who, seed, steps)))
             print(f"{env} {who} seed {seed}: {results[who][-1]}", file=sys.stderr, flush=True)
     returns = {who: [r.final_return for r in results[who]] for who in TRAIN}
     rate = {who: np.array([r.steps / r.seconds for r in results[who]]) for who in TRAIN}
@@ -114,6 +115,7 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
         Metric(f"{env}_speed_vs_sb3", float(np.median(rate["ours"] / rate["sb3"])), "x",
                at_least=1.3),
         Metric(f"{env}_steps_per_second", float(np.median(rate["ours"])), "1/s"),
+        Metric(f"{env}_steps_per_second_untrained", in_own_process(env, "nobody", 0, steps), "1/s"),
         Metric(f"{env}_cpu_vs_sb3", float(np.median(cpu["ours"] / cpu["sb3"])), "x"),
         Metric(f"{env}_memory", megabytes["ours"], "MB"),
         Metric(f"{env}_memory_vs_sb3", megabytes["ours"] / megabytes["sb3"], "x"),
@@ -129,14 +131,14 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
     return mean - half, mean + half
 
 
-def in_own_process(env: str, who: str, seed: int, steps: int) -> Result:
-    """A training with one thread a process, so that memory is its own and nothing is warm."""
+def in_own_process(env: str, who: str, seed: int, steps: int) -> Any:
+    """A run with one thread a process, so that memory is its own and nothing is warm."""
     command = [sys.executable, "-m", "benchmarks.bench_ppo", "--env", env, "--steps", str(steps)]
     done = subprocess.run(
         [*command, "--run", who, str(seed)], stdout=subprocess.PIPE, text=True, check=True,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
-    return Result(**json.loads(done.stdout.splitlines()[-1]))
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def memory() -> float:
@@ -231,7 +233,27 @@ def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
     return total
 
 
+def step_only(env: str, seed: int, steps: int) -> float:
+    """Steps a second of the same environments with random actions and nothing learned."""
+    from envs.vector import vector_envs
+
+    config = config_of(env, seed)
+    with vector_envs(config, config.rl.envs) as envs:
+        envs.action_space.seed(seed)
+        envs.restart([seed] * envs.num_envs)
+        count, start = max(1, steps // envs.num_envs // 4), time.perf_counter()
+        for _ in range(count):
+            actions = np.stack([envs.action_space.sample() for _ in range(envs.num_envs)])
+            _, _, terminated, truncated, _ = envs.step(actions)
+            ended = terminated | truncated
+            if ended.any():
+                envs.restart([None] * envs.num_envs, ended)
+        return count * envs.num_envs / (time.perf_counter() - start)
+
+
 TRAIN = {"ours": train_ours, "sb3": train_sb3}
+RUN = {who: lambda *task, train=train: vars(train(*task)) for who, train in TRAIN.items()}
+RUN["nobody"] = step_only
 
 
 if __name__ == "__main__":

@@ -22,17 +22,14 @@ from envs import hand_starts
 from envs.approach import Outline
 from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.grasp_goals import GraspGoals
+from envs.hand_commands import HandCommands
 from envs.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     JOINT_VELOCITY,
-    ServoStep,
     UnreachableError,
     forward_kinematics,
     inverse_kinematics,
-    moved,
-    pose_error,
-    rotation_matrix,
 )
 from envs.objects import ObjectSet, load_object_set
 from envs.panda import MAX_OPENING
@@ -43,25 +40,11 @@ from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
 
-_LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
-_HIGHEST_TIP = 0.50  # m
 _SHORTEST_LIFT = 0.05  # m, for the reward of objects that rest near the lift height already
-_MARGIN = 0.08  # m that E may leave the workspace sideways
-# How far the arm's answer to a command may lie from it before the command is refused.
-_FOLLOW_POSITION, _FOLLOW_ROTATION = 0.01, 0.06  # m, rad
-# The quicker joints of the wrist go no faster than the others: Bullet can hold a body's joints to
-# one limit only, and what is held to the lowest is legal for all.
-_FASTEST = float(JOINT_VELOCITY.min())  # rad/s
-# Share of that speed that is commanded: inertia and contacts throw a joint a little over what its
-# motor asks for (3 % in free motion).
-_SPEED_HEADROOM = 0.95
-_LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _LOOKS = 16  # from as many places at each scene: a place is quicker to reach than a scene to make
 _NEAR = 0.03  # m, see `object_offset`
 # An object that has tipped over, which offers other grasps: leaning this much, and this slow.
 _LEANING, _STILL = 0.2, 0.05  # rad, m/s
-_GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
-_FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
 
 
 class RobotGraspingEnv(gymnasium.Env):
@@ -168,13 +151,7 @@ class RobotGraspingEnv(gymnasium.Env):
             1,
             round(self.settings.hold_seconds * self.config.sim.frequency / self.settings.substeps),
         )
-        reach = self.config.workspace.size / 2 + _MARGIN
-        x, y = self.config.workspace.center
-        self._lowest = (x - reach, y - reach, _LOWEST_TIP)
-        self._highest = (x + reach, y + reach, _HIGHEST_TIP)
-        self._speed = _FASTEST * _SPEED_HEADROOM * self.config.robot.velocity_scale
-        seconds = self.settings.substeps / self.config.sim.frequency
-        self._max_joint_change = self._speed * seconds
+        self._hand = HandCommands(self.config)
 
     def _observation_spaces(self) -> dict[str, spaces.Space]:
         side = self.settings.resolution
@@ -242,11 +219,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self, q: np.ndarray, opening: float = MAX_OPENING
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode with the arm at joint positions q (7,), the gripper at `opening` m."""
-        self.cell.robot.limit_speed(_FASTEST)
-        self._servo = ServoStep(q)  # at the commanded joint positions
-        self._T_command = self._servo.reached
-        self._opening_command = opening
-        self._reachable = True
+        self._hand.begin(self.cell.robot, q, opening)
         self._steps = 0
         self._held_steps = 0
         self._running = True
@@ -272,7 +245,7 @@ class RobotGraspingEnv(gymnasium.Env):
             if self._goals is not None:
                 grasp = self._goals.grasp(self.np_random.integers(len(self._goals)), T_WO)
             T, opening = hand_starts.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
-            T[:3, 3] = np.clip(T[:3, 3], self._lowest, self._highest)
+            T[:3, 3] = np.clip(T[:3, 3], self._hand.lowest, self._hand.highest)
         try:
             return inverse_kinematics(T, self.cell.home, self.cell.home), opening
         except UnreachableError:
@@ -290,7 +263,7 @@ class RobotGraspingEnv(gymnasium.Env):
         if not self._running:
             raise ResetNeeded("step() needs a running episode: call reset() first")
         self._looks_left = 0  # an action may change the scene
-        self._command(self._checked(action))
+        self._hand.command(self._checked(action), self._state)
         self.cell.step(self.settings.substeps)
         self._steps += 1
         try:
@@ -362,79 +335,6 @@ class RobotGraspingEnv(gymnasium.Env):
         if not np.isfinite(action).all():
             raise InvalidAction(f"action holds a non-finite number: {action.tolist()}")
         return np.minimum(np.maximum(action, -1.0), 1.0)
-
-    def _command(self, action: np.ndarray) -> None:
-        """Move the commanded pose by an action and send the motors there."""
-        if self.settings.control == "joint":
-            goal = self._servo.q + self.settings.joint_step * action[:7]
-            goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
-            servo = ServoStep(self._within_speed(goal)[0])
-            self._reachable = self._allowed(servo)
-            if self._reachable:
-                self._servo = servo
-        else:
-            self._follow(self._moved_pose(action))
-        self.cell.robot.drive_arm_to(self._servo.q, self._speed)
-        self._opening_command = self._new_opening(float(action[-1]))
-        self.cell.robot.command_gripper(self._opening_command)
-
-    def _new_opening(self, action: float) -> float:
-        """What the gripper is told, in metres."""
-        if self.settings.gripper == "opening":
-            return MAX_OPENING * (action + 1) / 2
-        opening = self._opening_command + self.settings.gripper_step * action
-        now = float(self._state[14])
-        opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
-        return min(max(opening, 0.0), MAX_OPENING)
-
-    def _moved_pose(self, action: np.ndarray) -> np.ndarray:
-        """(4, 4) the commanded pose of E moved by an action, within the workspace."""
-        settings, T = self.settings, self._T_command.copy()
-        move = settings.position_step * action[:3]
-        turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
-        if settings.frame == "hand":
-            move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
-        position = zip((T[:3, 3] + move).tolist(), self._lowest, self._highest)
-        T[:3, 3] = [min(max(value, low), high) for value, low, high in position]
-        if any(turn.tolist()):
-            T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
-        return T
-
-    def _follow(self, target: np.ndarray) -> None:
-        """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
-        where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
-        goal, share = self._within_speed(self._servo.towards(target))
-        for _ in range(_FOLLOW_TRIES):
-            wanted = target
-            if share < 1.0:
-                wanted = moved(self._T_command, share * pose_error(self._T_command, target))
-            servo = ServoStep(goal)
-            error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
-            if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
-                self._reachable = self._allowed(servo)
-                if self._reachable:
-                    self._servo, self._T_command = servo, wanted
-                return
-            goal, slower = self._within_speed(servo.towards(wanted))
-            share *= slower
-        self._reachable = False
-
-    def _allowed(self, goal: ServoStep) -> bool:
-        """Whether a goal may be commanded: the arm is free, and its gate lets that pass."""
-        tip = goal.reached[:3, 3]
-        return not self._blocked(goal.q) and self.cell.robot.gate.refusal(goal.q, tip) is None
-
-    def _blocked(self, goal: np.ndarray) -> bool:
-        """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""
-        now = self._state[:7]
-        lead = abs(goal - now).max()
-        return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
-
-    def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joint positions (7,) towards a goal, and the share of the way that an action gets."""
-        change = goal - self._servo.q
-        share = 1.0 / max(float(abs(change).max()) / self._max_joint_change, 1.0)
-        return self._servo.q + share * change, share
 
     # --- What happened ----------------------------------------------------------------------
 
@@ -508,10 +408,10 @@ class RobotGraspingEnv(gymnasium.Env):
             "object_position": self._object_position,
             "object_offset": offset,
             "object_outline": self._view.outline(),
-            "gripper": np.array([self._state[14], self._opening_command]),
+            "gripper": np.array([self._state[14], self._hand.opening]),
             "end_effector_position": self._tip,
             "grasped": self._grasped,
-            "reachable": bool(self._reachable),
+            "reachable": self._hand.reachable,
             "scene_seed": self._scene_seed,
         }
         if self._goals is not None:
