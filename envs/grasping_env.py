@@ -90,7 +90,8 @@ class RobotGraspingEnv(gymnasium.Env):
     (`off_table`) or the physics has blown up (`physics`). Truncation: `max_steps` actions.
 
     info: `is_success`, `reason` (why the episode ended, or None), `end_effector_position` (3,),
-    `gripper` (2,), its opening and what is commanded (m), `reachable` (False where the action was
+    `gripper` (2,), its opening and what is commanded (m), `squeeze` (1,), by how much it is wider
+    than commanded: it moves, or holds something (m), `reachable` (False where the action was
     refused), `scene_seed`; and what no robot is told: `grasped`, `object_position` (3,), and of the
     same nearest object `object_offset` (6,), from E to its centre along E's axes, in metres and as
     tanh(metres / 0.03), which tells the last centimetres finely, and `object_outline` (9,), see
@@ -186,9 +187,9 @@ class RobotGraspingEnv(gymnasium.Env):
             self._looks_left = _LOOKS if start == "look" else 0
         if start == "home":
             return self._begin(self.cell.home.copy())
-        q, opening = self._start_hand(start)
+        q, opening, command = self._start_hand(start)
         self.cell.robot.place(q, opening)
-        return self._begin(q, opening)
+        return self._begin(q, command)
 
     def _make_scene(self, seed: int) -> None:
         self._scene_seed = seed
@@ -216,10 +217,11 @@ class RobotGraspingEnv(gymnasium.Env):
         self._goals = self._goals_now() if self.settings.goal == "grasp" else None
 
     def _begin(
-        self, q: np.ndarray, opening: float = MAX_OPENING
+        self, q: np.ndarray, command: float = MAX_OPENING
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode with the arm at joint positions q (7,), the gripper at `opening` m."""
-        self._hand.begin(self.cell.robot, q, opening)
+        """Begin an episode with the arm at joint positions q (7,) and the gripper commanded to open
+        by so many metres."""
+        self._hand.begin(self.cell.robot, q, command)
         self._steps = 0
         self._held_steps = 0
         self._running = True
@@ -230,26 +232,26 @@ class RobotGraspingEnv(gymnasium.Env):
             self.render()
         return self._observation(), self._info(None)
 
-    def _start_hand(self, start: str) -> tuple[np.ndarray, float]:
-        """Joint positions (7,) and opening to begin with "near" one of the objects, or to "look" at
-        one from; those of home where the arm does not reach what was drawn."""
+    def _start_hand(self, start: str) -> tuple[np.ndarray, float, float]:
+        """Joint positions (7,), opening and commanded opening to begin with: "near" one of the
+        objects, or to "look" at one from; at home where the arm does not reach what was drawn."""
         T_home = forward_kinematics(self.cell.home)
         index = int(self.np_random.integers(len(self._outlines)))
         T_WO = self.cell.object_pose(index)
         top = self._outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
-        opening = MAX_OPENING
         if start == "near":
             T = hand_starts.near(T_home, T_WO[:2, 3], top, self.np_random)
+            opening = command = MAX_OPENING
         else:
             grasp = None
             if self._goals is not None:
                 grasp = self._goals.grasp(self.np_random.integers(len(self._goals)), T_WO)
-            T, opening = hand_starts.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
+            T, opening, command = hand_starts.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
             T[:3, 3] = np.clip(T[:3, 3], self._hand.lowest, self._hand.highest)
         try:
-            return inverse_kinematics(T, self.cell.home, self.cell.home), opening
+            return inverse_kinematics(T, self.cell.home, self.cell.home), opening, command
         except UnreachableError:
-            return self.cell.home.copy(), opening
+            return self.cell.home.copy(), opening, command
 
     def _goals_now(self) -> GraspGoals:
         return GraspGoals(self.cell.truth(), self.cell.object_pose(0))
@@ -409,6 +411,7 @@ class RobotGraspingEnv(gymnasium.Env):
             "object_offset": offset,
             "object_outline": self._view.outline(),
             "gripper": np.array([self._state[14], self._hand.opening]),
+            "squeeze": np.array([self._state[14] - self._hand.opening]),
             "end_effector_position": self._tip,
             "grasped": self._grasped,
             "reachable": self._hand.reachable,

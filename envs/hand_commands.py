@@ -54,7 +54,8 @@ class HandCommands:
         self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency
 
     def begin(self, robot: Panda, q: np.ndarray, opening: float) -> None:
-        """Begin with a robot at joint positions q (7,), its gripper open by `opening` metres."""
+        """Begin with the arm of a robot at joint positions q (7,), its gripper commanded to open by
+        `opening` metres."""
         self._robot = robot
         robot.limit_speed(_FASTEST)
         self._servo = ServoStep(q)  # at the commanded joint positions

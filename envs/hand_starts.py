@@ -18,6 +18,7 @@ _LOOK_HEIGHT, _LOOK_TURN = (0.01, 0.42), math.pi / 2
 _LOOK_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
 _OPEN_SHARE = 0.6  # of the looks: with open fingers, as nearly all of an episode is seen
 _GRASP_SHARE = 0.4  # of the looks: on the way down to a grasp
+_MOVING_SHARE, _MOST_SQUEEZE = 0.5, 0.02  # of the looks: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
 
@@ -35,22 +36,28 @@ def near(T_home: np.ndarray, object_place: np.ndarray, top: float, random) -> np
 
 def look(
     T_home: np.ndarray, object_place: np.ndarray, top: float, grasp: Grasp | None, random
-) -> tuple[np.ndarray, float]:
-    """A place to look at an object from, with an opening in metres: wherever an episode may lead
-    the hand, from high above to right around a grasp. Arguments as of `near`; grasp: of the object,
-    None where no looks from its way down are wanted."""
+) -> tuple[np.ndarray, float, float]:
+    """A place to look at an object from, (4, 4), with the opening of the hand and the one that is
+    commanded, in metres: wherever an episode may lead, from high above to right around a grasp.
+
+    Arguments as of `near`; grasp: of the object, None where no looks on the way down to one are
+    wanted.
+    """
     if grasp is not None and random.random() < _GRASP_SHARE:
         place = grasp.position[:2] + random.normal(0, _GRASP_SIDE, 2)
         height = random.uniform(grasp.position[2], top + _GRASP_HEIGHT)
         turn = grasp.angle - math.atan2(T_home[1, 1], T_home[0, 1])
         turn -= _HALF_TURN * round(turn / _HALF_TURN)
-        T = _hand(T_home, place, height, turn + random.normal(0, _GRASP_TURN))
-        return T, random.uniform(grasp.narrow, grasp.wide)
-    rise = math.exp(random.uniform(*np.log(_LOOK_HEIGHT)))
-    place = object_place + random.normal(0, _LOOK_SIDE[0] + _LOOK_SIDE[1] * rise, 2)
-    opened = random.random() < _OPEN_SHARE
-    opening = _MAX_OPENING if opened else random.uniform(0, _MAX_OPENING)
-    return _hand(T_home, place, top + rise, random.uniform(-_LOOK_TURN, _LOOK_TURN)), opening
+        turn += random.normal(0, _GRASP_TURN)
+        opening = random.uniform(grasp.narrow, grasp.wide)
+    else:
+        rise = math.exp(random.uniform(*np.log(_LOOK_HEIGHT)))
+        place = object_place + random.normal(0, _LOOK_SIDE[0] + _LOOK_SIDE[1] * rise, 2)
+        height, turn = top + rise, random.uniform(-_LOOK_TURN, _LOOK_TURN)
+        opened = random.random() < _OPEN_SHARE
+        opening = _MAX_OPENING if opened else random.uniform(0, _MAX_OPENING)
+    squeeze = random.uniform(0, _MOST_SQUEEZE) if random.random() < _MOVING_SHARE else 0.0
+    return _hand(T_home, place, height, turn), opening, max(opening - squeeze, 0.0)
 
 
 def _hand(T_home: np.ndarray, place: np.ndarray, height: float, turn: float) -> np.ndarray:

@@ -19,7 +19,7 @@ from envs.kinematics import forward_kinematics
 from utils.config import with_settings
 from utils.transforms import Grasp, RGBDFrame
 
-TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper")
+TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "squeeze")
 _SURE = 3  # looks in a row at which something must be gripped: a first touch may slip
 SCENARIOS = ("isolated", "static")  # one object, which stays where it is
 

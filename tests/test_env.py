@@ -461,6 +461,10 @@ def test_looks_are_from_many_places_at_each_scene(make):
     hands = np.array([info["end_effector_position"] for info in infos[:32]])
     assert (np.ptp(hands, axis=0) > 0.1).all()
     assert np.ptp([info["gripper"][0] for info in infos]) > 0.04
+    squeezes = np.array([info["squeeze"][0] for info in infos])
+    commands = np.array([info["gripper"] for info in infos])
+    np.testing.assert_allclose(squeezes, commands[:, 0] - commands[:, 1], atol=1e-6)
+    assert 0.25 < np.mean(squeezes > 1e-3) < 0.75, "about half of them while the fingers close"
     again = [env.reset(seed=3 if n == 0 else None, options=look)[1] for n in range(2)]
     for info, before in zip(again, infos):
         np.testing.assert_array_equal(info["grasp_goal"], before["grasp_goal"])
