@@ -11,17 +11,19 @@ Corke and Leitner ("Closing the loop for robotic grasping", RSS 2018) draw their
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from models.grasp_peaks import PeakSettings, find_peaks, surface_grasps
+from models.grasp_peaks import PeakSettings, find_peaks, surface_depth, surface_grasps
 from models.graspnet import to_input
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_planner import GraspNetPlanner
 from models.planners import Planner, make_planner
 from models.rectangle_scores import Judged, judged
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.overhead_view import overhead_view
 from utils.real_data import RealSample, open_real_data
@@ -31,18 +33,27 @@ from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
 
 # A first Kinect's colour camera as its driver describes it where it was not calibrated.
 K = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
+SHAPE = (480, 640)  # rows and columns of its images
 HAND = GripperGeometry()
 OPENING = 0.15  # m, of the hand that photographs are judged for: the tutorial's widest
 SHRUNK = OPENING / HAND.max_opening  # how many times smaller a photograph's world becomes
 REACH = 0.04  # m outside a workspace that the planners' search still grasps (`SearchSettings`)
 # So that planners reach 0.30 m of the shrunk world, as large a square as the cell's.
 WORKSPACE = Workspace((0.0, 0.0), 0.30 - 2 * REACH)
+PIXEL = 0.002  # m, of the view that tells how high a planner's grasp lies
 BEST = PeakSettings(threshold=-1.0, count=1)
 
 
 def photographs(root: Path) -> list[RealSample]:
     """Cornell's images in a folder. Raises UserError naming what is wrong with it."""
-    return list(open_real_data("cornell", root))
+    samples = list(open_real_data("cornell", root))
+    for sample in samples:
+        if sample.depth.shape != SHAPE:
+            height, width = sample.depth.shape
+            raise UserError(
+                f"{root}: {sample.name} has {width} x {height} px, Cornell's photographs 640 x 480"
+            )
+    return samples
 
 
 def frame_of(sample: RealSample, shrunk: float = SHRUNK) -> RGBDFrame:
@@ -78,16 +89,23 @@ def judge_photographs(
 
 
 def best_grasp(planner: Planner, frame: RGBDFrame) -> Grasp | None:
-    """A network's best grasp, else the planner's first."""
+    """A network's best grasp, else the planner's first; on the surface that the image shows, below
+    which it does not tell how far the fingers go."""
     if isinstance(planner, GraspNetPlanner):
         return network_grasp(planner.network, frame)
-    return next(iter(planner(frame)), None)
+    planned = planner(frame)
+    if not planned:
+        return None
+    view = overhead_view(frame, WORKSPACE, PIXEL, REACH)
+    pixel, _ = project(planned[0].position, view.K, view.T_WC)
+    (distance,) = surface_depth(view.depth, pixel)
+    x, y, _ = planned[0].position
+    return replace(planned[0], position=np.array([x, y, view.T_WC[2, 3] - distance]))
 
 
 @torch.inference_mode()
 def network_grasp(saved: SavedGraspNet, frame: RGBDFrame) -> Grasp:
-    """The grasp at the best pixel of what a network sees from above. At the surface: where the
-    fingers end is nothing that an image shows."""
+    """The grasp at the best pixel of what a network sees from above, on the surface there."""
     view = overhead_view(frame, WORKSPACE, saved.metres_per_pixel, REACH)
     maps = saved.model.eval()(to_input(view.rgb, view.depth)[None])
     (grasp,) = surface_grasps(find_peaks(*maps, BEST), view.depth, HAND)
