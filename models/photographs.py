@@ -1,10 +1,10 @@
 """How planners and networks that were made in simulation alone do on Cornell's photographs.
 
-No label teaches or chooses anything. A photograph becomes a frame: its distances become depths, the
-table tells where the camera is (`utils.table_camera`). The labels are for a hand that can hold a
-cereal box, which the Panda's cannot. A hand of the same shape that is k times as large does in its
-world what the Panda's does in one that is k times as small; so frames are shrunk, and everything
-else is as in the cell. The plates of a rectangle are half as long as its opening, as Morrison,
+No label teaches anything, and nothing is fitted to one. A photograph becomes a frame: its distances
+become depths, the table tells where the camera is (`utils.table_camera`). The labels are for a hand
+that can hold a cereal box, which the Panda's cannot. A hand of the same shape that is k times as
+large does in its world what the Panda's does in one that is k times as small; so frames are shrunk,
+and everything else is as in the cell. The plates of a rectangle are half as long as its opening, as Morrison,
 Corke and Leitner ("Closing the loop for robotic grasping", RSS 2018) draw theirs.
 """
 
