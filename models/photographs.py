@@ -4,8 +4,8 @@ No label teaches anything, and nothing is fitted to one. A photograph becomes a 
 become depths, the table tells where the camera is (`utils.table_camera`). The labels are for a hand
 that can hold a cereal box, which the Panda's cannot. A hand of the same shape that is k times as
 large does in its world what the Panda's does in one that is k times as small; so frames are shrunk,
-and everything else is as in the cell. The plates of a rectangle are half as long as its opening, as Morrison,
-Corke and Leitner ("Closing the loop for robotic grasping", RSS 2018) draw theirs.
+and everything else is as in the cell. The plates of a rectangle are half as long as its opening, as
+Morrison, Corke and Leitner ("Closing the loop for robotic grasping", RSS 2018) draw theirs.
 """
 
 from __future__ import annotations
