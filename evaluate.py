@@ -42,8 +42,7 @@ from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
 from envs.worlds import in_world, make_cell
-from models.graspnet_planner import GraspNetPlanner
-from models.photographs import judge_photographs, photographs
+from models.photographs import judge_photographs, photographs, sees_photographs
 from models.planners import make_planner
 from models.rectangle_pictures import draw_rectangles
 from utils.config import (
@@ -249,13 +248,13 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
         if error is not None or interrupted:
             break
     for planner in planners if samples and PHOTOGRAPHS in worlds else []:
-        if is_learned(planner):
+        if is_learned(planner) or not sees_photographs(planner, config.seed):
             continue
-        network = make_planner(planner, GripperGeometry(), workspace_of(config), config.seed)
-        if isinstance(network, GraspNetPlanner):
-            judged = judge_photographs(network.network, samples)
-            scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for one in judged), len(judged))
-            draw_rectangles(run / f"{Path(planner).stem}-{PHOTOGRAPHS}.png", samples, judged)
+        judged = judge_photographs(planner, samples, config.seed)
+        shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
+        scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for _, one in shown), len(samples))
+        if shown:
+            draw_rectangles(run / f"{Path(planner).stem}-{PHOTOGRAPHS}.png", *zip(*shown))
 
     lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")

@@ -59,12 +59,12 @@ def median_plate_length(samples: Sequence[RealSample]) -> float:
 
 @torch.inference_mode()
 def best_rectangle(
-    model: GraspNet, sample: RealSample, view: View, plate_length: float | None
+    model: GraspNet, sample: RealSample, view: View, plate_length: float
 ) -> tuple[GraspRectangle, float]:
     """The network's best grasp on an image, in that image's pixels, and its quality.
 
-    plate_length: pixels of the image, what the rectangle measures across the closing line; None:
-    half of the opening. The model has to be in evaluation mode.
+    plate_length: pixels of the image, what the rectangle measures across the closing line. The
+    model has to be in evaluation mode.
     """
     rgb, depth, _ = view.warp(sample)
     device = next(model.parameters()).device
@@ -72,27 +72,27 @@ def best_rectangle(
     found = find_peaks(*model(x), BEST)
     zoom = view.size / view.side
     opening = max(float(found.width[0]) / view.metres_per_pixel, 1e-3)
-    plates = opening / 2 if plate_length is None else plate_length * zoom
-    there = GraspRectangle(found.pixel[0], float(found.angle[0]), opening, plates)
+    there = GraspRectangle(found.pixel[0], float(found.angle[0]), opening, plate_length * zoom)
     back = np.linalg.inv(view.matrix(sample.depth.shape))
     return there.transformed(back), float(found.quality[0])
 
 
 def judge(
-    model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float | None
+    model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float
 ) -> list[Judged]:
     """The rectangle metric of the best grasp on every image; the model ends in evaluation mode."""
     model.eval()
-    judged = []
-    for sample in samples:
-        rectangle, quality = best_rectangle(model, sample, view, plate_length)
-        overlaps = [intersection_over_union(rectangle, label) for label in sample.positives]
-        nearest = int(np.argmax(overlaps))
-        error = angle_difference(rectangle.angle, sample.positives[nearest].angle)
-        judged.append(
-            Judged(
-                sample.name, sample.object_id, rectangle, quality,
-                rectangle_match(rectangle, sample.positives), overlaps[nearest], float(error),
-            )
-        )  # fmt: skip
-    return judged
+    return [
+        judged(sample, *best_rectangle(model, sample, view, plate_length)) for sample in samples
+    ]
+
+
+def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Judged:
+    """The rectangle metric of a grasp on an image, in that image's pixels."""
+    overlaps = [intersection_over_union(rectangle, label) for label in sample.positives]
+    nearest = int(np.argmax(overlaps))
+    error = angle_difference(rectangle.angle, sample.positives[nearest].angle)
+    return Judged(
+        sample.name, sample.object_id, rectangle, quality,
+        rectangle_match(rectangle, sample.positives), overlaps[nearest], float(error),
+    )  # fmt: skip

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from evaluate import is_trained
-from models.photographs import view_of
-from models.real_training_data import VIEWS
 from utils.config import TransferPolicy, load_config
 from utils.results import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
@@ -143,14 +141,6 @@ def test_outside_is_outside():
         inner, outer = getattr(training.physics, name), getattr(outside.physics, name)
         assert outer.low >= inner.high or outer.high <= inner.low, name
         assert outer.operation == inner.operation, name
-
-
-def test_photographs_are_seen_at_the_network_s_scale():
-    view, cornell = view_of(0.00178), VIEWS["cornell"]
-    assert view.size % 8 == 0 and view.metres_per_pixel == pytest.approx(0.00178, rel=0.02)
-    assert view.size * view.metres_per_pixel == pytest.approx(
-        cornell.size * cornell.metres_per_pixel
-    )
 
 
 @pytest.mark.slow

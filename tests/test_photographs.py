@@ -1,0 +1,161 @@
+"""Photographs as frames: a box on a table seen from the side, whose geometry is known exactly."""
+
+import numpy as np
+import pytest
+
+from models import photographs
+from models.graspnet_io import SavedGraspNet
+from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
+from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
+from tests.test_real_training import write_cornell
+from utils.errors import UserError
+from utils.overhead_view import overhead_view
+from utils.real_data import RealSample
+from utils.rectangles import GraspRectangle
+from utils.table_camera import find_table_camera
+from utils.transforms import Grasp, RGBDFrame, deproject, look_at, project
+
+# Cornell's camera looks down like this: 0.73 m over the table, 37 degrees from straight down.
+T_WC = look_at((0.0, -0.55, 0.73), (0.0, 0.0, 0.0))
+ROBOT = np.array([-0.3, -0.9, 0.1])
+BOX = np.array([0.06, 0.16, 0.08])  # m along x, y and z, in the middle of the view
+GREY, RED = (200, 200, 200), (180, 30, 30)
+
+
+def photographed(
+    box: np.ndarray | None = BOX, noise: float = 0.0, labels: tuple[GraspRectangle, ...] = ()
+) -> tuple[RealSample, RGBDFrame]:
+    """The sample whose depths are distances from ROBOT, and the true frame; by the slab formula."""
+    v, u = np.mgrid[:480, :640]
+    rays = deproject(np.stack([u, v], axis=-1), np.ones(u.shape), K, T_WC) - T_WC[:3, 3]
+    depth, rgb = -T_WC[2, 3] / rays[..., 2], np.full((480, 640, 3), GREY, np.uint8)
+    if box is not None:
+        low, high = np.array([-box[0] / 2, -box[1] / 2, 0.0]), np.array([*box[:2] / 2, box[2]])
+        slabs = np.sort([(side - T_WC[:3, 3]) / rays for side in (low, high)], axis=0)
+        near, far = slabs[0].max(axis=-1), slabs[1].min(axis=-1)
+        hit = (near < far) & (near < depth)
+        depth, rgb[hit] = np.where(hit, near, depth), RED
+    frame = RGBDFrame(rgb, depth.astype(np.float32), K, T_WC)
+    distance = np.linalg.norm(frame.points() - ROBOT, axis=-1)
+    distance += noise * np.random.default_rng(0).standard_normal(distance.shape)
+    return RealSample("pcd0100", "box", rgb, distance.astype(np.float32), labels), frame
+
+
+# --- The camera ------------------------------------------------------------------------------
+
+
+def test_distances_from_the_robot_tell_the_camera_and_the_depths():
+    sample, true = photographed()
+    camera = find_table_camera(sample.depth, K)
+    np.testing.assert_allclose(camera.T_WC, T_WC, atol=2e-3)
+    robot = camera.T_WC[:3, :3] @ camera.origin + camera.T_WC[:3, 3]
+    assert robot == pytest.approx(ROBOT, abs=5e-3)
+    np.testing.assert_allclose(camera.depth(sample.depth, K), true.depth, atol=3e-3)
+
+
+def test_noise_leaves_heights_true_to_millimetres():
+    sample, true = photographed(noise=0.002)
+    camera = find_table_camera(sample.depth, K)
+    found = RGBDFrame(true.rgb, camera.depth(sample.depth, K), K, camera.T_WC)
+    top = true.points()[..., 2] > BOX[2] - 1e-4
+    assert np.median(found.points()[top, 2]) == pytest.approx(BOX[2], abs=2e-3)
+
+
+# --- From above ------------------------------------------------------------------------------
+
+
+def test_the_view_from_above_shows_the_top_of_a_box_where_it_is():
+    _, frame = photographed()
+    view = overhead_view(frame, WORKSPACE, 0.0018)
+    assert view.depth.shape == (120, 120)  # 0.22 m
+    high = view.depth < 0.8 - BOX[2] + 1e-3
+    v, u = np.nonzero(high)
+    corners, _ = project(np.array([[-0.03, 0.08, 0.08], [0.03, -0.08, 0.08]]), view.K, view.T_WC)
+    assert (u.min(), v.min()) == pytest.approx(corners[0], abs=1.5)
+    assert (u.max(), v.max()) == pytest.approx(corners[1], abs=1.5)
+    assert high.sum() == pytest.approx(np.prod(corners[1] - corners[0]), rel=0.05)
+    assert (view.rgb[high] == RED).all()
+
+
+def test_what_the_box_hides_is_bare_table():
+    _, frame = photographed()
+    view = overhead_view(frame, WORKSPACE, 0.0018)
+    (hidden,), _ = project(np.array([[0.0, 0.1, 0.0]]), view.K, view.T_WC)  # 2 cm behind
+    u, v = np.rint(hidden).astype(int)
+    assert view.depth[v, u] == pytest.approx(0.8, abs=1e-3)
+    assert tuple(view.rgb[v, u]) == GREY
+
+
+# --- Grasps and rectangles -------------------------------------------------------------------
+
+
+def test_a_rectangle_is_the_projected_opening():
+    _, frame = photographed()
+    across = photographs.rectangle_of(Grasp(np.zeros(3), 0.0, 0.08, 1.0), frame)
+    away = np.linalg.norm(T_WC[:3, 3])
+    assert across.centre == pytest.approx((319.5, 239.5))
+    assert (across.angle, across.width) == pytest.approx((0.0, 525 * 0.08 / away))
+    assert across.height == across.width / 2
+    along = photographs.rectangle_of(Grasp(np.zeros(3), np.pi / 2, 0.08, 1.0), frame)
+    assert along.angle == pytest.approx(np.pi / 2)
+    # Foreshortened by the sine of the camera's elevation.
+    assert along.width == pytest.approx(525 * 0.08 / away * 0.73 / away, rel=0.01)
+
+
+def test_a_shrunk_world_looks_the_same():
+    sample, _ = photographed()
+    whole, small = frame_of(sample, 1.0), frame_of(sample, 2.0)
+    point = np.array([0.03, -0.05, 0.04])
+    at, far = project(point, whole.K, whole.T_WC)
+    there, near = project(point / 2, small.K, small.T_WC)
+    assert at == pytest.approx(there) and far == pytest.approx(2 * near)
+    np.testing.assert_allclose(whole.depth, 2 * small.depth, rtol=1e-6)
+
+
+def truth(sample_frame: RGBDFrame, grasp: Grasp) -> tuple[GraspRectangle, ...]:
+    return (photographs.rectangle_of(grasp, sample_frame),)
+
+
+def test_the_heuristic_grasps_a_photographed_box_across():
+    _, frame = photographed()
+    label = truth(frame, Grasp(np.array([0.0, 0.0, BOX[2]]), 0.0, 0.09, 1.0))
+    sample, _ = photographed(noise=0.001, labels=label)
+    (found,) = judge_photographs("heuristic", [sample], seed=0)
+    assert found.correct and found.iou > 0.5
+    assert np.degrees(found.angle_error) < 5
+
+
+def test_nothing_on_the_table_is_nothing_to_grasp():
+    sample, _ = photographed(box=None)
+    assert judge_photographs("heuristic", [sample], seed=0) == [None]
+
+
+def test_a_network_s_best_pixel_becomes_a_grasp_of_the_photograph():
+    sample, frame = photographed()
+    middle = 8 * round(0.30 / METRES_PER_PIXEL / 8) / 2 - 0.5
+    # 27 pixels of 1.8 mm to the right of the middle; 0.8 m away, where the table is.
+    network = Opinion((middle + 27.5, middle - 0.5), radius=0.1)
+    grasp = photographs.network_grasp(
+        SavedGraspNet(network, METRES_PER_PIXEL, {}, {}), frame_of(sample)
+    )
+    right = 27.5 * METRES_PER_PIXEL
+    assert grasp.position == pytest.approx((right, 0.5 * METRES_PER_PIXEL, 0.0), abs=2e-3)
+    assert (grasp.angle, grasp.width) == pytest.approx((0.0, 0.05))
+    rectangle = photographs.rectangle_of(grasp, frame_of(sample))
+    (true,) = truth(frame, Grasp(SHRUNK * grasp.position, 0.0, SHRUNK * 0.05, 1.0))
+    assert rectangle.centre == pytest.approx(true.centre, abs=1.0)
+    assert rectangle.width == pytest.approx(true.width, rel=0.01)
+
+
+def test_the_hand_opens_as_wide_as_the_tutorial_s_network_can_tell():
+    assert SHRUNK * HAND.max_opening == pytest.approx(0.15)
+
+
+def test_whoever_needs_the_truth_sees_no_photographs():
+    assert not photographs.sees_photographs("oracle", 0)
+    assert photographs.sees_photographs("random", 0)
+
+
+def test_images_of_another_size_are_refused(tmp_path):
+    with pytest.raises(UserError, match="640 x 480"):
+        photographs.photographs(write_cornell(tmp_path, 1))

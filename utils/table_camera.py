@@ -1,0 +1,82 @@
+"""A camera over a table, found from how far each pixel's point is from a place that is not it.
+
+Cornell's depth images are of that kind. Its point clouds are given in the robot's frame, and the
+images made from them, as `DepthImage.from_pcd` of github.com/dougsm/ggcnn does, hold the length of
+each point's coordinates. Taken for depths they bend the table by centimetres; as distances from the
+robot they leave it flat, and say where camera and robot are. This module knows no file format.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from utils.table_plane import Plane
+
+SIDE = 400  # pixels of the square in the image's middle that the table is looked for in
+STEP = 8  # pixels between those that are looked at
+FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel counts ever less
+# Where the search starts: a camera one metre from the table that looks at it from half above, and
+# the robot on the camera's side of the table.
+STEEP = np.array([0.0, 0.8, 1.0])
+ROBOT = np.array([0.0, 0.8, 0.2])
+
+
+@dataclass(frozen=True)
+class TableCamera:
+    """In the camera's optical frame, metres. table: (3,) normal of the table's plane over its
+    distance, so that points on it are those with table @ point = 1. origin: (3,) from where the
+    distances are measured."""
+
+    table: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def T_WC(self) -> np.ndarray:
+        """(4, 4) in the world whose z = 0 is the table, with the origin where the optical axis
+        meets it."""
+        length = np.linalg.norm(self.table)
+        foot = np.array([0.0, 0.0, 1 / self.table[2]])
+        T_WC = Plane(-self.table / length, 1 / length, foot, 1.0).camera_pose()
+        T_WC[:2, 3] -= (T_WC[:3, :3] @ foot + T_WC[:3, 3])[:2]
+        return T_WC
+
+    def depth(self, distance: np.ndarray, K: np.ndarray) -> np.ndarray:
+        """(H, W) float32 metres along the optical axis of points at `distance` (H, W) from the
+        origin: where each pixel's ray leaves the sphere of that radius around it."""
+        rays = _rays(distance.shape, K)
+        along, squared = rays @ self.origin, (rays**2).sum(axis=-1)
+        beside = self.origin @ self.origin - distance.astype(float) ** 2
+        # A pixel that is off by its noise may have a sphere that its ray only just misses.
+        root = np.sqrt(np.maximum(along**2 - squared * beside, 0))
+        return ((along + root) / squared).astype(np.float32)
+
+
+def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
+    """The camera of an image of distances (H, W) metres, most of whose middle shows a table.
+
+    A robust fit (Cauchy's loss), for which objects and walls hardly count. An origin on either
+    side of the table would explain the image alike; the search starts from the upper one.
+    """
+    height, width = distance.shape
+    rows, columns = (
+        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP)
+        for length in (height, width)
+    )
+    rays = _rays(distance.shape, K)[rows, columns].reshape(-1, 3)
+    seen = distance[rows, columns].ravel().astype(float)
+
+    def off(guess: np.ndarray) -> np.ndarray:
+        points = rays / (rays @ guess[:3])[:, None]
+        return np.linalg.norm(points - guess[3:], axis=1) - seen
+
+    found = least_squares(off, np.concatenate([STEEP, ROBOT]), loss="cauchy", f_scale=FLAT).x
+    return TableCamera(found[:3], found[3:])
+
+
+def _rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
+    """(H, W, 3) what leads from the camera to the points that the pixels show at depth 1."""
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
