@@ -12,7 +12,7 @@ from evaluate import is_trained
 from models.photographs import view_of
 from models.real_training_data import VIEWS
 from utils.config import TransferPolicy, load_config
-from utils.results import AttemptRecord, RoundRecord
+from utils.round_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
 from utils.transfer import (
     Score,
