@@ -134,7 +134,7 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = float(cell.robot.tip_pose()[2, 3])
-    _go_home(cell)
+    detail += _go_home(cell)
     cell.check_physics()
     cell.retire_lost_objects()
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at)
@@ -196,8 +196,9 @@ def _close(cell: BaseCell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: BaseCell) -> None:
-    """Open, rise on a straight line if the hand is low, and return to the home posture."""
+def _go_home(cell: BaseCell) -> str:
+    """Open, rise on a straight line if the hand is low, and return to the home posture. A remark
+    for the outcome's detail where the arm could not do so by itself."""
     robot = cell.robot
     robot.command_gripper(MAX_OPENING)
     cell.step(round(0.1 / cell.dt))
@@ -209,10 +210,16 @@ def _go_home(cell: BaseCell) -> None:
         with contextlib.suppress(UnreachableError, ArmStoppedError):
             _follow(cell, _line(cell, robot.q, up))
     try:
-        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
-    except ArmStoppedError:  # the way bulges out of the workspace; a straight line does not
-        _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
-        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+        try:
+            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+        except ArmStoppedError:  # the way bulges out of the workspace; a straight line does not
+            _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
+            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+    except (UnreachableError, ArmStoppedError):
+        # Stretched right at the edge of the workspace it could bend its elbow only by leaving it.
+        robot.place(cell.home)
+        return "; no way home within the workspace, it was put there by hand"
+    return ""
 
 
 def choose_posture(cell: BaseCell, pose: np.ndarray) -> np.ndarray:

@@ -128,6 +128,22 @@ def test_a_box_without_the_bin_is_refused(narrow, config):
     check_bin(load_config(None, low))  # planned motions reach down to the floor of grasps
 
 
+def test_an_arm_stretched_at_the_edge_is_put_home(narrow, box_set):
+    """Its elbow is bent by less than at its full reach, sqrt(0.316^2 + 0.0825^2) + sqrt(0.384^2 +
+    0.0825^2) m at -0.467 rad: any way back to home, at -2.36 rad, leads through that reach."""
+    narrow.load(make_scene("isolated", box_set, 0, narrow.config))
+    stretched = np.array([0.142, 1.338, 0.036, -0.387, -0.039, 1.741, 0.330])
+
+    def chase(cell, grasp):
+        cell.robot.place(stretched)
+        raise ArmStoppedError("the workspace ends here")
+
+    outcome = execute_grasp(narrow, Grasp(np.array([0.5, 0, 0.03]), 0.0, 0.07, 1.0), chase)
+    assert outcome.reason == "stopped"
+    assert outcome.detail.endswith("no way home within the workspace, it was put there by hand")
+    np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
+
+
 def test_a_contact_stops_the_open_loop_with_a_reason(narrow, box_set):
     narrow.load(make_scene("isolated", box_set, 0, narrow.config))
     place = narrow.object_position(0)
