@@ -19,22 +19,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a worker; the worker
 
 import argparse
 import functools
-import multiprocessing
 import platform
-import signal
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
-from itertools import islice
+from collections.abc import Sequence
 from pathlib import Path
-
-import cv2
-from tqdm import tqdm
 
 from envs.base_cell import BaseCell
 from envs.challenges import CHALLENGES
-from envs.execution import GraspOutcome
+from envs.execution import GraspOutcome, check_bin
 from envs.learned_policies import approach_by, check_learned, is_learned
 from envs.objects import ObjectSet, load_object_set, prepare
 from envs.policy_approach import nowhere_yet
@@ -49,33 +40,33 @@ from utils.config import (
     OBJECT_SETS,
     Config,
     TransferPolicy,
-    load_config,
     parse_args,
     run_script,
     with_settings,
 )
 from utils.errors import UserError
-from utils.files import write_atomic, write_json_atomic
-from utils.gallery import balanced, write_failures
-from utils.geometry import GripperGeometry, Workspace
-from utils.overlay import draw_grasp
-from utils.report import GalleryItem, write_report
-from utils.results import (
-    OPEN_LOOP,
-    RoundRecord,
-    append_round,
-    compare,
-    contestant,
+from utils.evaluation_plan import (
+    Task,
+    check_controllers,
+    check_resume,
+    contestants,
     interruption,
-    planned_rounds,
+)
+from utils.files import write_atomic, write_json_atomic
+from utils.gallery import balanced, picture, write_failures
+from utils.geometry import GripperGeometry, Workspace
+from utils.report import write_report
+from utils.results import (
+    compare,
     print_comparisons,
     print_table,
-    read_rounds,
     summarise,
     write_csv,
     write_results,
 )
+from utils.round_records import OPEN_LOOP, contestant
 from utils.runs import check_writable, git_state, new_run_folder
+from utils.scene_workers import Outcome, Played, play_scenes, worker_count
 from utils.stop_reasons import print_stop_reasons, stop_reasons
 from utils.transfer import (
     Score,
@@ -86,7 +77,7 @@ from utils.transfer import (
     transfer_content,
     transfer_notes,
 )
-from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+from utils.transforms import Grasp, RGBDFrame
 
 PHOTOGRAPHS = "cornell"  # the one world of the transfer report that is not simulated
 
@@ -99,11 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_controllers(config, options.overrides)
     check_resume(config, options.resume)
     check_writable("--results", options.results)
-    make_cell(config).close()  # what cannot be had is named here, not by a dying worker
+    check_cell(config)
     check_objects(config)
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
-    device = f"{platform.machine()} CPU, {worker_count(config)} workers"
-    announce(config, run, device)
+    announce(config, run)
 
     outcome = evaluate(config, run)
 
@@ -111,16 +101,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     print_table(rows)
     print_stop_reasons(stop_reasons(outcome.rounds))
     print_comparisons(compare(outcome.rounds, config.seed))
-    complete = interruption(len(outcome.rounds), config) is None
+    unfinished, device = interruption(len(outcome.rounds), config), device_of(config)
     for path in filter(None, [run / "results.json", options.results]):
-        write_results(path, rows, config, git_state().commit, device, complete)
+        write_results(path, rows, config, git_state().commit, device, unfinished is None)
     write_csv(run / "results.csv", rows)
     gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(run / "report.html", rows, outcome.rounds, config, gallery, outcome.films, device)
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
-    if not complete:
-        print(f"{interruption(len(outcome.rounds), config)}; go on with --resume {run}")
+    if unfinished is not None:
+        print(f"{unfinished}; go on with --resume {run}")
     if outcome.error is not None:
         raise outcome.error
     return 130 if outcome.interrupted else 0
@@ -128,6 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--results", type=Path, metavar="FILE", help="also write results.json here")
+
+
+# --- What is wrong is told before any work is done ------------------------------------------
 
 
 def check_policies(config: Config) -> None:
@@ -140,43 +133,10 @@ def check_policies(config: Config) -> None:
             make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
 
 
-def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
-    """Raise UserError for a grasp.controller that evaluate.controllers would leave unheard."""
-    several, one = config.evaluate.controllers, config.grasp.controller
-    asked = any(change.split("=")[0].strip() == "grasp.controller" for change in overrides)
-    if several is not None and (asked or one != OPEN_LOOP):
-        raise UserError(
-            f"grasp.controller={one} would be ignored: evaluate.controllers is "
-            f"[{', '.join(several)}] and says which controllers are scored; write "
-            f"evaluate.controllers={one} or, to have grasp.controller count, "
-            "evaluate.controllers=null"
-        )
-
-
-def workspace_of(config: Config) -> Workspace:
-    return Workspace(tuple(config.workspace.center), config.workspace.size)
-
-
-def check_resume(config: Config, run: Path | None) -> None:
-    """Raise UserError if a resumed run would mix rounds of different experiments."""
-    if run is None:
-        return
-    free = {"rounds", "workers", "name", "videos", "gallery", "film_format"}
-    before = load_config(run / "config.yaml").model_dump()
-    now = config.model_dump()
-    if now["evaluate"]["rounds"] < before["evaluate"]["rounds"]:
-        raise UserError(
-            f"--resume {run}: evaluate.rounds is {now['evaluate']['rounds']}, the run began with "
-            f"{before['evaluate']['rounds']}; it can only grow"
-        )
-    for plan in (before["evaluate"], now["evaluate"]):
-        for key in free:
-            plan.pop(key)
-    if before != now:
-        raise UserError(
-            f"--resume {run}: only evaluate.{', evaluate.'.join(sorted(free))} may differ from the "
-            "run that is resumed; start a new run for anything else"
-        )
+def check_cell(config: Config) -> None:
+    """Raise UserError for a cell that cannot be had, or that keeps the arm from the bin."""
+    make_cell(config).close()
+    check_bin(config)
 
 
 def check_objects(config: Config) -> None:
@@ -193,19 +153,80 @@ def load_objects(name: str, config: Config) -> ObjectSet:
     return load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
 
 
-def worker_count(config: Config) -> int:
-    return config.evaluate.workers or os.cpu_count() or 1
+def workspace_of(config: Config) -> Workspace:
+    return Workspace(tuple(config.workspace.center), config.workspace.size)
 
 
-def announce(config: Config, run: Path, device: str) -> None:
+def announce(config: Config, run: Path) -> None:
     plan = config.evaluate
     print(
         f"{', '.join(contestant(*pair) for pair in contestants(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, in {config.world}, on {device}; results in {run}",
+        f"seed {config.seed}, in {config.world}, on {device_of(config)}; results in {run}",
         flush=True,
     )
+
+
+def device_of(config: Config) -> str:
+    return f"{platform.machine()} CPU, {worker_count(config)} workers"
+
+
+# --- Every policy on every scene ------------------------------------------------------------
+
+_config: Config  # of this worker process, as the cell is
+_cell: BaseCell
+
+
+def evaluate(config: Config, run: Path) -> Outcome:
+    """Play what rounds.jsonl in `run` does not hold yet, in worker processes, and add it there."""
+    return play_scenes(config, run, work, set_up=_set_up)
+
+
+def _set_up(config: Config) -> None:
+    global _config, _cell
+    _config, _cell = config, make_cell(config)
+
+
+def work(task: Task) -> Played:
+    """Let each policy of a task work on its scene. Runs in a worker process."""
+    objects, layout = load_objects(task.objects, _config), CHALLENGES[task.scenario].layout
+    scene = make_scene(layout, objects, task.seed, _config, _cell.client)
+    played = Played()
+    for planner_name, controller in task.policies:
+        policy, approach = contestant(planner_name, controller), None
+        if is_learned(planner_name):
+            approach, planner = approach_by(planner_name, _cell), nowhere_yet
+        else:
+            workspace = workspace_of(_config)
+            planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
+        privileged = getattr(planner, "needs_truth", False)
+
+        def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
+            if task.keep_pictures or not outcome.success:
+                shown = picture(frame, grasp, policy, task.scenario, outcome.reason)
+                played.gallery.append(shown)
+
+        film = Film(_cell) if task.film_folder is not None else None
+        played.rounds.append(
+            run_round(
+                _cell, scene, planner, policy=planner_name, objects=task.objects,
+                max_failures=_config.evaluate.max_failures, scenario=task.scenario,
+                controller=controller, with_truth=privileged, on_attempt=keep,
+                approach_by=approach,
+            )
+        )  # fmt: skip
+        if film is not None:
+            path = task.film_folder / _film_name(task, policy)
+            film.write(path)
+            played.films.append((path, f"{policy} on {task.scenario}"))
+    return played
+
+
+def _film_name(task: Task, policy: str) -> str:
+    who = policy.replace(os.sep, "_")  # a checkpoint's path
+    name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
+    return f"{name}.{_config.evaluate.film_format}"
 
 
 # --- From one world to another --------------------------------------------------------------
@@ -227,19 +248,18 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
     }
     for there in config_of.values():
         check_policies(there)
-        make_cell(there).close()
+        check_cell(there)
     check_resume(config, resume)
     check_writable("--results", results)
     check_objects(config)
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
     run = resume or new_run_folder("evaluate", config.evaluate.name, config)
-    device = f"{platform.machine()} CPU, {worker_count(config)} workers"
 
     scores: dict[str, dict[str, Score]] = {planner: {} for planner in planners}
     error, interrupted = None, False
     for world, there in config_of.items():
         (run / world).mkdir(exist_ok=True)
-        announce(there, run / world, device)
+        announce(there, run / world)
         outcome = evaluate(there, run / world)
         write_failures(run / world / "failures.png", outcome.gallery)
         for planner in planners:
@@ -259,8 +279,9 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
     lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
     complete = error is None and not interrupted
-    content = {"schema": 1, "complete": complete, "commit": git_state().commit, "device": device}
-    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines)}
+    content = {"schema": 1, "complete": complete, "commit": git_state().commit}
+    content |= {"device": device_of(config), "config": config.model_dump(mode="json")}
+    content |= transfer_content(lines)
     for path in filter(None, [run / "results.json", results]):
         write_json_atomic(path, content)
     write_atomic(run / "transfer.png", draw_transfer(lines, worlds))
@@ -276,185 +297,6 @@ def is_trained(who: TransferPolicy) -> bool:
     """Whether a row of the report can be scored: what is no file needs no training."""
     file = Path(who.planner.partition(":")[2] if is_learned(who.planner) else who.planner)
     return file.suffix != ".pt" or file.exists()
-
-
-# --- Running rounds in worker processes -----------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Task:
-    """One scene, on which every policy that is still to be scored works in turn, a policy being a
-    planner's name and a controller's."""
-
-    objects: str
-    scenario: str
-    seed: int
-    policies: tuple[tuple[str, str], ...]
-    keep_pictures: bool
-    film_folder: Path | None
-
-
-@dataclass
-class Outcome:
-    """rounds: what was measured; films: (file, caption); interrupted: by Ctrl-C; error: what ended
-    the work early, to be raised once the rest has been written."""
-
-    rounds: list[RoundRecord] = field(default_factory=list)
-    gallery: list[GalleryItem] = field(default_factory=list)
-    films: list[tuple[Path, str]] = field(default_factory=list)
-    interrupted: bool = False
-    error: UserError | None = None
-
-
-def contestants(config: Config) -> list[tuple[str, str]]:
-    """Every policy with every controller."""
-    controllers = config.evaluate.controllers or (config.grasp.controller,)
-    return [
-        (policy, controller) for policy in config.evaluate.policies for controller in controllers
-    ]
-
-
-def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
-    """What is left to do; every policy gets the same seeds."""
-    plan = config.evaluate
-    known = {(r.policy, r.scenario, r.objects, r.seed) for r in done}
-    for number in range(plan.rounds):
-        seed = config.seed * 100_000 + number
-        for objects in plan.object_sets:
-            for scenario in plan.scenarios:
-                policies = tuple(
-                    pair
-                    for pair in contestants(config)
-                    if (contestant(*pair), scenario, objects, seed) not in known
-                )
-                if policies:
-                    filmed = number < plan.videos and scenario == plan.scenarios[-1]
-                    film = run / "films" if filmed else None
-                    yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
-
-
-def evaluate(config: Config, run: Path) -> Outcome:
-    """Run every round that rounds.jsonl in `run` does not hold yet, and add it there."""
-    journal = run / "rounds.jsonl"
-    outcome = Outcome(rounds=read_rounds(journal))
-    pool = ProcessPoolExecutor(
-        worker_count(config),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(config,),
-    )
-    progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
-    todo, pending = tasks(config, outcome.rounds, run), set()
-    try:
-        with pool:
-            try:
-                while True:
-                    # No more than one scene a worker is under way, so that an end is soon an end.
-                    more = islice(todo, worker_count(config) - len(pending))
-                    pending |= {pool.submit(work, task) for task in more}
-                    if not pending:
-                        break
-                    finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                    _collect(finished, outcome, journal, progress)
-            except KeyboardInterrupt:
-                outcome.interrupted = True
-                progress.write("interrupted: finishing the scenes under way")
-                _collect(wait(pending).done, outcome, journal, progress)
-    except BrokenProcessPool:
-        outcome.error = UserError(
-            f"a worker process died (out of memory?); {len(outcome.rounds)} rounds are safe in "
-            f"{journal}: go on with --resume {run}, perhaps with evaluate.workers=1"
-        )
-    except UserError as error:  # a scene that cannot be made, an object that cannot be used
-        outcome.error = error
-    finally:
-        progress.close()
-    outcome.rounds.sort(key=lambda r: _rank(r, config))
-    outcome.gallery.sort(key=lambda item: item.caption)  # not in the order of the workers' speed
-    outcome.films.sort()
-    return outcome
-
-
-def _collect(finished: Iterable[Future], outcome: Outcome, journal: Path, progress: tqdm) -> None:
-    for future in finished:
-        rounds, pictures, films = future.result()
-        for record in rounds:
-            append_round(journal, record)
-        outcome.rounds += rounds
-        outcome.gallery += pictures
-        outcome.films += films
-        progress.update(len(rounds))
-
-
-def _rank(record: RoundRecord, config: Config) -> tuple[int, ...]:
-    plan = config.evaluate
-    policies = [contestant(*pair) for pair in contestants(config)]
-    known = record.policy in policies  # a resumed report may have lost the weights of one
-    return (
-        plan.object_sets.index(record.objects),
-        plan.scenarios.index(record.scenario),
-        policies.index(record.policy) if known else len(policies),
-        record.seed,
-    )
-
-
-_worker_config: Config
-_worker_cell: BaseCell
-
-
-def _start_worker(config: Config) -> None:
-    global _worker_config, _worker_cell
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    cv2.setNumThreads(1)  # as with OMP_NUM_THREADS
-    _worker_config, _worker_cell = config, make_cell(config)
-
-
-def work(task: Task) -> tuple[list[RoundRecord], list[GalleryItem], list[tuple[Path, str]]]:
-    """Let each policy of a task work on its scene. Runs in a worker process."""
-    config, cell = _worker_config, _worker_cell
-    scene = make_scene(
-        CHALLENGES[task.scenario].layout, load_objects(task.objects, config), task.seed, config,
-        cell.client,
-    )  # fmt: skip
-    workspace = workspace_of(config)
-    rounds, pictures, films = [], [], []
-    for planner_name, controller in task.policies:
-        policy, approach = contestant(planner_name, controller), None
-        if is_learned(planner_name):
-            approach, planner = approach_by(planner_name, cell), nowhere_yet
-        else:
-            planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
-        privileged = getattr(planner, "needs_truth", False)
-
-        def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
-            if task.keep_pictures or not outcome.success:
-                pictures.append(picture(frame, grasp, outcome, policy, task.scenario))
-
-        film = Film(cell) if task.film_folder is not None else None
-        rounds.append(
-            run_round(
-                cell, scene, planner, policy=planner_name, objects=task.objects,
-                max_failures=config.evaluate.max_failures, scenario=task.scenario,
-                controller=controller, with_truth=privileged, on_attempt=keep,
-                approach_by=approach,
-            )
-        )  # fmt: skip
-        if film is not None:
-            who = policy.replace(os.sep, "_")  # a checkpoint's path
-            name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
-            path = task.film_folder / f"{name}.{config.evaluate.film_format}"
-            film.write(path)
-            films.append((path, f"{policy} on {task.scenario}"))
-    return rounds, pictures, films
-
-
-def picture(
-    frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy: str, scenario: str
-) -> GalleryItem:
-    """The frame with the grasp drawn in, and how it went."""
-    on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
-    image = draw_grasp(frame.rgb, on_image, frame.K, success=outcome.success)
-    return GalleryItem(image, f"{policy}, {scenario}: {outcome.reason}", outcome.success, policy)
 
 
 if __name__ == "__main__":

@@ -26,14 +26,9 @@ from envs.wrist_camera import WristCamera
 from models.planners import make_planner
 from utils.config import load_config, run_script
 from utils.geometry import GripperGeometry, Workspace
-from utils.object_tracking import (
-    ObjectTracker,
-    grasp_frame,
-    make_template,
-    planar,
-    planar_part,
-)
+from utils.object_tracking import ObjectTracker, grasp_frame, make_template
 from utils.servo_errors import TargetLostError
+from utils.tabletop import planar, planar_part
 from utils.transforms import Grasp, inverse_pose, position_quaternion
 
 OBJECT_SETS = ("random_urdfs", "primitives")

@@ -15,15 +15,17 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from envs import grasp_loop
 from envs.beliefs import teach
 from envs.cell import Cell
 from envs.challenges import CHALLENGES
 from envs.disturbances import disturbed
 from envs.execution import execute_grasp
+from envs.grasp_loop import ClosedLoop
+from envs.kinematics import forward_kinematics
 from envs.objects import load_object_set
 from envs.scenes import make_scene
 from envs.studio import Studio
+from envs.wrist_camera import DepthSight
 from models.planners import make_planner
 from utils.config import load_config
 from utils.geometry import GripperGeometry, Workspace
@@ -48,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         taught, challenge = teach(cell), CHALLENGES[scenario]
         cell.load(make_scene(challenge.layout, objects, config.seed, config))
         beliefs, frame = challenge.beliefs(cell), cell.frame()
-        loop = grasp_loop.ClosedLoop(cell, "ibvs", frame, beliefs, taught, challenge.latency)
+        loop = ClosedLoop(cell, "ibvs", frame, beliefs, taught, challenge.latency)
         pictures, camera, start = [], loop.camera, cell.seconds
         with Studio(cell, *_SIZE) as studio:
 
@@ -56,35 +58,23 @@ def main(argv: Sequence[str] | None = None) -> None:
                 sight = camera()
                 passed = len(pictures) < len(MOMENTS) and sight is not None
                 if passed and cell.seconds - start >= MOMENTS[len(pictures)]:
-                    pictures.append(_both(studio.picture(), sight, run[0], loop))
+                    pictures.append(_both(studio.picture(), sight, loop))
                 return sight
 
-            loop.camera, run = see, []
-            _keep_run(run)
+            loop.camera = see
             with disturbed(cell, challenge.motion(cell, 0)):
                 outcome = execute_grasp(cell, plan(frame)[0], loop)
     iio.imwrite(Path(file), np.hstack(pictures))
     print(f"{outcome.reason} {outcome.detail}; wrote {file}")
 
 
-def _keep_run(run: list) -> None:
-    """Let `run` hold the approach that is made next."""
-    make = grasp_loop._Run.__init__
-
-    def keep(self, *arguments):
-        run.append(self)
-        make(self, *arguments)
-
-    grasp_loop._Run.__init__ = keep
-
-
-def _both(picture: np.ndarray, sight, run, loop) -> np.ndarray:
+def _both(picture: np.ndarray, sight: DepthSight, loop: ClosedLoop) -> np.ndarray:
     depth = sight.depth
     nearest, farthest = depth[depth > 0].min(), depth.max()
     grey = (255 * (farthest - depth) / max(farthest - nearest, 1e-3)).clip(0, 255).astype(np.uint8)
     image = cv2.resize(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), None, fx=2, fy=2)
-    T_WC = grasp_loop.forward_kinematics(sight.q) @ loop.T_EC
-    points = transform_points(inverse_pose(T_WC) @ run.T_WO, run.template.points)
+    T_WC = forward_kinematics(sight.q) @ loop.T_EC
+    points = transform_points(inverse_pose(T_WC) @ loop.target.T_WO, loop.target.template.points)
     for u, v in points[:, :2] / points[:, 2:] * loop.K[[0, 1], [0, 1]] + loop.K[:2, 2]:
         cv2.circle(image, (round(2 * u + 0.5), round(2 * v + 0.5)), 3, (230, 60, 40), -1)
     below = np.full((image.shape[0], picture.shape[1], 3), 255, np.uint8)

@@ -22,7 +22,7 @@ from envs.cell import Cell
 from envs.kinematics import forward_kinematics
 from envs.scenes import Scene
 from envs.servo_target import Board
-from utils.object_tracking import table_plane
+from utils.tabletop import table_plane
 from utils.transforms import RGBDFrame, inverse_pose
 
 _BOARD_DEPTH = 0.25  # m from the camera to the board on the jig

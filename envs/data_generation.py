@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from envs.appearance import Appearance, draw_camera
 from envs.cell import Cell, PhysicsError, camera_intrinsics
-from envs.execution import execute_grasp
+from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.scenes import LAYOUTS, Scene, SceneError, make_scene
 from utils.config import Config, dump_config, with_settings
@@ -82,8 +82,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     """Write the shards that the data set of a config still lacks; returns its folder.
 
     rank, ranks: this process makes every ranks-th shard (`torchrun`).
-    Raises UserError if the folder holds data of another config, or a worker died. Whatever stops
-    it, the shards under way are finished and no others begun.
+    Raises UserError if the folder holds data of another config, labels cannot be tried out, or a
+    worker died. Whatever stops it, the shards under way are finished and no others begun.
     """
     folder = data_folder(config)
     _claim(folder, config)
@@ -91,6 +91,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     if not missing:
         return folder
     object_sets(config)  # what is wrong with them is told here, not by a worker that dies of it
+    if config.data.executed_share:
+        check_bin(config)
     workers = config.data.workers or max(1, (os.cpu_count() or 1) // ranks)
     workers = min(workers, len(missing))
     pool = ProcessPoolExecutor(

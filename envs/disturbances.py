@@ -16,7 +16,7 @@ import numpy as np
 import pybullet
 
 from envs.cell import Cell
-from utils.object_tracking import planar
+from utils.tabletop import planar
 from utils.transforms import inverse_pose, position_quaternion
 
 _START_SECONDS = 0.2  # in which a conveyor gets up to speed: what stands must not topple

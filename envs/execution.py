@@ -21,13 +21,16 @@ from envs.kinematics import (
     inverse_kinematics,
 )
 from envs.panda import MAX_OPENING
-from envs.safety import ArmStoppedError
+from envs.safety import ArmStoppedError, reaching_down
 from envs.world import BIN_CENTRE, BIN_HEIGHT
+from utils.config import Config
+from utils.errors import UserError
 from utils.transforms import Grasp, top_down_pose
 
 _LOOK_SECONDS = 0.05  # between two looks at the fingers or at the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _RELEASE_SECONDS = 0.35  # for the fingers to open and the object to fall into the bin
+OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E lets go of an object
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the same grasp, other finger
 
 
@@ -41,9 +44,9 @@ class GraspOutcome:
     every command to the arm passes, or out of time); of a closed loop also `lost` (the object was
     not seen any more).
     sim_seconds: simulated time from home and back home, at legal joint speeds.
-    object_index: the object that was held, if any. detail: a sentence on the failure, if there is
-    more to say. palm_stopped_at: metres, height of E where something under the palm stopped the
-    approach.
+    object_index: the object that was held, if any, also where it was lost or the arm stopped later.
+    detail: a sentence on the failure, if there is more to say. palm_stopped_at: metres, height of E
+    where something under the palm stopped the approach.
     """
 
     reason: str
@@ -60,9 +63,9 @@ class GraspOutcome:
 class GraspFailure(Exception):
     """Ends an attempt early with a reason."""
 
-    def __init__(self, reason: str, object_index: int | None = None, detail: str = ""):
+    def __init__(self, reason: str, detail: str = ""):
         super().__init__(detail or reason)
-        self.reason, self.object_index, self.detail = reason, object_index, detail
+        self.reason, self.detail = reason, detail
 
 
 class Around(NamedTuple):
@@ -92,6 +95,20 @@ def open_loop(cell: BaseCell, grasp: Grasp) -> Around:
 Approach = Callable[[BaseCell, Grasp], Around]
 
 
+def check_bin(config: Config) -> None:
+    """Raise UserError where the gate's box ends before the bin: whatever is picked would end as
+    `stopped` on its way there, so that no grasp could succeed."""
+    told, place = config.safety, OVER_BIN.round(3).tolist()
+    box = reaching_down(told, config.grasp.floor)
+    if not all(low <= at <= high for low, at, high in zip(box.box_lower, place, box.box_upper)):
+        raise UserError(
+            f"safety: the box from box_lower {list(told.box_lower)} to box_upper "
+            f"{list(told.box_upper)} leaves out {place} m, where the hand lets go of objects over "
+            "the bin, so that every pick would be stopped on its way there; widen the box until it "
+            "holds that point"
+        )
+
+
 def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
     """Approach, close, lift, hold, carry to the bin, release, go home.
 
@@ -103,57 +120,60 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
     approach: how the open gripper gets around the object; the rest is the same for all.
     """
     cell.check_physics()
-    start, detail = cell.seconds, ""
+    start, held, reason, detail = cell.seconds, None, "success", ""
     try:
-        index = _pick(cell, grasp, approach)
-        _carry_to_bin(cell, index)
-        outcome, index = "success", index
+        held, raised = _grip(cell, grasp, approach)
+        _lift(cell, held, raised)
+        _carry_to_bin(cell, held)
     except UnreachableError:
-        outcome, index = "ik", None
+        reason = "ik"
     except GraspFailure as failure:
-        outcome, index, detail = failure.reason, failure.object_index, failure.detail
+        reason, detail = failure.reason, failure.detail
     except ArmStoppedError as stop:
-        outcome, index = "collision" if stop.contact else "stopped", None
-        detail = f"stopped: {stop}"
+        reason, detail = "collision" if stop.contact else "stopped", f"stopped: {stop}"
     stopped_at = None
-    if outcome == "collision" and cell.robot.palm_touches():
+    if reason == "collision" and cell.robot.palm_touches():
         stopped_at = float(cell.robot.tip_pose()[2, 3])
-    _go_home(cell)
+    detail += _go_home(cell)
     cell.check_physics()
     cell.retire_lost_objects()
-    return GraspOutcome(outcome, cell.seconds - start, index, detail, stopped_at)
+    return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at)
 
 
-def _pick(cell: BaseCell, grasp: Grasp, approach: Approach) -> int:
-    """From home to an object held above the lift height; its number. Raises GraspFailure."""
-    settings = cell.config.execution
+def _grip(cell: BaseCell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray]:
+    """From home to an object between the fingers: its number, and (4, 4) T_WE to which to lift it.
+    Raises GraspFailure."""
     around = approach(cell, grasp)
     _close(cell, around.wait)
     cell.robot.hold()  # nothing that it followed is sent any more
     index = cell.held_object()
     if index is None:
         raise GraspFailure("missed")
-
     lifted = (forward_kinematics(cell.robot.q) if around.pose is None else around.pose).copy()
     # A learned policy names no grasp beforehand: it counts where its hand has closed.
-    lifted[2, 3] = max(grasp.position[2], lifted[2, 3], 0.0) + settings.lift_height + 0.05
+    height = max(grasp.position[2], lifted[2, 3], 0.0)
+    lifted[2, 3] = height + cell.config.execution.lift_height + 0.05
+    return index, lifted
+
+
+def _lift(cell: BaseCell, index: int, lifted: np.ndarray) -> None:
+    """Raise the hand to `lifted` (4, 4) and hold the object there. Raises GraspFailure."""
+    settings = cell.config.execution
     _follow(cell, _line(cell, cell.robot.q, lifted))
     if not cell.is_lifted(index, settings.lift_height):
-        raise GraspFailure("slipped", index)
+        raise GraspFailure("slipped")
     for _ in range(round(settings.hold_seconds / _LOOK_SECONDS)):
         cell.step(round(_LOOK_SECONDS / cell.dt))
         _still_lifted(cell, index)
-    return index
 
 
 def _still_lifted(cell: BaseCell, index: int) -> None:
     if not cell.is_lifted(index, cell.config.execution.lift_height):
-        raise GraspFailure("dropped", index)
+        raise GraspFailure("dropped")
 
 
 def _carry_to_bin(cell: BaseCell, index: int) -> None:
-    over_bin = top_down_pose([*BIN_CENTRE, BIN_HEIGHT + 0.17], -np.pi / 2)
-    posture = choose_posture(cell, over_bin)
+    posture = choose_posture(cell, top_down_pose(OVER_BIN, -np.pi / 2))
     carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
     every = round(_LOOK_SECONDS / cell.dt)
     for start in range(0, len(carry), every):
@@ -176,8 +196,9 @@ def _close(cell: BaseCell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: BaseCell) -> None:
-    """Open, rise on a straight line if the hand is low, and return to the home posture."""
+def _go_home(cell: BaseCell) -> str:
+    """Open, rise on a straight line if the hand is low, and return to the home posture. A remark
+    for the outcome's detail where the arm could not do so by itself."""
     robot = cell.robot
     robot.command_gripper(MAX_OPENING)
     cell.step(round(0.1 / cell.dt))
@@ -189,10 +210,16 @@ def _go_home(cell: BaseCell) -> None:
         with contextlib.suppress(UnreachableError, ArmStoppedError):
             _follow(cell, _line(cell, robot.q, up))
     try:
-        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
-    except ArmStoppedError:  # the way bulges out of the workspace; a straight line does not
-        _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
-        _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+        try:
+            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+        except ArmStoppedError:  # the way bulges out of the workspace; a straight line does not
+            _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
+            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+    except (UnreachableError, ArmStoppedError):
+        # Stretched right at the edge of the workspace it could bend its elbow only by leaving it.
+        robot.place(cell.home)
+        return "; no way home within the workspace, it was put there by hand"
+    return ""
 
 
 def choose_posture(cell: BaseCell, pose: np.ndarray) -> np.ndarray:

@@ -7,9 +7,7 @@ far     position-based for every controller, until the object is near the middle
 near    the controller's own law, towards a goal that sinks along the grasp's axis as far as the
         camera sees the object. The object's own velocity, as the filter tells it, is added to
         the law's, which takes away the lag behind what moves.
-blind   the rest of the way, some centimetres, straight down and along with the object's motion as
-        it was foreseen; the same while the fingers close. Images go on being taken: the watchdog
-        stops the arm here too when they stop coming.
+blind   the rest of the way, some centimetres, without looking (`envs.blind_descent`).
 
 All velocities pass the safety gate (`GuardedArm`). Reads depth images and encoders; where the
 cameras are comes from `CameraBeliefs` alone. Frames: W world, E gripper, C camera, O object on the
@@ -26,31 +24,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from envs.beliefs import CameraBeliefs
+from envs.blind_descent import AVOIDANCE_GAIN, DAMPING, BlindDescent
 from envs.camera import Intrinsics
 from envs.cell import Cell
 from envs.execution import HALF_TURN, Around, GraspFailure
-from envs.kinematics import (
-    JOINT_LOWER,
-    JOINT_UPPER,
-    UnreachableError,
-    forward_kinematics,
-    geometric_jacobian,
-    inverse_kinematics,
-    pose_error,
-)
+from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.panda import MAX_OPENING
-from envs.safety import ArmStoppedError
+from envs.safety import ArmStoppedError, reaching_down
 from envs.servoing import GuardedArm, servo_period
-from envs.wrist_camera import DepthSight, WristCamera
-from utils.object_motion import PlanarMotion
-from utils.object_tracking import (
-    ObjectTemplate,
-    ObjectTracker,
-    grasp_frame,
-    make_template,
-    planar,
-    planar_part,
-)
+from envs.sighted_object import SightedObject
+from envs.way_round import must_turn, turned_is_better
+from envs.wrist_camera import WristCamera
 from utils.se3 import pose_exp
 from utils.servo_errors import (
     CollinearPointsError,
@@ -61,6 +45,7 @@ from utils.servo_errors import (
 from utils.servo_features import MIN_POINTS
 from utils.servo_laws import joint_limit_avoidance, joint_velocities
 from utils.servo_loop import View, VisualServo
+from utils.tabletop import planar_part
 from utils.transforms import (
     Grasp,
     RGBDFrame,
@@ -74,21 +59,9 @@ from utils.visual_servo import (
     PositionBasedVisualServo,
 )
 
-_DAMPING = 0.02  # of the arm's Jacobian
-_AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
-_ROOM = 0.6  # rad to the wrist's limits that a way round should leave
-_LITTLE_ROOM = 0.3  # rad of it at which the other way round is looked at
-_LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
-_FORESIGHT = 1.5  # s, about what is left of the way in the far stage
-_TURNING_KNOWN = 0.15  # rad/s, standard deviation of a turning rate that can be relied on
-_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for that
+_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for another look at the way round
 _NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
 _FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
-_BLIND_GAIN = 8.0  # 1/s, towards the foreseen path
-_REACHED = 0.0015  # m from the end of the path that count as there
-_NEAR_ENOUGH = 0.005  # m that do when the time is over
-_BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, down to this
-_SLACK_SECONDS = 0.35  # beyond what the path takes, for the end of the blind stage
 _SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
 _NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
 
@@ -127,8 +100,10 @@ class ClosedLoop:
     controller: pbvs, ibvs or hybrid. frame: as it is believed to have been taken. taught_T_CE:
     (4, 4) the gripper in the wrist camera as that camera showed it (`envs.beliefs.teach`), from
     which ibvs and hybrid have their goal images. camera: gives a DepthSight, or None where no new
-    image has come.
+    image has come. target: the object, once it is looked for.
     """
+
+    target: SightedObject
 
     def __init__(
         self,
@@ -157,28 +132,24 @@ class ClosedLoop:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
         robot, settings = cell.robot, cell.config.grasp
         robot.command_gripper(min(grasp.width, MAX_OPENING))
-        arm = self._arm()
+        arm = GuardedArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
         with _told_as_failure(arm):
-            run = _Run(self, arm, grasp)
+            guided = GuidedDescent(self, arm, grasp)
             end = cell.seconds + settings.seconds
-            while run.look():
+            while (start := guided.look()) is None:
                 if cell.seconds > end:
                     raise ServoError(f"not at the grasp after {settings.seconds} s")
-                run.go()
+                guided.go()
             self.record.stage = "blind"
-            run.go_blind()
+            blind = BlindDescent(arm, self.camera, self.target, start, guided.height)
+            blind.go()
         self.record.stage = "closing"
 
         def wait(steps: int) -> None:
             with _told_as_failure(arm):
-                run.follow(steps)
+                blind.follow(steps)
 
         return Around(wait, None)
-
-    def _arm(self) -> GuardedArm:
-        safety, floor = self.cell.config.safety, self.cell.config.grasp.floor
-        lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
-        return GuardedArm(self.cell, safety=safety.model_copy(update={"box_lower": lower}))
 
 
 @contextlib.contextmanager
@@ -201,152 +172,37 @@ def _reason_of(error: ServoError) -> str:
     return "collision" if contact else "stopped"
 
 
-def _wrist_room(q: np.ndarray) -> float:
-    """Radians from the last joint to the nearer one of its limits."""
-    return float(min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1]))
-
-
-class _Run:
-    """One approach under way."""
+class GuidedDescent:
+    """The far and the near stage of one approach: what the arm does while it sees the object."""
 
     def __init__(self, loop: ClosedLoop, arm: GuardedArm, grasp: Grasp):
+        """Takes the first image that comes; raises TargetLostError, and UnreachableError where the
+        grasp is out of reach."""
         self.loop, self.cell, self.arm = loop, loop.cell, arm
-        self.settings = loop.cell.config.grasp
-        self.template: ObjectTemplate = make_template(loop.frame, grasp)
-        self.tracker = ObjectTracker(self.template, loop.K, loop.size)
-        self.T_WO = grasp_frame(grasp)  # as last seen
+        self.settings = settings = loop.cell.config.grasp
+        self.target = loop.target = SightedObject(
+            loop.frame, grasp, loop.K, loop.size, loop.T_EC, settings.lost_seconds,
+            self.cell.seconds,
+        )  # fmt: skip
         self.T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
-        self.motion: PlanarMotion | None = None
-        self.chosen_at = planar_part(self.T_WO)[2]
-        self._choose_way_round()
-        self.image_seconds = self.found_seconds = self.cell.seconds
+        self.chosen_at = planar_part(self.target.T_WO)[2]  # rad, direction of the object
+        if turned_is_better(self.cell, self._hand_above(self.target.T_WO)):
+            self.T_OE = self.T_OE @ HALF_TURN
         self.near, self.height = False, np.inf
         self.lowest = self._lowest_view()
         self.wish = np.zeros(7)
-        self._spent = 0.0  # s of the clock, on the last image
-        self.steps_to_image = 0  # physics steps, in the blind stage
-        self.holds = False  # something is gripped, or in the way of the closing hand
         self._wait_for_sight()
 
-    def _choose_way_round(self) -> None:
-        """Take the grasp or the same one turned by half a turn: the smaller turn of the wrist that
-        leaves it room to turn with the object. Raises UnreachableError if neither is in reach."""
-        ways = self._ways_round()
-        roomy = [turned for turned, q in ways.items() if _wrist_room(q) > _ROOM] or list(ways)
-        now = self.cell.robot.q[-1]
-        if min(roomy, key=lambda turned: abs(ways[turned][-1] - now)):
-            self.T_OE = self.T_OE @ HALF_TURN
-
-    def _reconsider_way_round(self) -> None:
-        """Turn round where the wrist, following the object, is about to meet its limit."""
-        direction = planar_part(self._foreseen())[2]
-        if abs(direction - self.chosen_at) < _RECONSIDER_ANGLE:
-            return
-        self.chosen_at = direction
-        # Out of reach at this moment is no reason to change anything.
-        with contextlib.suppress(UnreachableError):
-            ways, now = self._ways_round(), self.cell.robot.q[-1]
-            kept, other = (
-                _wrist_room(ways[turned]) if turned in ways else 0.0 for turned in (0, 1)
-            )
-            # The law takes the shorter turn; a longer one than half a turn would be the wrong way.
-            if kept < _LITTLE_ROOM < other and abs(ways[True][-1] - now) < _LONGEST_TURN:
-                self.T_OE = self.T_OE @ HALF_TURN
-
-    def _ways_round(self) -> dict[bool, np.ndarray]:
-        """Joint positions (7,) over the grasp as it is (False) and turned by half a turn (True),
-        those that can be reached; raises UnreachableError if there are none."""
-        T_WE = self._foreseen() @ self.T_OE
-        T_WE[2, 3] += self.settings.look_height
-        ways, error = {}, None
-        for turned, pose in ((False, T_WE), (True, T_WE @ HALF_TURN)):
-            try:
-                ways[turned] = inverse_kinematics(pose, self.cell.home, self.cell.home)
-            except UnreachableError as unreachable:
-                error = unreachable
-        if not ways:
-            raise error
-        return ways
-
-    def _foreseen(self) -> np.ndarray:
-        """(4, 4) T_WO a little before the fingers close, once it is known how the object moves."""
-        known = self.motion is not None and self.motion.covariance[5, 5] < _TURNING_KNOWN**2
-        return self._object_at(self.cell.seconds + _FORESIGHT) if known else self.T_WO
-
-    def _goal(self, height: float) -> np.ndarray:
-        """(4, 4) T_CO: the object as the camera should see it from `height` above the grasp."""
-        raised = self.T_OE.copy()
-        raised[2, 3] += height
-        return self.loop.goal_T_CE @ inverse_pose(raised)
-
-    def _lowest_view(self) -> float:
-        """The height above the grasp from which the camera still sees the object."""
-        heights = np.arange(self.settings.commit_height, self.settings.look_height, 0.01)
-        nearest = self.cell.config.camera.near + _NEAR_PLANE
-        for height in heights:
-            if self.tracker.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
-                return float(height)
-        return self.settings.look_height
-
-    def _wait_for_sight(self) -> None:
-        """Hold still until a first image has come (it may be late) and shows the object."""
-        end = self.cell.seconds + self.settings.lost_seconds
-        while not self._take_in(self.loop.camera()):
-            if self.cell.seconds > end:
-                raise TargetLostError(f"no image has come for {self.settings.lost_seconds} s")
-            for _ in range(servo_period(self.cell)):
-                self.arm.wait()
-
-    def _take_in(self, sight: DepthSight | None) -> bool:
-        """Find the object in a new image; whether there was one."""
-        if sight is None:
-            return False
-        start = time.perf_counter()
-        self.image_seconds = sight.seconds
-        T_WC = forward_kinematics(sight.q) @ self.loop.T_EC
-        expected = self._object_at(sight.seconds)
-        try:
-            found = self.tracker.find(
-                sight.depth, inverse_pose(T_WC) @ expected, inverse_pose(T_WC)
-            )
-        except TargetLostError as error:
-            if self.motion is None:
-                raise
-            if sight.seconds - self.found_seconds > self.settings.lost_seconds:
-                raise TargetLostError(f"{error}, for {self.settings.lost_seconds} s") from error
-            self._spent = time.perf_counter() - start
-            return True
-        T_WO, believed = T_WC @ found.T_CO, True
-        pose = planar_part(T_WO)
-        if self.motion is None:
-            self.motion = PlanarMotion(pose, sight.seconds, turns=not self.tracker.round)
-        else:
-            axes = planar(0, 0, pose[2])[:3, :3]
-            covariance = axes @ found.covariance @ axes.T
-            believed = self.motion.see(pose, covariance, sight.seconds)
-        if believed:  # a false match shows no more than an image without the object
-            self.T_WO, self.found_seconds = T_WO, sight.seconds
-        self._spent = time.perf_counter() - start
-        return True
-
-    def _object_at(self, seconds: float) -> np.ndarray:
-        """(4, 4) T_WO expected at a time: as last seen, moved to where the filter has it."""
-        if self.motion is None:
-            return self.T_WO
-        x, y, turn = self.motion.at(seconds)[:3]
-        x0, y0, turn0 = planar_part(self.T_WO)
-        return planar(x, y, turn) @ inverse_pose(planar(x0, y0, turn0)) @ self.T_WO
-
-    def look(self) -> bool:
-        """Take in what the camera has, and wish for a velocity; False where the blind stage
-        begins."""
-        new = self._take_in(self.loop.camera())
+    def look(self) -> np.ndarray | None:
+        """Take in what the camera has, and wish for a velocity. Where the blind stage begins, the
+        (4, 4) T_WE that its path starts from, `height` above the grasp; None before."""
+        new = self.target.take_in(self.loop.camera())
         start = time.perf_counter()
         if not self.near:
             self._reconsider_way_round()
         q, now = self.cell.robot.q, self.cell.seconds
         T_WE = forward_kinematics(q)
-        T_CO = inverse_pose(T_WE @ self.loop.T_EC) @ self._object_at(now)
+        T_CO = inverse_pose(T_WE @ self.loop.T_EC) @ self.target.at(now)
         off = self._off_axis(T_CO)
         if not self.near:
             self._choose_stage(off)
@@ -363,12 +219,63 @@ class _Run:
             self.loop.record.seconds.append(now)
             self.loop.record.errors.append(step.correction)
             if self._may_commit(off, step.correction):
-                self._commit(T_WE, step.correction, now)
-                return False
+                return self._where_the_goal_is(T_WE, step.correction)
         self.wish = self._joint_wish(q, T_WE, step.velocity, law, sink)
         if new:
-            self.loop.record.turn_seconds.append(self._spent + time.perf_counter() - start)
-        return True
+            spent = self.target.spent + time.perf_counter() - start
+            self.loop.record.turn_seconds.append(spent)
+        return None
+
+    def go(self) -> None:
+        """Send the wish until the next image. While images come but do not show the object, the arm
+        stands still: what it would go by is too old."""
+        watchdog, target = self.arm.gate.safety.watchdog, self.target
+        for _ in range(servo_period(self.cell)):
+            now = self.cell.seconds
+            if now - target.image_seconds <= watchdog < now - target.found_seconds:
+                self.arm.wait()
+            else:
+                self.arm.move(self.wish, now - target.found_seconds)
+
+    def _wait_for_sight(self) -> None:
+        """Hold still until a first image has come (it may be late) and shows the object."""
+        end = self.cell.seconds + self.settings.lost_seconds
+        while not self.target.take_in(self.loop.camera()):
+            if self.cell.seconds > end:
+                raise TargetLostError(f"no image has come for {self.settings.lost_seconds} s")
+            for _ in range(servo_period(self.cell)):
+                self.arm.wait()
+
+    def _hand_above(self, T_WO: np.ndarray) -> np.ndarray:
+        """(4, 4) T_WE above the grasp of an object at T_WO."""
+        T_WE = T_WO @ self.T_OE
+        T_WE[2, 3] += self.settings.look_height
+        return T_WE
+
+    def _reconsider_way_round(self) -> None:
+        """Turn round where the wrist, following the object, is about to meet its limit."""
+        foreseen = self.target.foreseen(self.cell.seconds)
+        direction = planar_part(foreseen)[2]
+        if abs(direction - self.chosen_at) < _RECONSIDER_ANGLE:
+            return
+        self.chosen_at = direction
+        if must_turn(self.cell, self._hand_above(foreseen)):
+            self.T_OE = self.T_OE @ HALF_TURN
+
+    def _goal(self, height: float) -> np.ndarray:
+        """(4, 4) T_CO: the object as the camera should see it from `height` above the grasp."""
+        raised = self.T_OE.copy()
+        raised[2, 3] += height
+        return self.loop.goal_T_CE @ inverse_pose(raised)
+
+    def _lowest_view(self) -> float:
+        """The height above the grasp from which the camera still sees the object."""
+        heights = np.arange(self.settings.commit_height, self.settings.look_height, 0.01)
+        nearest = self.cell.config.camera.near + _NEAR_PLANE
+        for height in heights:
+            if self.target.tracker.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
+                return float(height)
+        return self.settings.look_height
 
     def _off_axis(self, T_CO: np.ndarray) -> tuple[float, float, float]:
         """How far off the grasp's axis (m), how high above the grasp (m) and how far turned (rad)
@@ -406,16 +313,16 @@ class _Run:
             height < self.lowest + 0.01
             and distance < settings.aligned_distance
             and turn < settings.aligned_angle
-            and self.cell.seconds - self.found_seconds <= self.arm.gate.safety.watchdog
+            and self.cell.seconds - self.target.found_seconds <= self.arm.gate.safety.watchdog
         )
 
     def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[View, View]:
         """What is seen and what should be seen: the template's points and its pose. Of the points
         those count that lie within the image; raises FeatureCountError where they are too few."""
         views = []
-        seen = np.ones(len(self.template.points), bool)
+        seen = np.ones(len(self.target.template.points), bool)
         for T in (T_CO, T_GO):
-            points = transform_points(T, self.template.points)
+            points = transform_points(T, self.target.template.points)
             pixels = points[:, :2] / points[:, 2:] * self.loop.K[[0, 1], [0, 1]]
             views.append(View(pixels + self.loop.K[:2, 2], points[:, 2], T))
         if near:
@@ -433,89 +340,13 @@ class _Run:
     ) -> np.ndarray:
         """(7,) rad/s: the law's velocity, and with it the object's own and the goal's."""
         J = geometric_jacobian(q)
-        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
-        wish = law.compute_joint_velocities(T_WE, v_C, J, away, _DAMPING)
-        ahead = self._object_twist(T_WE[:3, 3])
+        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, AVOIDANCE_GAIN)
+        wish = law.compute_joint_velocities(T_WE, v_C, J, away, DAMPING)
+        ahead = self.target.twist(T_WE[:3, 3], self.cell.seconds)
         ahead[2] -= sink
-        return wish + joint_velocities(J, ahead, damping=_DAMPING)[0]
+        return wish + joint_velocities(J, ahead, damping=DAMPING)[0]
 
-    def _object_twist(self, place: np.ndarray) -> np.ndarray:
-        """(6,) in W of a point at `place` (3,) that is carried along with the object, now."""
-        x, y, _, vx, vy, omega = self.motion.at(self.cell.seconds)
-        arm = place[:2] - (x, y)
-        return np.array([vx - omega * arm[1], vy + omega * arm[0], 0.0, 0.0, 0.0, omega])
-
-    def go(self) -> None:
-        """Send the wish until the next image. While images come but do not show the object, the arm
-        stands still: what it would go by is too old."""
-        watchdog = self.arm.gate.safety.watchdog
-        for _ in range(servo_period(self.cell)):
-            now = self.cell.seconds
-            if now - self.image_seconds <= watchdog < now - self.found_seconds:
-                self.arm.wait()
-            else:
-                self.arm.move(self.wish, now - self.found_seconds)
-
-    # --- Without looking ---------------------------------------------------------------------
-
-    def _commit(self, T_WE: np.ndarray, correction: np.ndarray, now: float) -> None:
-        """Fix the path that is left: to where the law says that the goal is, then straight on."""
+    def _where_the_goal_is(self, T_WE: np.ndarray, correction: np.ndarray) -> np.ndarray:
+        """(4, 4) T_WE of a gripper that the law has nothing to correct of."""
         T_EC = self.loop.T_EC
-        self.start = T_WE @ T_EC @ pose_exp(-correction) @ inverse_pose(T_EC)
-        self.start_seconds, self.left = now, self.height
-        self.depth_gone = 0.0
-
-    def go_blind(self) -> None:
-        """Down to the grasp along the foreseen path; raises ServoError where the arm is stopped, or
-        does not get there in time."""
-        speed = self.settings.descend_speed
-        end = self.cell.seconds + self.left / speed + _SLACK_SECONDS
-        while True:
-            rest = self.left - self.depth_gone
-            off = self._follow_step(min(speed, max(_BRAKE * rest, _SLOWEST)) if rest > 0 else 0.0)
-            if rest <= 0 and off < _REACHED:
-                return
-            if self.cell.seconds > end:
-                if off < _NEAR_ENOUGH:
-                    return
-                raise ServoError(f"{1000 * off:.0f} mm off the foreseen path at its end")
-
-    def _follow_step(self, sink: float) -> float:
-        """Follow the path for one physics step, sinking at `sink` m/s; metres off it before."""
-        if self.steps_to_image == 0:
-            self.steps_to_image = servo_period(self.cell)
-            sight = self.loop.camera()
-            if sight is not None:
-                self.image_seconds = sight.seconds
-        self.steps_to_image -= 1
-        dt, now = self.cell.dt, self.cell.seconds
-        if now - self.found_seconds > self.settings.blind_seconds:
-            raise TargetLostError(f"not seen for {self.settings.blind_seconds} s")
-        self.depth_gone = min(self.depth_gone + sink * dt, self.left)
-        path = self.motion.motion(self.start_seconds, now) @ self.start
-        path[:3, 3] += self.depth_gone * path[:3, 2]
-        q = self.cell.robot.q
-        T_WE = forward_kinematics(q)
-        error = pose_error(T_WE, path)
-        twist = self._object_twist(path[:3, 3]) + _BLIND_GAIN * error
-        twist[:3] += sink * path[:3, 2] * (self.depth_gone < self.left)
-        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
-        wish = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)[0]
-        # The object is too near to be seen: by design the wish is based on what was foreseen, for
-        # no longer than blind_seconds, and as long as the camera shows that it lives.
-        self.arm.move(wish, now - self.image_seconds)
-        return float(np.linalg.norm(error[:3]))
-
-    def follow(self, steps: int) -> None:
-        """Let physics steps pass while the fingers close, along with the object; hold still once
-        something presses harder than the gate allows, which is what a grip does."""
-        for _ in range(steps):
-            try:
-                if not self.holds:
-                    self._follow_step(0.0)
-                    continue
-            except ArmStoppedError as stop:
-                if not stop.contact:
-                    raise
-                self.holds = True
-            self.arm.wait()
+        return T_WE @ T_EC @ pose_exp(-correction) @ inverse_pose(T_EC)

@@ -10,7 +10,7 @@ from envs.base_cell import BaseCell
 from envs.policy_approach import SCENARIOS, TOLD_A_ROBOT, PolicyApproach
 from models.grasp_policy import SavedPolicy, load_policy
 from utils.errors import UserError
-from utils.results import OPEN_LOOP
+from utils.round_records import OPEN_LOOP
 
 LEARNED = "ppo"
 SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"

@@ -28,7 +28,7 @@ from envs.meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_files import FineVisual, fine_visual, object_files, read_object
 from envs.panda import MAX_OPENING
 from envs.primitives import NativeShape, make_primitive, random_color
-from utils.config_schema import OBJECT_SETS
+from utils.config_types import OBJECT_SETS
 from utils.geometry import ConvexSolid
 
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000

@@ -23,7 +23,7 @@ from envs.grasp_loop import ClosedLoop
 from envs.kinematics import forward_kinematics
 from envs.policy_approach import PolicyApproach
 from envs.scenes import Scene
-from utils.results import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
+from utils.round_records import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
 from utils.servo_errors import TargetLostError
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 
@@ -95,6 +95,7 @@ def run_round(
                     outcome.sim_seconds,
                     on_image,
                     detail=outcome.detail,
+                    held=_name_of(scene, outcome.object_index),
                     **_turn_ms(approach),
                 )  # fmt: skip
             )
@@ -124,6 +125,10 @@ def believed(cell: BaseCell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFr
         return beliefs.frame(frame, mount, T_WE)
     except TargetLostError:
         return replace(beliefs, levelled=False).frame(frame, mount, T_WE)
+
+
+def _name_of(scene: Scene, index: int | None) -> str | None:
+    return None if index is None else scene.placements[index].model.name
 
 
 def _turn_ms(approach: Approach) -> dict[str, float]:

@@ -56,6 +56,12 @@ def contact_reason(force: float, limit: float) -> str | None:
     return None if force <= limit else f"contact with {force:.1f} N, allowed are {limit} N"
 
 
+def reaching_down(safety: SafetyConfig, floor: float) -> SafetyConfig:
+    """The limits with a box that begins at `floor` m where that is lower than its own."""
+    lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
+    return safety.model_copy(update={"box_lower": lower})
+
+
 class ArmGate:
     """Judges every command before it reaches the motors of one arm, whoever gives it.
 
@@ -67,9 +73,9 @@ class ArmGate:
     def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, floor: float):
         """dt: seconds of one control period. floor: m, of the box where that is lower than
         safety.box_lower: planned grasps reach down to the table."""
-        lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
+        safety = reaching_down(safety, floor)
         self._box = [
-            (low - _LEAD, high + _LEAD) for low, high in zip(lower, safety.box_upper, strict=True)
+            (low - _LEAD, high + _LEAD) for low, high in zip(safety.box_lower, safety.box_upper)
         ]
         self.speeds = (JOINT_VELOCITY * robot.velocity_scale).tolist()  # rad/s
         self._dt = dt

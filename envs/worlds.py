@@ -9,7 +9,7 @@ from envs.mujoco_cell import MujocoCell
 from utils.config import Config, with_settings
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
-from utils.results import OPEN_LOOP
+from utils.round_records import OPEN_LOOP
 
 WORLDS = {"pybullet": Cell, "mujoco": MujocoCell}
 

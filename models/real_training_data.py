@@ -20,7 +20,8 @@ from models.rectangle_scores import Judged, judge, median_plate_length
 from models.training_data import TrainingData
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
-from utils.real_data import RealSample, Split, image_folds, object_folds, open_real_data
+from utils.data_splits import Split, image_folds, object_folds
+from utils.real_data import RealSample, open_real_data
 from utils.statistics import wilson_interval
 
 VIEWS = {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envs.cell import Cell
-from envs.execution import execute_grasp
+from envs.execution import check_bin, execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.safety import ArmGate, ArmStoppedError
@@ -114,8 +114,33 @@ def test_the_open_loop_does_not_leave_the_workspace(narrow, box_set):
     narrow.on_step = None
     assert outcome.reason == "stopped"
     assert outcome.detail.startswith("stopped: the workspace ends here (y = -0.30")
+    assert outcome.object_index == 0, "what was in the hand is named"
     # It was told to hold still at the edge, 30 cm, at the carry's full speed of over 1 m/s.
     assert -0.32 < min(lowest) < -0.30
+    np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
+
+
+def test_a_box_without_the_bin_is_refused(narrow, config):
+    check_bin(config)
+    with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.25\] m.*widen the box"):
+        check_bin(narrow.config)
+    low = ["safety.box_lower=[0.15,-0.55,0.3]", "grasp.floor=0.009"]
+    check_bin(load_config(None, low))  # planned motions reach down to the floor of grasps
+
+
+def test_an_arm_stretched_at_the_edge_is_put_home(narrow, box_set):
+    """Its elbow is bent by less than at its full reach, sqrt(0.316^2 + 0.0825^2) + sqrt(0.384^2 +
+    0.0825^2) m at -0.467 rad: any way back to home, at -2.36 rad, leads through that reach."""
+    narrow.load(make_scene("isolated", box_set, 0, narrow.config))
+    stretched = np.array([0.142, 1.338, 0.036, -0.387, -0.039, 1.741, 0.330])
+
+    def chase(cell, grasp):
+        cell.robot.place(stretched)
+        raise ArmStoppedError("the workspace ends here")
+
+    outcome = execute_grasp(narrow, Grasp(np.array([0.5, 0, 0.03]), 0.0, 0.07, 1.0), chase)
+    assert outcome.reason == "stopped"
+    assert outcome.detail.endswith("no way home within the workspace, it was put there by hand")
     np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
 
 

@@ -15,7 +15,7 @@ from envs.panda import ARM, FINGERS
 from envs.scenes import make_scene
 from envs.worlds import make_cell
 from utils.config import load_config
-from utils.config_schema import PhysicsRangesConfig, Range, VisionRangesConfig
+from utils.config_ranges import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
 

@@ -9,20 +9,21 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs import grasp_loop
+from envs import sighted_object
 from envs.beliefs import level, off, teach, true_beliefs, wrong_beliefs
 from envs.cell import Cell, wrist_mount
 from envs.challenges import CHALLENGES, crossing
 from envs.disturbances import Conveyor, Displacement, disturbed
-from envs.execution import execute_grasp
-from envs.grasp_loop import ClosedLoop
+from envs.execution import GraspFailure, execute_grasp
+from envs.grasp_loop import ClosedLoop, GuidedDescent
 from envs.kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenes import make_scene
+from envs.servoing import GuardedArm
 from envs.wrist_camera import WristCamera
 from utils.config import load_config
-from utils.config_schema import ScoredScenario
-from utils.object_tracking import planar_part, table_plane
+from utils.config_types import ScoredScenario
+from utils.tabletop import planar_part, table_plane
 from utils.transforms import Grasp, inverse_pose, top_down_pose
 
 CLOSED = ("pbvs", "ibvs", "hybrid")
@@ -101,7 +102,7 @@ def test_a_frozen_camera_stops_the_arm(cell, scene, images):
     cell.load(scene)
     grasp = grasp_of_box(cell)
     approach = loop(cell, "ibvs", camera=frozen_after(WristCamera(cell), images))
-    with pytest.raises(grasp_loop.GraspFailure) as failure:
+    with pytest.raises(GraspFailure) as failure:
         approach(cell, grasp)
     speeds = np.abs(cell.robot.joint_state()[1])
     assert failure.value.reason == "stopped"
@@ -176,7 +177,7 @@ def test_a_vanished_object_stops_the_arm(cell, scene):
 
 def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
     cell.load(scene)
-    make = grasp_loop.make_template
+    make = sighted_object.make_template
 
     def far_points(frame, grasp):
         template = make(frame, grasp)
@@ -184,7 +185,7 @@ def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
         points[2:] += [0.5, 0, 0]  # all but two leave the image
         return replace(template, points=points)
 
-    monkeypatch.setattr(grasp_loop, "make_template", far_points)
+    monkeypatch.setattr(sighted_object, "make_template", far_points)
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs"))
     assert outcome.reason == "lost"
     assert "2 of those on the object are in the image, needed are at least 3" in outcome.detail
@@ -311,9 +312,9 @@ def test_images_arrive_late(cell, scene):
 
 def test_the_object_is_found_by_the_real_camera(cell, scene):
     cell.load(scene)
-    run = grasp_loop._Run(loop(cell, "pbvs"), grasp_loop.GuardedArm(cell), grasp_of_box(cell))
+    descent = GuidedDescent(loop(cell, "pbvs"), GuardedArm(cell), grasp_of_box(cell))
     x, y, turn = np.subtract(
-        planar_part(run.T_WO),
+        planar_part(descent.target.T_WO),
         [*cell.object_pose(0)[:2, 3], grasp_of_box(cell).angle],
     )
     assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
@@ -324,9 +325,10 @@ def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
     """A law that wishes for nothing: what is left is the velocity of the object's point below the
     hand, v + omega x r by hand, and the goal's sinking. Ahead of the object, not behind it."""
     cell.load(scene)
-    run = grasp_loop._Run(loop(cell, "pbvs"), grasp_loop.GuardedArm(cell), grasp_of_box(cell))
-    x, y = run.motion.state[:2]
-    run.motion.state[3:] = [0.04, -0.03, 0.3]
+    descent = GuidedDescent(loop(cell, "pbvs"), GuardedArm(cell), grasp_of_box(cell))
+    state = descent.target.motion.state
+    x, y = state[:2]
+    state[3:] = [0.04, -0.03, 0.3]
     q = cell.robot.q
     T_WE, J = forward_kinematics(q), geometric_jacobian(q)
 
@@ -334,7 +336,7 @@ def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
         def compute_joint_velocities(self, *args):
             return np.zeros(7)
 
-    twist = J @ run._joint_wish(q, T_WE, np.zeros(6), NoWish(), 0.05)
+    twist = J @ descent._joint_wish(q, T_WE, np.zeros(6), NoWish(), 0.05)
     rx, ry = T_WE[:2, 3] - (x, y)
     expected = [0.04 - 0.3 * ry, -0.03 + 0.3 * rx, -0.05, 0, 0, 0.3]
     np.testing.assert_allclose(twist, expected, atol=4e-3)

@@ -11,7 +11,7 @@ from scipy import stats
 
 from utils.adaptive_ranges import AdaptiveRanges, Bound
 from utils.config import ConfigError, UserError, load_config
-from utils.config_schema import Range
+from utils.config_ranges import Range
 from utils.random_ranges import changed, draw, neutral
 from utils.textures import TextureRandomizer
 

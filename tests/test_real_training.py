@@ -18,8 +18,9 @@ from models.rectangle_examples import RectangleExamples, RectangleImages, View
 from models.rectangle_scores import best_rectangle, judge, median_plate_length
 from utils.augmentation import Similarity
 from utils.config import load_config
+from utils.data_splits import image_folds, object_folds
 from utils.errors import UserError
-from utils.real_data import RealSample, image_folds, object_folds
+from utils.real_data import RealSample
 from utils.rectangles import GraspRectangle, rectangle_match
 
 QUICK = ("train.backbone=ggcnn", "train.epochs=1", "train.workers=0", "train.precision=float32")

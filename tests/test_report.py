@@ -13,23 +13,20 @@ import yaml
 
 from utils.config import load_config
 from utils.errors import UserError
+from utils.evaluation_plan import interruption, planned_rounds
 from utils.files import write_json_atomic
 from utils.overlay import FAILURE_COLOR, SUCCESS_COLOR, draw_grasp
 from utils.report import GalleryItem, write_report
 from utils.results import (
-    AttemptRecord,
-    RoundRecord,
     compare,
-    contestant,
     format_table,
-    interruption,
-    planned_rounds,
     print_comparisons,
     print_table,
     summarise,
     write_csv,
     write_results,
 )
+from utils.round_records import AttemptRecord, RoundRecord, contestant
 from utils.runs import environment, git_state, new_run_folder
 from utils.stop_reasons import print_stop_reasons, stop_reasons
 from utils.transforms import ImageGrasp
@@ -365,6 +362,12 @@ def test_what_stopped_the_arm_is_told_and_counted(capsys, tmp_path):
     assert "What stopped the arm" in told and OLD.format(104) in told and "8.0, 14.0" in told
     untold = page(ROUNDS)
     assert "What stopped the arm" not in untold and "turn, ms" not in untold
+
+
+def test_a_stop_with_an_object_in_the_hand_names_it(capsys):
+    carried = replace(stopped("stopped", "stopped: the workspace ends here"), held="mug_0012")
+    print_stop_reasons(stop_reasons([a_round("heuristic", 4, 1, 0, [carried])]))
+    assert "(scene 4, mug_0012 in the hand)" in capsys.readouterr().out
 
 
 def test_a_loops_turns_are_told_where_there_are_any():

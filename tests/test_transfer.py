@@ -10,7 +10,7 @@ import pytest
 
 from evaluate import is_trained
 from utils.config import TransferPolicy, load_config
-from utils.results import AttemptRecord, RoundRecord
+from utils.round_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
 from utils.transfer import (
     Score,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from utils.config_schema import AdaptiveConfig, Range
+from utils.config_ranges import AdaptiveConfig, Range
 from utils.random_ranges import neutral
 
 

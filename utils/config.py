@@ -28,8 +28,8 @@ from utils.config_errors import (
     schema_at,
     unknown_key,
 )
+from utils.config_ranges import RandomizationConfig
 from utils.config_schema import (
-    OBJECT_SETS,
     CameraConfig,
     Config,
     EnvConfig,
@@ -37,7 +37,6 @@ from utils.config_schema import (
     ExecutionConfig,
     GraspConfig,
     ObjectsConfig,
-    RandomizationConfig,
     RobotConfig,
     SafetyConfig,
     SceneConfig,
@@ -47,6 +46,7 @@ from utils.config_schema import (
     TransferPolicy,
     WorkspaceConfig,
 )
+from utils.config_types import OBJECT_SETS
 from utils.errors import UserError, did_you_mean
 
 __all__ = [

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from utils.config_schema import OBJECT_SETS, Config, Section
+from utils.config_schema import Config
+from utils.config_types import OBJECT_SETS, Section
 from utils.errors import UserError, did_you_mean
 
 DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"

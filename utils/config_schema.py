@@ -1,8 +1,9 @@
 """The schema of the configuration: types and ranges of every key, as frozen typed objects.
 
 `configs/default.yaml` holds defaults, units and meanings; a new section is a new `Section` class
-here, a field of `Config` and its keys in that file. This module knows neither files nor command
-line, and not how a mistake is told.
+here, a field of `Config` and its keys in that file. What sections are made of is in
+`utils.config_types`, the section of randomisation in `utils.config_ranges`. This module knows
+neither files nor command line, and not how a mistake is told.
 """
 
 from __future__ import annotations
@@ -12,55 +13,29 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from utils.config_ranges import RandomizationConfig
+from utils.config_types import (
+    Controller,
+    Count,
+    JointVector,
+    Mount,
+    Name,
+    ObjectSet,
+    Pixels,
+    Positive,
+    Scenario,
+    ScoredScenario,
+    Section,
+    Several,
+    Share,
+    Vector2,
+    Vector3,
+    no_repeats,
+)
 from utils.errors import UserError
 from utils.transforms import look_at
-
-OBJECT_SETS = ("box", "primitives", "random_urdfs")
-
-
-def _object_set(value: str) -> str:
-    if value not in OBJECT_SETS and not Path(value).expanduser().is_dir():
-        raise ValueError("no such object set or folder")
-    return value
-
-
-def _no_repeats(values: tuple) -> tuple:
-    if len(set(values)) != len(values):
-        raise ValueError("an entry is repeated")
-    return values
-
-
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(gt=0, le=1)]
-Pixels = Annotated[int, Field(ge=16, le=4096)]
-Name = Annotated[str, Field(min_length=1)]
-# What a type alone cannot tell is put in `description`, which error messages quote.
-ObjectSet = Annotated[
-    str,
-    AfterValidator(_object_set),
-    Field(description=f"one of {', '.join(OBJECT_SETS)}, or an existing folder"),
-]
-Scenario = Literal["isolated", "packed", "pile"]
-ScoredScenario = Literal[
-    "isolated", "packed", "pile", "static", "moved", "moving_5cm", "moving_10cm", "turning_5cm",
-    "turning_10cm", "crossing_5cm", "miscalibrated", "latency",
-]  # fmt: skip
-Controller = Literal["open_loop", "pbvs", "ibvs", "hybrid"]
-Mount = Literal["overhead", "wrist"]
-# YAML has lists where frozen objects hold tuples, hence strict=False; the items stay strict.
-Vector2 = Annotated[tuple[float, float], Field(strict=False)]
-Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
-JointVector = Annotated[tuple[float, float, float, float, float, float, float], Field(strict=False)]
-Several = Field(min_length=1, strict=False)
-
-
-class Section(BaseModel):
-    """Base of every section: no unknown keys, no silent conversions, no changes, no NaN."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class SimConfig(Section):
@@ -185,10 +160,10 @@ class GraspConfig(Section):
 
 
 class EvaluateConfig(Section):
-    policies: Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
-    controllers: Annotated[tuple[Controller, ...], Several, AfterValidator(_no_repeats)] | None
-    scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(_no_repeats)]
-    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
+    policies: Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
+    controllers: Annotated[tuple[Controller, ...], Several, AfterValidator(no_repeats)] | None
+    scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(no_repeats)]
+    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(no_repeats)]
     rounds: Count
     randomise: bool
     workers: Count | None
@@ -220,8 +195,8 @@ TransferRow = Annotated[
 
 
 class TransferConfig(Section):
-    policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(_no_repeats)] | None
-    worlds: Annotated[tuple[TransferWorld, ...], Several, AfterValidator(_no_repeats)]
+    policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(no_repeats)] | None
+    worlds: Annotated[tuple[TransferWorld, ...], Several, AfterValidator(no_repeats)]
     cornell: Annotated[Path, Field(strict=False)] | None
 
 
@@ -234,7 +209,7 @@ class DataConfig(Section):
     repeats: Count
     frames: Count
     validation_frames: Count
-    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(_no_repeats)]
+    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(no_repeats)]
     max_objects: Annotated[int, Field(ge=2, le=12)]
     randomise: bool
     randomise_physics: bool
@@ -276,7 +251,7 @@ class TrainConfig(Section):
 
 class EnvConfig(Section):
     observations: Annotated[
-        tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(_no_repeats)
+        tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(no_repeats)
     ]
     control: Literal["ee", "ee_planar", "joint"]
     frame: Literal["world", "hand"]
@@ -307,7 +282,7 @@ class EnvConfig(Section):
 EnvArgument = Annotated[
     str, Field(pattern=r"^[A-Za-z_]\w*=", description="NAME=VALUE, the value as YAML")
 ]
-Names = Annotated[tuple[Name, ...], Several, AfterValidator(_no_repeats)]
+Names = Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
 
 
 class RLConfig(Section):
@@ -379,131 +354,6 @@ class RLConfig(Section):
             raise ValueError(
                 f"batch_size ({self.batch_size}) must divide envs x rollout_steps ({steps})"
             )
-        return self
-
-
-Fraction = Annotated[float, Field(ge=0, le=1)]
-
-
-class Range(NamedTuple):
-    """A parameter's range, see `utils.random_ranges`."""
-
-    low: float
-    high: float
-    distribution: str
-    operation: str
-    every: str
-
-
-def _range(values: tuple) -> Range:
-    value = Range(*values)
-    if value.low > value.high:
-        raise ValueError(f"low ({value.low}) must not be greater than high ({value.high})")
-    if value.low <= 0 and value.distribution == "log_uniform":
-        raise ValueError(f"log_uniform needs low > 0, got {value.low}")
-    if value.low <= 0 and value.operation == "scale":
-        raise ValueError(f"a factor (scale) needs low > 0, got {value.low}")
-    return value
-
-
-def _unsigned(value: Range) -> Range:
-    if value.low < 0:
-        raise ValueError(f"low ({value.low}) must not be negative")
-    return value
-
-
-RangeOf = Annotated[
-    tuple[
-        float,
-        float,
-        Literal["uniform", "log_uniform", "normal"],
-        Literal["scale", "add", "set"],
-        Literal["episode", "step"],
-    ],
-    Field(
-        strict=False,
-        description="a list of low, high, uniform | log_uniform | normal, scale | add | set, "
-        "episode | step",
-    ),
-    AfterValidator(_range),
-]
-UnsignedRange = Annotated[RangeOf, AfterValidator(_unsigned)]
-
-
-class PhysicsRangesConfig(Section):
-    object_mass: RangeOf
-    object_friction: RangeOf
-    rolling_friction: RangeOf
-    spinning_friction: RangeOf
-    table_friction: RangeOf
-    finger_friction: RangeOf
-    restitution: UnsignedRange
-    contact_stiffness: RangeOf
-    contact_damping: RangeOf
-    robot_mass: RangeOf
-    joint_damping: UnsignedRange
-    arm_position_gain: RangeOf
-    arm_velocity_gain: RangeOf
-    gripper_gain: RangeOf
-    gravity: RangeOf
-    action_noise: UnsignedRange
-    action_bias: RangeOf
-    latency: UnsignedRange
-
-
-class VisionRangesConfig(Section):
-    light_tilt: UnsignedRange
-    light_heading: RangeOf
-    light_colour: UnsignedRange
-    light_ambient: UnsignedRange
-    light_diffuse: UnsignedRange
-    light_specular: UnsignedRange
-    camera_shift: RangeOf
-    camera_turn: RangeOf
-    camera_fov: RangeOf
-    brightness: RangeOf
-    contrast: RangeOf
-    saturation: RangeOf
-    white_balance: RangeOf
-    colour_noise: UnsignedRange
-    depth_shift: RangeOf
-    depth_jitter: RangeOf
-    depth_step: RangeOf
-
-
-class AdaptiveConfig(Section):
-    enabled: bool
-    initial: Fraction
-    step: Share
-    boundary_share: Share
-    episodes: Count
-    widen_at: Share
-    narrow_at: Fraction
-
-    @model_validator(mode="after")
-    def _narrow_below_widen(self) -> AdaptiveConfig:
-        if self.narrow_at >= self.widen_at:
-            raise ValueError(
-                f"narrow_at ({self.narrow_at}) must be smaller than widen_at ({self.widen_at})"
-            )
-        return self
-
-
-class RandomizationConfig(Section):
-    parts: Annotated[tuple[Literal["physics", "vision"], ...], Several, AfterValidator(_no_repeats)]
-    physics: PhysicsRangesConfig
-    vision: VisionRangesConfig
-    colour_share: Fraction
-    texture_share: Fraction
-    texture_folder: Annotated[Path, Field(strict=False)] | None
-    shadow_share: Fraction
-    depth_noise_share: Fraction
-    adaptive: AdaptiveConfig
-
-    @model_validator(mode="after")
-    def _adaptive_ranges_are_of_physics(self) -> RandomizationConfig:
-        if self.adaptive.enabled and "physics" not in self.parts:
-            raise ValueError("adaptive ranges are those of physics: add it to parts")
         return self
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pybullet
 
 from utils.adaptive_ranges import AdaptiveRanges, Bound
-from utils.config_schema import RandomizationConfig, Range
+from utils.config_ranges import RandomizationConfig, Range
 from utils.errors import UserError
 from utils.random_physics import RandomPhysics
 from utils.random_physics import World as PhysicsWorld

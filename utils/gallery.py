@@ -1,4 +1,4 @@
-"""Which pictures of grasps are shown: successes and failures, and of each policy some."""
+"""Pictures of grasps, and which of them are shown: successes, failures, of each policy some."""
 
 from __future__ import annotations
 
@@ -8,10 +8,19 @@ from pathlib import Path
 import imageio.v3 as iio
 
 from utils.files import write_atomic
-from utils.overlay import contact_sheet
+from utils.overlay import contact_sheet, draw_grasp
 from utils.report import GalleryItem
+from utils.round_records import SUCCESS
+from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 MOST_FAILURES = 24  # on failures.png
+
+
+def picture(frame: RGBDFrame, grasp: Grasp, policy: str, scenario: str, reason: str) -> GalleryItem:
+    """The frame with the grasp drawn in, and how it went: "success" or why not."""
+    on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
+    image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
+    return GalleryItem(image, f"{policy}, {scenario}: {reason}", success, policy)
 
 
 def write_failures(path: Path, pictures: list[GalleryItem]) -> None:

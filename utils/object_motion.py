@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utils.object_tracking import planar
+from utils.tabletop import planar
 
 _ACCELERATION = 0.03  # m/s^2 by root hertz: how fast velocities wander unless something pushes
 _ANGULAR_ACCELERATION = 0.06  # rad/s^2 by root hertz

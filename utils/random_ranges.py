@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from utils.config_schema import Range
+from utils.config_ranges import Range
 
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
 NEUTRAL = {"scale": 1.0, "add": 0.0}  # changes nothing

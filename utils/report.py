@@ -20,19 +20,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
+from utils.evaluation_plan import interruption
 from utils.files import write_atomic
-from utils.results import (
-    FAILURES,
-    SUCCESS,
-    Comparison,
-    RoundRecord,
-    Row,
-    compare,
-    contestant,
-    failures_in_words,
-    interruption,
-    turn_ms_in_words,
-)
+from utils.results import Comparison, Row, compare, failures_in_words, turn_ms_in_words
+from utils.round_records import FAILURES, SUCCESS, RoundRecord, contestant
 from utils.runs import git_state
 from utils.statistics import Difference
 from utils.stop_reasons import stop_reasons
