@@ -31,6 +31,7 @@ from utils.unlabelled_images import KEY, UnlabelledImages
 # Of a photograph, what simulated training images are changed by, too: no change tells the domain.
 AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
 STANDS_OUT = (0.01, 0.15)  # m above the table: what a crop is laid around, as on simulated images
+MIDDLE = 0.25  # of the view's side, from its centre: farther out are walls and the table's edge
 INFORMATION_STEP = 4  # pixels between those whose predictions are asked; neighbours say the same
 
 
@@ -91,12 +92,14 @@ class TargetPairs(Dataset):
 def corner_around(
     x: torch.Tensor, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[int, int]:
-    """Row and column at which a crop of `size` starts that has a random pixel `STANDS_OUT` metres
-    above the table of an input x (4, H, W) somewhere in its middle; of any pixel if none does."""
+    """Row and column at which a crop of `size` starts: around a random pixel of an input x (4, H,
+    W) that is in its `MIDDLE` and `STANDS_OUT` metres above the table; anywhere if none is."""
     height = -DEPTH_UNIT * x[3].numpy()
-    low, high = STANDS_OUT
-    pixels = np.argwhere((height > low) & (height < high))
     size, shape = np.array(size), np.array(height.shape)
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    out = np.hypot(rows - shape[0] / 2, columns - shape[1] / 2)
+    low, high = STANDS_OUT
+    pixels = np.argwhere((height > low) & (height < high) & (out < MIDDLE * shape.min()))
     middle = pixels[rng.integers(len(pixels))] if len(pixels) else rng.integers(shape)
     corner = middle - size // 2 + rng.integers(-(size // 4), size // 4 + 1)
     row, column = np.clip(corner, 0, np.maximum(shape - size, 0))

@@ -303,11 +303,12 @@ def test_pairs_are_functions_of_seed_epoch_and_index(photographs):
 
 def test_crops_lie_around_what_stands_on_the_table():
     x = torch.zeros(4, 100, 120)
-    x[3, 70:73, 30:34] = -0.5  # 5 cm above the table
-    x[3, :10] = -2.9  # a wall behind, 29 cm
+    x[3, 60:63, 45:49] = -0.5  # 5 cm above the table
+    x[3, 40:45, 60:70] = -2.9  # too high
+    x[3, :10] = -1.0  # a wall behind
     for seed in range(20):
         row, column = corner_around(x, (40, 40), np.random.default_rng(seed))
-        assert row <= 70 and row + 40 >= 73 and column <= 30 and column + 40 >= 34
+        assert row <= 60 and row + 40 >= 63 and column <= 45 and column + 40 >= 49
     assert STANDS_OUT[0] < 0.05 < STANDS_OUT[1]
     empty = corner_around(torch.zeros(4, 100, 120), (40, 40), np.random.default_rng(0))
     assert 0 <= empty[0] <= 60 and 0 <= empty[1] <= 80
