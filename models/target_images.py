@@ -111,15 +111,18 @@ def corner_around(
 
 def grasp_information(model: GraspNet, images: LabelledImages) -> float:
     """Nats that a place in an image tells of what the network says there: nothing to grasp, or a
-    grasp in one of its K bins. 0 .. log(1 + K), see `utils.adaptation.mutual_information`. Labels
-    are not looked at; the model is left in evaluation mode."""
+    grasp in one of its K bins. 0 .. log(1 + K), see `utils.adaptation.mutual_information`. Of the
+    square `MIDDLE` around the centre; labels are not looked at. The model ends in evaluation mode.
+    """
     model.eval()
     said = []
     for index in range(len(images)):
         quality, angle, _ = predict(model, images[index])
-        quality, angle = (
-            maps[..., ::INFORMATION_STEP, ::INFORMATION_STEP].double() for maps in (quality, angle)
+        rows, columns = (
+            slice(round((0.5 - MIDDLE) * n), round((0.5 + MIDDLE) * n), INFORMATION_STEP)
+            for n in quality.shape[2:]
         )
+        quality, angle = (maps[..., rows, columns].double() for maps in (quality, angle))
         said.append(torch.cat([1 - quality, quality * angle.softmax(dim=1)], dim=1))
     p = torch.cat(said).clamp_min(torch.finfo(torch.double).tiny)
     return mutual_information(p.log())
