@@ -5,6 +5,7 @@
     python train_graspnet.py train.backbone=ggcnn data.frames=2000
     torchrun --nproc_per_node=2 train_graspnet.py
     python train_graspnet.py data.kind=cornell data.root=path/to/cornell
+    python train_graspnet.py train.initial=FILE.pt adaptation.target=path/to/photographs
 
 Leaves best.pt (chosen on held-out training objects), last.pt, graspnet.pt (the best one's weights
 alone), results.json, curves.png, predictions.png and TensorBoard events in
@@ -15,6 +16,9 @@ On real data (data.kind cornell or jacquard) it cross-validates: every fold of t
 by a network that is trained on the other folds for a fixed schedule. The last weights count, so no
 test image chooses anything. Each fold has its folder in the run's; results.json holds every
 prediction.
+
+With adaptation.target, labelled simulated images and unlabelled photographs are shown in turn, and
+the checkpoint is chosen without a label of the latter; see docs/sim_to_real.md.
 """
 
 from __future__ import annotations
@@ -43,6 +47,7 @@ from envs.cell import camera_intrinsics
 from envs.data_generation import generate
 from models.grasp_examples import EpochBatches
 from models.graspnet import GraspNet, create_model
+from models.graspnet_adaptation import AdaptingTrainer
 from models.graspnet_io import load_graspnet, load_initial, save_graspnet
 from models.graspnet_pictures import draw_curves, draw_predictions
 from models.graspnet_scores import check_graspable
@@ -56,9 +61,11 @@ from models.real_training_data import (
 )
 from models.rectangle_pictures import draw_rectangles
 from models.rectangle_scores import Judged
+from models.target_images import open_target, with_target
 from models.training_data import TrainingData, simulated_data
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
+from utils.files import write_atomic
 from utils.grasp_data import read_trials
 from utils.label_trials import label_truth
 from utils.results import write_json_atomic
@@ -74,10 +81,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_writable("--weights", options.weights)
     check_resume(config, options.resume)
     check_network(config)
+    photographs = open_target(config)
     with team(config.train.device, dict(os.environ)) as us:
         if config.data.kind != "simulated":
             return cross_validate(config, options.resume, options.weights, us)
         data = make_data(config, us)
+        if photographs is not None:
+            data = with_target(config, data, photographs)
         trainer = make_trainer(config, data, us)
         run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
         history, losses = load_progress(trainer, run / "last.pt")
@@ -151,6 +161,8 @@ def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
     torch.manual_seed(config.seed)
     model = make_network(config, config.train.max_width or data.max_width)
     total_steps = steps_per_epoch(config, data) * config.train.epochs
+    if config.adaptation.target is not None:
+        return AdaptingTrainer(model, config.train, total_steps, us, config.adaptation)
     return Trainer(model, config.train, total_steps, us)
 
 
@@ -176,9 +188,10 @@ def steps_per_epoch(config: Config, data: TrainingData) -> int:
 
 def announce(config: Config, run: Path, data: TrainingData, trainer: Trainer) -> None:
     parameters = sum(p.numel() for p in trainer.model.parameters())
+    to = f", adapted to {config.adaptation.target}" if config.adaptation.target else ""
     print(
         f"GraspNet {config.train.backbone}, {parameters:,} parameters, on {len(data.train)} "
-        f"{config.data.kind} images for {config.train.epochs} epochs, {trainer.team.ranks} "
+        f"{config.data.kind} images{to}, for {config.train.epochs} epochs, {trainer.team.ranks} "
         f"process(es), {trainer.team.device}, {str(trainer.precision).removeprefix('torch.')}, "
         f"seed {config.seed}; results in {run}",
         flush=True,
@@ -221,10 +234,7 @@ def train(
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
                 row |= data.score(trainer.model)
                 history.append(row)
-                if data.chosen_by and row[data.chosen_by] == max(
-                    old[data.chosen_by] for old in history
-                ):
-                    trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
+                keep_best(run, config, data, trainer, history)
                 save_last(run, config, data, trainer, history, losses=[])
                 for name, value in row.items():
                     writer.add_scalar(name, value, trainer.step)
@@ -234,6 +244,19 @@ def train(
             losses = []
             us.wait()
     return True
+
+
+def keep_best(
+    run: Path, config: Config, data: TrainingData, trainer: Trainer, history: list[dict]
+) -> None:
+    """Have best.pt hold the weights of the epoch that `data.chosen` names, if it names one."""
+    chosen = data.chosen(history)
+    if data.keeps_every_epoch:
+        this, best = (run / f"epoch{row['epoch']}.pt" for row in (history[-1], chosen))
+        trainer.save(this, config, data.metres_per_pixel, history=history)
+        write_atomic(run / "best.pt", best.read_bytes())
+    elif chosen is history[-1]:
+        trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
 
 
 def batches(config: Config, data: TrainingData, us: Team, epoch: int, skip: int) -> DataLoader:
@@ -291,7 +314,8 @@ def save_results(run: Path, data: TrainingData, history: list[dict], weights: Pa
     results = {"schema": 1, "commit": git_state().commit, "best": scores, "history": history}
     write_json_atomic(run / "results.json", results)
     draw_curves(run / "curves.png", history)
-    draw_predictions(run / "predictions.png", best.model, data.validation)
+    for name, images in data.pictured().items():
+        draw_predictions(run / f"{name}.png", best.model, images)
     print(f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}")
     print(f"score it: python evaluate.py evaluate.policies=heuristic,{run / 'graspnet.pt'}")
 

@@ -138,11 +138,20 @@ class GraspNet(nn.Module):
                 f"GraspNet: got an input of shape {tuple(x.shape)}, "
                 f"expected (B, {self.input_channels}, H, W)"
             )
+        return self.heads(self.features(x), logits, centres)
+
+    def features(self, x: torch.Tensor) -> torch.Tensor:
+        """What the backbone makes of x (B, C, H, W): (B, out_channels, H, W)."""
         height, width = x.shape[-2:]
         below, right = -height % self.backbone.stride, -width % self.backbone.stride
         if below or right:
             x = F.pad(x, (0, right, 0, below), mode="replicate")
-        features = self.backbone(x)[..., :height, :width]
+        return self.backbone(x)[..., :height, :width]
+
+    def heads(
+        self, features: torch.Tensor, logits: bool = False, centres: bool = False
+    ) -> tuple[torch.Tensor, ...]:
+        """The maps of `features`, see `forward`."""
         quality = self.quality_head(features)
         angle = self.angle_head(features)
         metres = torch.sigmoid(self.width_head(features)) * self.max_width

@@ -130,12 +130,16 @@ def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
 class Trainer:
     """A network in training.
 
-    total_steps: length of the schedule. model is the bare network; gradients are averaged over the
-    processes of `team`, so that together they take the step of the joint batch (with
-    batch-normalisation statistics of each process's part, except on GPUs).
+    total_steps: length of the schedule. model is the bare network; trained: what the optimiser
+    steps, the model or something larger that holds it. Gradients are averaged over the processes of
+    `team`, so that together they take the step of the joint batch (with batch-normalisation
+    statistics of each process's part, except on GPUs).
     """
 
-    def __init__(self, model: GraspNet, settings: TrainConfig, total_steps: int, team: Team):
+    def __init__(
+        self, model: GraspNet, settings: TrainConfig, total_steps: int, team: Team,
+        trained: nn.Module | None = None,
+    ):  # fmt: skip
         if settings.batch_size % team.ranks:
             raise UserError(
                 f"train.batch_size is {settings.batch_size}, but {team.ranks} processes have to "
@@ -144,12 +148,11 @@ class Trainer:
         self.settings, self.team, self.total_steps, self.step = settings, team, total_steps, 0
         self.precision = choose_precision(settings.precision, team.device)
         model = model.to(team.device, memory_format=torch.channels_last)
-        self.model, self._parallel = model, model
-        if team.ranks > 1:
-            if team.device.type == "cuda":
-                model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
-                self.model = model
-            self._parallel = DistributedDataParallel(model)
+        if team.ranks > 1 and team.device.type == "cuda":
+            model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
+        self.model = model
+        self.trained = model if trained is None else trained.to(team.device)
+        self._parallel = DistributedDataParallel(self.trained) if team.ranks > 1 else self.trained
         self.loss = GraspLoss(
             settings.quality_weight,
             settings.angle_weight,
@@ -157,7 +160,7 @@ class Trainer:
             settings.centre_weight,
         )
         self.optimizer = torch.optim.AdamW(
-            model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
+            self.trained.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
         )
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(
             self.optimizer,
@@ -179,7 +182,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(total).backward()
         self.scaler.unscale_(self.optimizer)
-        nn.utils.clip_grad_norm_(self.model.parameters(), GRADIENT_LIMIT)
+        nn.utils.clip_grad_norm_(self.trained.parameters(), GRADIENT_LIMIT)
         self.scaler.step(self.optimizer)
         self.scaler.update()
         self.scheduler.step()
@@ -204,13 +207,18 @@ class Trainer:
             path,
             kind=KIND,
             model_args=self.model.model_args,
-            model=self.model,
+            model=self.ordinary_model(),
             optimizer=self.optimizer,
             scheduler=self.scheduler,
             step=self.step,
             rng=rng_states({}),
             config=config.model_dump(mode="json"),
-            extra={PIXEL_SIZE: metres_per_pixel, "scaler": self.scaler.state_dict(), **extra},
+            extra={
+                PIXEL_SIZE: metres_per_pixel,
+                "scaler": self.scaler.state_dict(),
+                **self.more_state(),
+                **extra,
+            },
         )
 
     def load(self, path: Path) -> dict[str, Any]:
@@ -220,7 +228,7 @@ class Trainer:
         )
         if checkpoint["optimizer"] is None:
             raise UserError(f"{path}: holds weights only, no training to go on with")
-        load_weights(self.model, checkpoint, path)
+        self.take_weights(checkpoint, path)
         self.optimizer.load_state_dict(checkpoint["optimizer"])
         self.scheduler.load_state_dict(checkpoint["scheduler"])
         if checkpoint["extra"]["scaler"]:  # empty from a device that needed none, such as a CPU
@@ -228,3 +236,15 @@ class Trainer:
         self.step = checkpoint["step"]
         restore_rng(checkpoint["rng"], {})
         return checkpoint["extra"]
+
+    def ordinary_model(self) -> GraspNet:
+        """The network as a checkpoint holds it, for `load_graspnet`."""
+        return self.model
+
+    def more_state(self) -> dict[str, Any]:
+        """What a checkpoint has to hold of a training besides, plain."""
+        return {}
+
+    def take_weights(self, checkpoint: dict[str, Any], path: Path) -> None:
+        """Put back what `ordinary_model` and `more_state` gave."""
+        load_weights(self.model, checkpoint, path)

@@ -103,10 +103,15 @@ def best_grasp(planner: Planner, frame: RGBDFrame) -> Grasp | None:
     return replace(planned[0], position=np.array([x, y, view.T_WC[2, 3] - distance]))
 
 
+def from_above(frame: RGBDFrame, metres_per_pixel: float) -> RGBDFrame:
+    """A photograph's frame as a network sees it whose pixels span `metres_per_pixel`."""
+    return overhead_view(frame, WORKSPACE, metres_per_pixel, REACH)
+
+
 @torch.inference_mode()
 def network_grasp(saved: SavedGraspNet, frame: RGBDFrame) -> Grasp:
     """The grasp at the best pixel of what a network sees from above, on the surface there."""
-    view = overhead_view(frame, WORKSPACE, saved.metres_per_pixel, REACH)
+    view = from_above(frame, saved.metres_per_pixel)
     maps = saved.model.eval()(to_input(view.rgb, view.depth)[None])
     (grasp,) = surface_grasps(find_peaks(*maps, BEST), view.depth, HAND)
     return image_to_grasp(grasp, view.K, view.T_WC)

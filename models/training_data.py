@@ -5,7 +5,7 @@ Knows how images become examples; not how the simulated ones are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,18 @@ class TrainingData:
     chosen_by: str | None
     metres_per_pixel: float
     max_width: float
+
+    keeps_every_epoch = False  # whether `chosen` can go back to one that was not chosen before
+
+    def chosen(self, history: Sequence[dict[str, float]]) -> dict[str, float] | None:
+        """The epoch's row whose weights to keep; of equals the last. None: always the newest."""
+        if self.chosen_by is None:
+            return None
+        return max(history, key=lambda row: (row[self.chosen_by], row["epoch"]))
+
+    def pictured(self) -> dict[str, LabelledImages]:
+        """What a picture of the network's predictions shows, by the picture's name."""
+        return {"predictions": self.validation}
 
 
 def simulated_data(config: Config, folder: Path, focal: float, distance: float) -> TrainingData:

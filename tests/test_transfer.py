@@ -1,6 +1,7 @@
 """The transfer report: its figures by hand, its table, and the command from end to end."""
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluate import is_trained
 from utils.config import TransferPolicy, load_config
 from utils.round_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
@@ -128,10 +128,21 @@ def test_results_and_picture(lines):
 
 def test_the_shipped_report_is_a_config():
     transfer = load_config(REPORT).transfer
+    oracle = "oracle (sees the true scene)"
     policies = {who.policy for who in transfer.policies}
-    assert policies == {"random", "heuristic", "oracle (sees the true scene)", "GraspNet"}
-    nobody_s = [who for who in transfer.policies if not (is_trained(who) or who.train_with)]
-    assert [who.training for who in nobody_s] == ["both + adaptation"]  # no script does that yet
+    assert policies == {"random", "heuristic", oracle, "GraspNet (shipped)", "GraspNet"}
+    rows = [who for who in transfer.policies if who.policy == "GraspNet"]
+    parts = ["none", "physics", "vision", "both", "both for longer", "both + adaptation"]
+    assert [who.training for who in rows] == parts
+    for who in rows:  # the commands can be read, and are of one budget
+        words = shlex.split(who.train_with)
+        assert words[:2] == ["python", "train_graspnet.py"] and words[-1] == who.planner
+        config = load_config(REPOSITORY / words[3], [word for word in words[4:-2] if "=" in word])
+        assert (config.data.frames, config.train.backbone) == (800, "tutorial_skip")
+        physics = who.training == "physics" or who.training.startswith("both")
+        assert config.data.randomise_physics == physics
+        assert config.data.randomise == (who.training not in ("none", "physics"))
+        assert (config.adaptation.target is not None) == ("adaptation" in who.training)
 
 
 def test_outside_is_outside():

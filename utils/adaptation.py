@@ -63,11 +63,19 @@ class DomainBatchNorm(nn.Module):
 
     Statistics of a mixture fit neither domain (Li et al., "Revisiting batch normalization for
     practical domain adaptation", 2016). Which ones count is set by `select_domain`.
+    ordinary: the class of what it stands in for, see `ordinary_norms`.
     """
 
-    def __init__(self, channels: int, eps: float = 1e-5, momentum: float = 0.1):
+    def __init__(
+        self,
+        channels: int,
+        eps: float = 1e-5,
+        momentum: float = 0.1,
+        ordinary: type[nn.BatchNorm1d] | type[nn.BatchNorm2d] = nn.BatchNorm2d,
+    ):
         super().__init__()
         self.eps, self.momentum, self.domain = eps, momentum, SOURCE
+        self.ordinary = ordinary
         self.weight = nn.Parameter(torch.ones(channels))
         self.bias = nn.Parameter(torch.zeros(channels))
         self.register_buffer("running_mean", torch.zeros(2, channels))
@@ -89,13 +97,32 @@ def per_domain_norms(module: nn.Module) -> nn.Module:
     if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
         if not (module.affine and module.track_running_stats and module.momentum is not None):
             raise ValueError("per_domain_norms: needs affine norms with running averages")
-        norm = DomainBatchNorm(module.num_features, module.eps, module.momentum)
+        norm = DomainBatchNorm(module.num_features, module.eps, module.momentum, type(module))
         with torch.no_grad():
             for name in ("weight", "bias", "running_mean", "running_var"):
                 getattr(norm, name).copy_(getattr(module, name))
         return norm.to(module.weight.device)
     for name, child in module.named_children():
         setattr(module, name, per_domain_norms(child))
+    return module
+
+
+def ordinary_norms(module: nn.Module, domain: int = TARGET) -> nn.Module:
+    """The inverse of `per_domain_norms`: every DomainBatchNorm becomes an ordinary one with the
+    statistics of one domain, so that the module needs nothing of this file any more.
+
+    Changes the module it is given (unless that is a DomainBatchNorm itself) and returns it.
+    """
+    if isinstance(module, DomainBatchNorm):
+        norm = module.ordinary(len(module.weight), module.eps, module.momentum)
+        with torch.no_grad():
+            norm.weight.copy_(module.weight)
+            norm.bias.copy_(module.bias)
+            norm.running_mean.copy_(module.running_mean[domain])
+            norm.running_var.copy_(module.running_var[domain])
+        return norm.to(module.weight.device).train(module.training)
+    for name, child in module.named_children():
+        setattr(module, name, ordinary_norms(child, domain))
     return module
 
 
@@ -157,6 +184,14 @@ def _small_cnn(feature_dim: int) -> nn.Module:
     )  # fmt: skip
 
 
+def domain_loss(source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Binary cross-entropy of the domain classifier's logits (B,) of either domain's images, both
+    domains counting alike."""
+    ours = F.binary_cross_entropy_with_logits(source, torch.zeros_like(source))
+    theirs = F.binary_cross_entropy_with_logits(target, torch.ones_like(target))
+    return (ours + theirs) / 2
+
+
 # --- Training ---------------------------------------------------------------------------------
 
 
@@ -192,7 +227,8 @@ class Check:
     """A look at the network during training, without one target label.
 
     source_score: of the held-out source. information: nats, see `mutual_information`, of the
-    held-out target. domain_accuracy: of the domain classifier on what is held out; 0.5 is chance.
+    held-out target. domain_accuracy: of the domain classifier, on what is held out (or on batches,
+    where a training says so); 0.5 is chance.
     """
 
     step: int
@@ -263,7 +299,7 @@ def train_domain_adaptation(
             theirs = model(target[chosen_t], TARGET, weight)
         loss = task_loss(ours.task, labels[chosen_s])
         if settings.adversarial:
-            loss = loss + (_domain_loss(ours.domain, 0.0) + _domain_loss(theirs.domain, 1.0)) / 2
+            loss = loss + domain_loss(ours.domain, theirs.domain)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -329,10 +365,6 @@ def _look(model, step, images, labels, target, score) -> Check:
 
 def _accuracy(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
     return (logits.argmax(1) == labels).double().mean()
-
-
-def _domain_loss(logits: torch.Tensor, domain: float) -> torch.Tensor:
-    return F.binary_cross_entropy_with_logits(logits, torch.full_like(logits, domain))
 
 
 def _split(

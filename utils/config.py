@@ -30,6 +30,7 @@ from utils.config_errors import (
 )
 from utils.config_ranges import RandomizationConfig
 from utils.config_schema import (
+    AdaptationConfig,
     CameraConfig,
     Config,
     EnvConfig,
@@ -52,6 +53,7 @@ from utils.errors import UserError, did_you_mean
 __all__ = [
     "DEFAULTS",
     "OBJECT_SETS",
+    "AdaptationConfig",
     "CameraConfig",
     "Config",
     "ConfigError",

@@ -249,6 +249,12 @@ class TrainConfig(Section):
     name: Name | None
 
 
+class AdaptationConfig(Section):
+    target: Annotated[Path, Field(strict=False)] | None
+    weight: Annotated[float, Field(ge=0)]
+    held_out: Annotated[float, Field(gt=0, lt=1)]
+
+
 class EnvConfig(Section):
     observations: Annotated[
         tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(no_repeats)
@@ -375,6 +381,7 @@ class Config(Section):
     grasp: GraspConfig
     data: DataConfig
     train: TrainConfig
+    adaptation: AdaptationConfig
     evaluate: EvaluateConfig
     transfer: TransferConfig
     env: EnvConfig

@@ -112,11 +112,11 @@ class CornellDataset(RealDataset):
     SUFFIXES = ("r.png", "d.tiff", "cpos.txt", "cneg.txt")
 
     def __init__(self, root: str | Path) -> None:
-        root = _existing_folder(root)
-        files = _group_files(root, r"pcd(\d{4})(r\.png|d\.tiff|cpos\.txt|cneg\.txt)")
+        root = existing_folder(root)
+        files = group_files(root, r"pcd(\d{4})(r\.png|d\.tiff|cpos\.txt|cneg\.txt)")
         if not files:
             raise UserError(f"{root}: no Cornell files pcdNNNNr.png found here or in subfolders")
-        _check_complete(root, files, self.SUFFIXES, "pcd", CORNELL_HINT)
+        check_complete(root, files, self.SUFFIXES, "pcd", CORNELL_HINT)
         objects = _cornell_objects(root, [int(name) for name in files])
         super().__init__(
             root, [Record(f"pcd{n}", objects[int(n)], f) for n, f in sorted(files.items())]
@@ -127,7 +127,7 @@ class CornellDataset(RealDataset):
         negatives, also_skipped = _read_cornell_rectangles(record.files["cneg.txt"])
         if not positives:
             raise UserError(f"{record.files['cpos.txt']}: holds no complete rectangle")
-        rgb, depth = _read_rgbd(record.files["r.png"], record.files["d.tiff"])
+        rgb, depth = read_rgbd(record.files["r.png"], record.files["d.tiff"])
         return RealSample(
             record.name, record.object_id, rgb, depth, positives, negatives,
             skipped=skipped + also_skipped,
@@ -144,21 +144,21 @@ class JacquardDataset(RealDataset):
     def __init__(self, root: str | Path, depth: str = "perfect") -> None:
         if depth not in ("perfect", "stereo"):
             raise unknown_choice("data.depth", depth, ("perfect", "stereo"))
-        root = _existing_folder(root)
+        root = existing_folder(root)
         self.depth_file = f"_{depth}_depth.tiff"
-        files = _group_files(
+        files = group_files(
             root, r"(.+?)(_RGB\.png|_(?:perfect|stereo)_depth\.tiff|_grasps\.txt|_mask\.png)"
         )
         if not files:
             raise UserError(f"{root}: no Jacquard files <id>_RGB.png found here or in subfolders")
-        _check_complete(root, files, ("_RGB.png", self.depth_file, "_grasps.txt", "_mask.png"))
+        check_complete(root, files, ("_RGB.png", self.depth_file, "_grasps.txt", "_mask.png"))
         super().__init__(
             root, [Record(n, n.split("_", 1)[-1], f) for n, f in sorted(files.items())]
         )
 
     def read(self, record: Record) -> RealSample:
         positives = _read_jacquard_rectangles(record.files["_grasps.txt"])
-        rgb, depth = _read_rgbd(record.files["_RGB.png"], record.files[self.depth_file])
+        rgb, depth = read_rgbd(record.files["_RGB.png"], record.files[self.depth_file])
         mask_file = record.files["_mask.png"]
         mask = np.asarray(open_image(mask_file).convert("L")) > 0
         if mask.shape != depth.shape:
@@ -202,7 +202,7 @@ def fill_depth_holes(depth: np.ndarray) -> np.ndarray:
     return depth[rows, columns]
 
 
-def _read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) uint8 and (H, W) float32 metres without holes."""
     rgb = np.array(open_image(rgb_file).convert("RGB"))
     depth = np.asarray(open_image(depth_file))
@@ -281,14 +281,15 @@ def _size(image: np.ndarray) -> str:
 # Finding files and objects
 
 
-def _existing_folder(root: str | Path) -> Path:
+def existing_folder(root: str | Path, key: str = "data.root") -> Path:
+    """The folder that a config key names; UserError if there is none."""
     root = Path(root).expanduser()
     if not root.is_dir():
-        raise UserError(f"data.root: no folder {root}")
+        raise UserError(f"{key}: no folder {root}")
     return root
 
 
-def _group_files(root: Path, pattern: str) -> dict[str, dict[str, Path]]:
+def group_files(root: Path, pattern: str) -> dict[str, dict[str, Path]]:
     """Files under root whose whole name fits (name)(suffix), as {name: {suffix: path}}."""
     groups: dict[str, dict[str, Path]] = {}
     for path in root.rglob("*"):
@@ -302,13 +303,14 @@ def _group_files(root: Path, pattern: str) -> dict[str, dict[str, Path]]:
     return groups
 
 
-def _check_complete(
+def check_complete(
     root: Path,
     groups: dict[str, dict[str, Path]],
     suffixes: Sequence[str],
     prefix: str = "",
     hint: str = "",
 ) -> None:
+    """Raise UserError that names files of `group_files` which some name lacks."""
     missing = [
         f"{prefix}{name}{suffix}"
         for name in sorted(groups)

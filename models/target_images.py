@@ -1,0 +1,189 @@
+"""Unlabelled photographs as what GraspNet is adapted to: examples, and the choice of a checkpoint.
+
+No label of theirs is read anywhere. Every example is a pure function of (seed, epoch, index), as in
+`models.grasp_examples`, so that a run can be resumed exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from models.grasp_examples import LabelledImages
+from models.graspnet import DEPTH_UNIT, GraspNet, to_input
+from models.graspnet_adaptation import Pair
+from models.graspnet_scores import predict
+from models.photographs import frame_of, from_above
+from models.real_training_data import IN_MEMORY, Chosen
+from models.rectangle_examples import RectangleImages, View
+from models.training_data import TrainingData
+from utils.adaptation import SOURCE, TARGET, Check, choose_check, mutual_information, select_domain
+from utils.augmentation import Augmentation, ColourJitter
+from utils.config import Config
+from utils.errors import UserError
+from utils.real_data import RealSample
+from utils.unlabelled_images import KEY, UnlabelledImages
+
+# Of a photograph, what simulated training images are changed by, too: no change tells the domain.
+AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
+STANDS_OUT = (0.01, 0.15)  # m above the table: what a crop is laid around, as on simulated images
+MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
+INFORMATION_STEP = 4  # pixels between those whose predictions are asked; neighbours say the same
+
+
+def open_target(config: Config) -> Sequence[RealSample] | None:
+    """The images of `adaptation.target`, or None where nothing is adapted.
+
+    Raises UserError for data that cannot be adapted from, and for a folder that cannot be used.
+    """
+    folder = config.adaptation.target
+    if folder is None:
+        return None
+    if config.data.kind != "simulated":
+        raise UserError(
+            f"{KEY}={folder}: data.kind is {config.data.kind}, but adaptation is from simulated "
+            "images; use data.kind=simulated, or leave adaptation.target out"
+        )
+    return UnlabelledImages(folder)
+
+
+class FromAbove(Sequence[RealSample]):
+    """Photographs as a network sees them that learns at so many `metres_per_pixel`: from above."""
+
+    def __init__(self, samples: Sequence[RealSample], metres_per_pixel: float):
+        self.samples, self.metres_per_pixel = samples, metres_per_pixel
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> RealSample:
+        sample = self.samples[index]
+        view = from_above(frame_of(sample), self.metres_per_pixel)
+        return replace(sample, rgb=view.rgb, depth=view.depth)
+
+
+def split_target(
+    samples: Sequence[RealSample], share: float, seed: int
+) -> tuple[list[int], list[int]]:
+    """Numbers of the images to learn from, and of those held out to choose a checkpoint."""
+    order = np.random.default_rng(seed).permutation(len(samples)).tolist()
+    count = min(max(round(share * len(order)), 1), len(order) - 1)
+    return sorted(order[count:]), sorted(order[:count])
+
+
+class TargetPairs(Dataset):
+    """Labelled examples, each with a crop of a random photograph, changed at random.
+
+    source: a data set of `Example`s by (epoch, index). view: how the photographs are seen, at the
+    source's scale. Crops are as large as the source's, around something that stands on the table.
+    """
+
+    def __init__(
+        self, source: Dataset, samples: Sequence[RealSample], view: View, seed: int
+    ):  # fmt: skip
+        self.source, self.samples, self.view, self.seed = source, samples, view, seed
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, place: tuple[int, int]) -> Pair:
+        source = self.source[place]
+        rng = np.random.default_rng([self.seed, *place, TARGET])
+        sample = self.samples[rng.integers(len(self.samples))]
+        shape = (self.view.size, self.view.size)
+        rgb, depth, _ = self.view.warp(sample, AUGMENTATION.draw(rng, shape).matrix(shape))
+        rgb = AUGMENTATION.colour(torch.from_numpy(np.moveaxis(rgb, -1, 0).copy()), rng)
+        x = to_input(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), depth)
+        height, width = source.image.shape[1:]
+        row, column = corner_around(x, (height, width), rng)
+        return Pair(source, x[:, row : row + height, column : column + width].contiguous())
+
+
+def corner_around(
+    x: torch.Tensor, size: tuple[int, int], rng: np.random.Generator
+) -> tuple[int, int]:
+    """Row and column at which a crop of `size` starts: around a random pixel of an input x (4, H,
+    W) that is in its `MIDDLE` and `STANDS_OUT` metres above the table; anywhere if none is."""
+    height = -DEPTH_UNIT * x[3].numpy()
+    size, shape = np.array(size), np.array(height.shape)
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    out = np.hypot(rows - shape[0] / 2, columns - shape[1] / 2)
+    low, high = STANDS_OUT
+    pixels = np.argwhere((height > low) & (height < high) & (out < MIDDLE * shape.min()))
+    middle = pixels[rng.integers(len(pixels))] if len(pixels) else rng.integers(shape)
+    corner = middle - size // 2 + rng.integers(-(size // 4), size // 4 + 1)
+    row, column = np.clip(corner, 0, np.maximum(shape - size, 0))
+    return int(row), int(column)
+
+
+# --- Choosing without labels -----------------------------------------------------------------
+
+
+def grasp_information(model: GraspNet, images: LabelledImages) -> float:
+    """Nats that a place in an image tells of what the network says there: nothing to grasp, or a
+    grasp in one of its K bins. 0 .. log(1 + K), see `utils.adaptation.mutual_information`. Of the
+    square `MIDDLE` around the centre; labels are not looked at. The model ends in evaluation mode.
+    """
+    model.eval()
+    said = []
+    for index in range(len(images)):
+        quality, angle, _ = predict(model, images[index])
+        rows, columns = (
+            slice(round((0.5 - MIDDLE) * n), round((0.5 + MIDDLE) * n), INFORMATION_STEP)
+            for n in quality.shape[2:]
+        )
+        quality, angle = (maps[..., rows, columns].double() for maps in (quality, angle))
+        said.append(torch.cat([1 - quality, quality * angle.softmax(dim=1)], dim=1))
+    p = torch.cat(said).clamp_min(torch.finfo(torch.double).tiny)
+    return mutual_information(p.log())
+
+
+@dataclass(frozen=True)
+class AdaptationData(TrainingData):
+    """TrainingData whose `train` gives `Pair`s and whose `score` has an entry `information`.
+
+    target: the photographs that are held out.
+    """
+
+    target: LabelledImages
+
+    keeps_every_epoch = True  # a later epoch can make an earlier one the choice
+
+    def chosen(self, history: Sequence[dict[str, float]]) -> dict[str, float]:
+        """The row of the most information on the target, among those that do nearly as well as the
+        best on labelled images: `utils.adaptation.choose_check`."""
+        checks = [
+            Check(row["epoch"], row[self.chosen_by], row["information"], row["domain_accuracy"])
+            for row in history
+        ]
+        return history[checks.index(choose_check(checks))]
+
+    def pictured(self) -> dict[str, LabelledImages]:
+        return super().pictured() | {"target": self.target}
+
+
+def with_target(
+    config: Config, data: TrainingData, samples: Sequence[RealSample]
+) -> AdaptationData:
+    """Simulated data, paired with photographs of `open_target`."""
+    learnt, held_out = split_target(samples, config.adaptation.held_out, config.seed)
+    samples = FromAbove(samples, data.metres_per_pixel)
+    side = samples[0].depth.shape[0]
+    view = View(side, side, data.metres_per_pixel)
+    if len(samples) <= IN_MEMORY:
+        samples = list(samples)
+    target = RectangleImages(Chosen(samples, held_out), view)
+
+    def score(model: GraspNet) -> dict[str, float]:
+        select_domain(model, SOURCE)
+        scores = data.score(model)
+        select_domain(model, TARGET)
+        return scores | {"information": grasp_information(model, target)}
+
+    same = {field.name: getattr(data, field.name) for field in fields(TrainingData)}
+    pairs = TargetPairs(data.train, Chosen(samples, learnt), view, config.seed)
+    return AdaptationData(**same | {"train": pairs, "score": score}, target=target)
