@@ -33,6 +33,18 @@ def test_the_policy_of_the_box_lifts_it(box):
     assert sum(reason == "success" for reason, _ in ends) >= 9
 
 
+def test_the_policy_of_random_urdfs_lifts_what_it_has_never_seen():
+    """176 of 200 in docs/ppo.md: fewer than 6 of 10 would be chance once in a thousand times."""
+    path = CHECKPOINTS / "ppo_random_urdfs.pt"
+    config = config_of(path, ["sim.renderer=tiny", "objects.split=test"])
+    assert config.env.objects == "random_urdfs"
+    policy = load_policy(path)
+    told = {part.key for part in (*policy.layout.images, *policy.layout.state)}
+    assert told == {"rgb", "depth", "end_effector_position", "gripper", "squeeze"}
+    ends = run_episodes(policy, config, 10)
+    assert sum(reason == "success" for reason, _ in ends) >= 6
+
+
 def test_it_is_not_told_where_the_box_is(box):
     policy = load_policy(box)
     assert {part.key for part in policy.layout.images} == {"rgb", "depth"}
