@@ -33,11 +33,12 @@ def test_the_policy_of_the_box_lifts_it(box):
     assert sum(reason == "success" for reason, _ in ends) >= 9
 
 
-def test_the_policy_of_random_urdfs_lifts_what_it_has_never_seen():
-    """176 of 200 in docs/ppo.md: fewer than 6 of 10 would be chance once in a thousand times."""
-    path = CHECKPOINTS / "ppo_random_urdfs.pt"
+@pytest.mark.parametrize("objects", ["random_urdfs", "primitives"])
+def test_policies_lift_what_they_have_never_seen(objects):
+    """176 and 171 of 200 in docs/ppo.md: fewer than 6 of 10 would be chance once in a hundred."""
+    path = CHECKPOINTS / f"ppo_{objects}.pt"
     config = config_of(path, ["sim.renderer=tiny", "objects.split=test"])
-    assert config.env.objects == "random_urdfs"
+    assert config.env.objects == objects
     policy = load_policy(path)
     told = {part.key for part in (*policy.layout.images, *policy.layout.state)}
     assert told == {"rgb", "depth", "end_effector_position", "gripper", "squeeze"}
