@@ -47,7 +47,7 @@ from envs.cell import camera_intrinsics
 from envs.data_generation import generate
 from models.grasp_examples import EpochBatches
 from models.graspnet import GraspNet, create_model
-from models.graspnet_adaptation import AdaptingTrainer
+from models.graspnet_adaptation import AdaptingTrainer, check_alone
 from models.graspnet_io import load_graspnet, load_initial, save_graspnet
 from models.graspnet_pictures import draw_curves, draw_predictions
 from models.graspnet_scores import check_graspable
@@ -85,6 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with team(config.train.device, dict(os.environ)) as us:
         if config.data.kind != "simulated":
             return cross_validate(config, options.resume, options.weights, us)
+        if photographs is not None:
+            check_alone(us)  # before work is put into the data
         data = make_data(config, us)
         if photographs is not None:
             data = with_target(config, data, photographs)

@@ -6,7 +6,8 @@
 
 Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
 rl.films=N, films of N episodes in runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on
-from last.pt, bit for bit on the same device and number of processes.
+from last.pt, bit for bit on the same device and number of processes. The first is written after the
+looks (rl.looks); until then Ctrl-C ends all.
 
 No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
 all environments begin new episodes from seeds that follow from the run's seed and the number of
@@ -68,7 +69,7 @@ FREE_TO_CHANGE = (
     "target_success",
     "target_return",
 )
-# Purposes of seeds, which never share any; 3 is that of benchmarks.bench_policy.
+# Purposes of seeds, which never share any; 3 is FRESH of benchmarks.bench_policy.
 TRAINING, EVALUATION, LEARNING, LOOKING = 0, 1, 2, 4
 LOOKS = 32  # of an environment, before they are learned from: two scenes
 
@@ -180,10 +181,10 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
     per_update, total = settings.envs * settings.rollout_steps, updates(config)
     step = ppo.updates * per_update
     writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.leads else None
-    if config.rl.looks and not history:
-        learn_to_see(config, envs, ppo, watch, writer)
-    bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
     try:
+        if config.rl.looks and not history:
+            learn_to_see(config, envs, ppo, watch, writer)
+        bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
         with stop_on_interrupt() as interrupted, bar:
             while True:
                 if ppo.updates % settings.evaluate_every == 0 or ppo.updates == total:
@@ -243,6 +244,7 @@ def learn_to_see(
         for chunk in range(chunks):
             with watch(SIMULATION):
                 looks = collect_looks(envs, ppo.layout, LOOKS, seeds)
+                looks = looks.map(lambda part: part.to(us.device))
             with watch(NETWORK):
                 ppo.network.observe(looks, us)
                 new = ppo.estimate_loss(looks)  # before it learns from them
@@ -251,7 +253,8 @@ def learn_to_see(
             bar.update(settings.envs * LOOKS)
             bar.set_postfix(loss=f"{new:.3g}")
             if us.leads:
-                log(writer, (chunk + 1) * settings.envs * LOOKS, "looks", {"loss": new})
+                # Before step 0, so that resuming leaves them where they are.
+                log(writer, (chunk + 1 - chunks) * settings.envs * LOOKS, "looks", {"loss": new})
     ppo.memory.clear()
 
 

@@ -24,7 +24,7 @@ from utils.checkpoint import load_checkpoint
 from utils.config import Config, load_config, run_script
 from utils.statistics import wilson_interval
 
-FRESH = 3  # after train_rl.py's purposes of seeds: training, evaluation, learning
+FRESH = 3  # none of train_rl.py's purposes of seeds
 
 
 def main(argv: Sequence[str] | None = None) -> None:

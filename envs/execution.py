@@ -134,7 +134,7 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = float(cell.robot.tip_pose()[2, 3])
-    detail += _go_home(cell)
+    detail = "; ".join(filter(None, [detail, _go_home(cell)]))
     cell.check_physics()
     cell.retire_lost_objects()
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at)
@@ -218,7 +218,7 @@ def _go_home(cell: BaseCell) -> str:
     except (UnreachableError, ArmStoppedError):
         # Stretched right at the edge of the workspace it could bend its elbow only by leaving it.
         robot.place(cell.home)
-        return "; no way home within the workspace, it was put there by hand"
+        return "no way home within the workspace, it was put there by hand"
     return ""
 
 

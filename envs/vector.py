@@ -101,16 +101,23 @@ class VectorEnvs:
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:
         """Episodes begun in here are as hard as the task, whatever makes training easier."""
-        self._options = {"start": "home"} if self._own else {}
-        yield
-        self._options = {}
+        with self._begun_with({"start": "home"}):
+            yield
 
     @contextmanager
     def looking(self) -> Iterator[None]:
         """Episodes begun in here, which are not played, begin anywhere that one may lead to."""
-        self._options = {"start": "look"} if self._own else {}
-        yield
-        self._options = {}
+        with self._begun_with({"start": "look"}):
+            yield
+
+    @contextmanager
+    def _begun_with(self, options: dict[str, Any]) -> Iterator[None]:
+        """Options of the cell's resets; other environments know none of them."""
+        self._options = options if self._own else {}
+        try:
+            yield
+        finally:
+            self._options = {}
 
     @property
     def processes(self) -> list[multiprocessing.Process]:

@@ -75,6 +75,15 @@ def domain_classifier(channels: int) -> nn.Module:
     )  # fmt: skip
 
 
+def check_alone(team: Team) -> None:
+    """Raise UserError for more than one process."""
+    if team.ranks > 1:
+        raise UserError(
+            f"adaptation.target: got {team.ranks} processes, but only one can adapt a network; "
+            "start train_graspnet.py without torchrun"
+        )
+
+
 class AdaptingTrainer(Trainer):
     """A Trainer that takes batches of `Pair`.
 
@@ -86,11 +95,7 @@ class AdaptingTrainer(Trainer):
         self, model: GraspNet, settings: TrainConfig, total_steps: int, team: Team,
         adaptation: AdaptationConfig,
     ):  # fmt: skip
-        if team.ranks > 1:
-            raise UserError(
-                f"adaptation.target: got {team.ranks} processes, but only one can adapt a network; "
-                "start train_graspnet.py without torchrun"
-            )
+        check_alone(team)
         network = DomainAdaptationNetwork(
             feature_extractor=Features(model), task_head=Heads(model),
             domain_classifier=domain_classifier(model.backbone.out_channels),

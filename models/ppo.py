@@ -180,7 +180,7 @@ class GraspPPO:
         """What the estimates for observations (B, ...) are worth now."""
         size, losses = self.settings.batch_size, []
         for start in range(0, len(seen.state), size):
-            part = seen.rows(slice(start, start + size)).map(lambda p: p.to(self.team.device))
+            part = seen.rows(slice(start, start + size))
             losses.append(self.network.estimate_loss(part.image(), part.state, part.privileged))
         return gather(self.team, torch.stack(losses).mean()).mean().item()
 

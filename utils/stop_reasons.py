@@ -42,7 +42,7 @@ def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
     for record in rounds:
         cell = kinds.setdefault((record.policy, record.scenario, record.objects), {})
         for attempt in record.attempts:
-            if attempt.detail:
+            if attempt.detail and not attempt.success:
                 kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
                 cell.setdefault(kind, []).append((attempt.detail, record.seed, attempt.held))
     return [

@@ -27,7 +27,8 @@ FEWEST = 5  # images: some are held out, and statistics of one or two mean nothi
 
 
 class UnlabelledImages(RealDataset):
-    """Pairs `NAMEr.png` (colour) and `NAMEd.tiff` (depth, float32 metres) in any subfolder.
+    """Pairs `NAMEr.png` (colour) and `NAMEd.tiff` (float32, metres from the robot's base as
+    Cornell's are, see `utils.table_camera`) in any subfolder.
 
     Cornell's names `pcdNNNNr.png` are such names. Raises UserError, when it is opened, if there is
     no such folder, if a file of a pair is missing, if there are fewer than `FEWEST` images, or
