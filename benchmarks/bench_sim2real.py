@@ -37,7 +37,9 @@ RESETS = 10
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each pair of digit sets")
-    parser.add_argument("--steps", type=int, default=400, help="of each training")
+    parser.add_argument(
+        "--steps", type=int, default=AdaptationSettings.steps, help="of each training"
+    )
     parser.add_argument("--parts", default="speed,digits", help="any of speed,digits")
     parser.add_argument("--pairs", nargs="+", default=PAIRS, help="SOURCE:TARGET of the digits")
     options = parser.parse_args(argv)
