@@ -65,10 +65,9 @@ from models.target_images import open_target, with_target
 from models.training_data import TrainingData, simulated_data
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
-from utils.files import write_atomic
+from utils.files import write_atomic, write_json_atomic
 from utils.grasp_data import read_trials
 from utils.label_trials import label_truth
-from utils.results import write_json_atomic
 from utils.runs import check_writable, git_state, new_run_folder
 
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch

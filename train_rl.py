@@ -56,7 +56,7 @@ from train_graspnet import stop_on_interrupt
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
-from utils.results import write_json_atomic
+from utils.files import write_json_atomic
 from utils.runs import git_state, new_run_folder
 from utils.stopwatch import Stopwatch
 

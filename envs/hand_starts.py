@@ -23,11 +23,13 @@ _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
 
 
-def near(T_home: np.ndarray, object_place: np.ndarray, top: float, random) -> np.ndarray:
+def near(
+    T_home: np.ndarray, object_place: np.ndarray, top: float, random: np.random.Generator
+) -> np.ndarray:
     """(4, 4) a little over an object, and turned a little from how the hand is at home.
 
     T_home: (4, 4) the hand at home. object_place: (2,) x, y of the object and top: its highest
-    point, in W, m. random: a NumPy Generator.
+    point, in W, m.
     """
     side = random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
     height = top + random.uniform(*_NEAR_HEIGHT)
@@ -35,7 +37,11 @@ def near(T_home: np.ndarray, object_place: np.ndarray, top: float, random) -> np
 
 
 def look(
-    T_home: np.ndarray, object_place: np.ndarray, top: float, grasp: Grasp | None, random
+    T_home: np.ndarray,
+    object_place: np.ndarray,
+    top: float,
+    grasp: Grasp | None,
+    random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
     """A place to look at an object from, (4, 4), with the opening of the hand and the one that is
     commanded, in metres: wherever an episode may lead, from high above to right around a grasp.

@@ -7,7 +7,7 @@ besides. This module knows the data sets' cameras; not how the files are read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,17 +54,19 @@ AUGMENTATION = Augmentation(
 )
 
 
-class Levelled(Sequence[RealSample]):
-    """The samples with the table's slope taken out of their depth, as a view sees it."""
+class Changed(Sequence[RealSample]):
+    """The samples of a data set, each changed by a function whenever it is asked for."""
 
-    def __init__(self, samples: Sequence[RealSample], view: View):
-        self.samples, self.view = samples, view
+    def __init__(
+        self, samples: Sequence[RealSample], change: Callable[[RealSample], RealSample]
+    ):  # fmt: skip
+        self.samples, self.change = samples, change
 
     def __len__(self) -> int:
         return len(self.samples)
 
     def __getitem__(self, index: int) -> RealSample:
-        return self.view.levelled(self.samples[index])
+        return self.change(self.samples[index])
 
 
 class Chosen(Sequence[RealSample]):
@@ -110,7 +112,7 @@ def real_folds(config: Config) -> list[Fold]:
     splits = folds_of(dataset.object_ids, settings.split, settings.folds, config.seed)
     numbers = range(settings.folds) if settings.fold is None else [settings.fold]
     view = VIEWS[settings.kind]
-    samples = Levelled(dataset, view) if view.slanted else dataset
+    samples = Changed(dataset, view.levelled) if view.slanted else dataset
     samples = list(samples) if len(dataset) <= IN_MEMORY else samples
     return [_fold(config, number, splits[number], samples, dataset.names) for number in numbers]
 

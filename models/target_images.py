@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from models.graspnet import DEPTH_UNIT, GraspNet, to_input
 from models.graspnet_adaptation import Pair
 from models.graspnet_scores import predict
 from models.photographs import frame_of, from_above
-from models.real_training_data import IN_MEMORY, Chosen
+from models.real_training_data import IN_MEMORY, Changed, Chosen
 from models.rectangle_examples import RectangleImages, View
 from models.training_data import TrainingData
 from utils.adaptation import SOURCE, TARGET, Check, choose_check, mutual_information, select_domain
@@ -51,19 +52,10 @@ def open_target(config: Config) -> Sequence[RealSample] | None:
     return UnlabelledImages(folder)
 
 
-class FromAbove(Sequence[RealSample]):
-    """Photographs as a network sees them that learns at so many `metres_per_pixel`: from above."""
-
-    def __init__(self, samples: Sequence[RealSample], metres_per_pixel: float):
-        self.samples, self.metres_per_pixel = samples, metres_per_pixel
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def __getitem__(self, index: int) -> RealSample:
-        sample = self.samples[index]
-        view = from_above(frame_of(sample), self.metres_per_pixel)
-        return replace(sample, rgb=view.rgb, depth=view.depth)
+def seen_from_above(sample: RealSample, metres_per_pixel: float) -> RealSample:
+    """A photograph as a network sees it that learns at so many metres per pixel."""
+    view = from_above(frame_of(sample), metres_per_pixel)
+    return replace(sample, rgb=view.rgb, depth=view.depth)
 
 
 def split_target(
@@ -171,7 +163,8 @@ def with_target(
 ) -> AdaptationData:
     """Simulated data, paired with photographs of `open_target`."""
     learnt, held_out = split_target(samples, config.adaptation.held_out, config.seed)
-    samples = FromAbove(samples, data.metres_per_pixel)
+    see = partial(seen_from_above, metres_per_pixel=data.metres_per_pixel)
+    samples = Changed(samples, see)
     side = samples[0].depth.shape[0]
     view = View(side, side, data.metres_per_pixel)
     if len(samples) <= IN_MEMORY:
