@@ -21,6 +21,7 @@ import argparse
 import functools
 import platform
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from envs.base_cell import BaseCell
@@ -232,6 +233,42 @@ def _film_name(task: Task, policy: str) -> str:
 # --- From one world to another --------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Contest:
+    """Rows of the report that are scored on the same scenes in one world, and how."""
+
+    world: str
+    scenes: str
+    rows: tuple[TransferPolicy, ...]
+    config: Config
+
+
+def contests(config: Config) -> list[Contest]:
+    """What there is to play for the transfer report; rows that are not trained are left out."""
+    trained = [who for who in config.transfer.policies if is_trained(who)]
+    found = []
+    for scenes in dict.fromkeys(who.scenes for who in trained):
+        rows = tuple(who for who in trained if who.scenes == scenes)
+        plan = {"policies": list(dict.fromkeys(who.planner for who in rows))}
+        if scenes is not None:
+            plan |= {"scenarios": [scenes[0]], "object_sets": [scenes[1]]}
+        here = with_settings(config, "evaluate", plan)
+        for world in config.transfer.worlds:
+            if world != PHOTOGRAPHS:
+                name = scenes_of(rows[0], config)
+                found.append(Contest(world, name, rows, in_world(here, world)))
+    return found
+
+
+def scenes_of(who: TransferPolicy, config: Config) -> str:
+    """What a row is scored on, in words: 'pile of random_urdfs'."""
+    plan = config.evaluate
+    scenarios, objects = plan.scenarios, plan.object_sets
+    if who.scenes is not None:
+        scenarios, objects = ([one] for one in who.scenes)
+    return f"{', '.join(scenarios)} of {', '.join(Path(name).name for name in objects)}"
+
+
 def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
     """The same policies on the same scenes in every world, and how well one foretells another."""
     worlds, policies = config.transfer.worlds, config.transfer.policies
@@ -240,43 +277,44 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
             "transfer.policies: the report compares open loops; leave evaluate.controllers null "
             "and grasp.controller open_loop"
         )
-    planners = list(dict.fromkeys(who.planner for who in policies if is_trained(who)))
-    config_of = {
-        world: with_settings(in_world(config, world), "evaluate", {"policies": planners})
-        for world in worlds
-        if world != PHOTOGRAPHS
-    }
-    for there in config_of.values():
-        check_policies(there)
-        check_cell(there)
+    to_play = contests(config)
+    for contest in to_play:
+        check_policies(contest.config)
+        check_cell(contest.config)
+        check_objects(contest.config)
     check_resume(config, resume)
     check_writable("--results", results)
-    check_objects(config)
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
     run = resume or new_run_folder("evaluate", config.evaluate.name, config)
 
-    scores: dict[str, dict[str, Score]] = {planner: {} for planner in planners}
+    scores: dict[TransferPolicy, dict[str, Score]] = {who: {} for who in policies}
     error, interrupted = None, False
-    for world, there in config_of.items():
-        (run / world).mkdir(exist_ok=True)
-        announce(there, run / world)
-        outcome = evaluate(there, run / world)
-        write_failures(run / world / "failures.png", outcome.gallery)
-        for planner in planners:
-            scores[planner][world] = score_of(outcome.rounds, planner)
+    for contest in to_play:
+        folder = run / contest.world / contest.scenes.replace(" ", "_")
+        folder.mkdir(parents=True, exist_ok=True)
+        announce(contest.config, folder)
+        outcome = evaluate(contest.config, folder)
+        write_failures(folder / "failures.png", outcome.gallery)
+        for who in contest.rows:
+            scores[who][contest.world] = score_of(outcome.rounds, who.planner)
         error, interrupted = outcome.error, outcome.interrupted
         if error is not None or interrupted:
             break
-    for planner in planners if samples and PHOTOGRAPHS in worlds else []:
-        if is_learned(planner) or not sees_photographs(planner, config.seed):
+    for who in policies if samples and PHOTOGRAPHS in worlds else []:
+        # A row with scenes of its own is there to be compared on these.
+        if who.scenes is not None or not is_trained(who) or is_learned(who.planner):
             continue
-        judged = judge_photographs(planner, samples, config.seed)
+        if not sees_photographs(who.planner, config.seed):
+            continue
+        judged = judge_photographs(who.planner, samples, config.seed)
         shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
-        scores[planner][PHOTOGRAPHS] = Score(sum(one.correct for _, one in shown), len(samples))
+        scores[who][PHOTOGRAPHS] = Score(sum(one.correct for _, one in shown), len(samples))
         if shown:
-            draw_rectangles(run / f"{Path(planner).stem}-{PHOTOGRAPHS}.png", *zip(*shown))
+            draw_rectangles(run / f"{Path(who.planner).stem}-{PHOTOGRAPHS}.png", *zip(*shown))
 
-    lines = [TransferLine(who, scores.get(who.planner, {}), is_trained(who)) for who in policies]
+    lines = [
+        TransferLine(who, scenes_of(who, config), scores[who], is_trained(who)) for who in policies
+    ]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
     complete = error is None and not interrupted
     content = {"schema": 1, "complete": complete, "commit": git_state().commit}

@@ -5,9 +5,9 @@
     torchrun --nproc_per_node=2 train_rl.py --config configs/ppo.yaml
 
 Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
-rl.films=N, films of N episodes in runs/train_rl/<time>/. Ctrl-C stops early; --resume RUN goes on
-from last.pt, bit for bit on the same device and number of processes. The first is written after the
-looks (rl.looks); until then Ctrl-C ends all.
+rl.films=N, films of N episodes in runs/train_rl/<time>/; --weights FILE is the best policy alone.
+Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit on the same device and number of
+processes. The first is written after the looks (rl.looks); until then Ctrl-C ends all.
 
 No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
 all environments begin new episodes from seeds that follow from the run's seed and the number of
@@ -21,6 +21,7 @@ import os
 # The processes that simulate need the cores while a thread waits for another one.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -37,7 +38,7 @@ from tqdm import tqdm
 
 from envs.films import film_episode
 from envs.vector import VectorEnvs, WorkerError, make_env, vector_envs
-from models.grasp_policy import GraspPPO, policy_for
+from models.grasp_policy import GraspPPO, load_policy, policy_for, save_policy
 from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
 from models.ppo import KIND
@@ -57,7 +58,7 @@ from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
 from utils.files import write_json_atomic
-from utils.runs import git_state, new_run_folder
+from utils.runs import check_writable, git_state, new_run_folder
 from utils.stopwatch import Stopwatch
 
 FREE_TO_CHANGE = (
@@ -71,11 +72,13 @@ FREE_TO_CHANGE = (
 )
 # Purposes of seeds, which never share any; 3 is FRESH of benchmarks.bench_policy.
 TRAINING, EVALUATION, LEARNING, LOOKING = 0, 1, 2, 4
+WEIGHTS_HELP = "also write the best policy here, once the training has reached its end"
 LOOKS = 32  # of an environment, before they are learned from: two scenes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    config, options = parse_args(argv, "Train a policy by PPO.")
+    config, options = parse_args(argv, "Train a policy by PPO.", _add_options)
+    check_writable("--weights", options.weights)
     check_resume(config, options.resume)
     with rl_team(config) as us, vector_envs(config, envs_of(config, us)) as envs:
         ppo = make_ppo(config, envs, us)
@@ -86,11 +89,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         finished = train(config, run, envs, ppo, history)
 
         if us.leads:
-            save_results(run, history)
+            # A policy that is half trained must not replace one that is not.
+            save_results(run, history, options.weights if finished else None)
             film(config, run, ppo)
             if not finished:
                 print(f"stopped; go on after {history[-1]['step']:,} steps with --resume {run}")
     return 0 if finished else 130
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS_HELP)
 
 
 def check_resume(config: Config, run: Path | None) -> None:
@@ -354,7 +362,9 @@ def shares_in_words(watch: Stopwatch) -> str:
     return f"{total:.0f} s: {shares.replace(SIMULATION, 'simulation and rendering')}"
 
 
-def save_results(run: Path, history: list[dict]) -> None:
+def save_results(run: Path, history: list[dict], weights: Path | None) -> None:
+    if weights is not None:
+        save_policy(weights, load_policy(run / "best.pt"))
     best = max(history, key=score)
     results = {"schema": 1, "commit": git_state().commit, "best": best, "history": history}
     write_json_atomic(run / "results.json", results)

@@ -20,7 +20,7 @@ from torch import nn
 from models.normalisers import ObservationNormaliser
 from models.observations import ObservationLayout, Observations
 from models.ppo import KIND, GraspPPO
-from utils.checkpoint import load_checkpoint, load_weights
+from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import RLConfig
 from utils.errors import UserError
 
@@ -31,6 +31,7 @@ __all__ = [
     "SavedPolicy",
     "load_policy",
     "policy_for",
+    "save_policy",
 ]
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
@@ -354,3 +355,15 @@ def load_policy(path: Path | str) -> SavedPolicy:
     extra = checkpoint["extra"]
     layout = ObservationLayout.from_plain(extra["layout"])
     return SavedPolicy(network.eval(), layout, extra, checkpoint["config"])
+
+
+def save_policy(path: Path | str, policy: SavedPolicy) -> None:
+    """Write what `load_policy` reads, without what a training needs to go on."""
+    save_checkpoint(
+        path,
+        kind=KIND,
+        model_args=policy.network.model_args,
+        model=policy.network,
+        config=policy.config,
+        extra={key: policy.extra[key] for key in ("layout", "history") if key in policy.extra},
+    )

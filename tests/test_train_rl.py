@@ -99,6 +99,19 @@ def test_the_evaluation_of_the_best_policy_can_be_repeated(finished):
     assert np.mean(totals) == pytest.approx(results["best"]["return"], rel=1e-5)
 
 
+def test_the_best_policy_alone_acts_as_in_its_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert train_rl.main([*POINT, "rl.total_steps=64", "--weights", "alone.pt"]) == 0
+    (run,) = Path("runs/train_rl").iterdir()
+    alone, best = load_policy("alone.pt"), load_policy(run / "best.pt")
+    seen, _ = make_env(load_config(None, POINT)).reset(seed=0)
+    assert alone(seen).tolist() == best(seen).tolist()
+    assert alone.config == best.config
+    assert Path("alone.pt").stat().st_size < (run / "best.pt").stat().st_size
+    with pytest.raises(UserError, match="existing folder"):
+        train_rl.main([*POINT, "--weights", "nowhere/alone.pt"])
+
+
 def test_evaluations_are_at_full_difficulty():
     seen = "rl.policy_observations=[state,end_effector_position]"
     settings = ["rl.parallel=false", "env.near_share=1", "env.observations=[state]", seen]

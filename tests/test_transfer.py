@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from utils.config import TransferPolicy, load_config
+from utils.config import Config, TransferPolicy, load_config
 from utils.round_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
 from utils.transfer import (
@@ -88,14 +88,14 @@ def lines():
     """Three policies in two worlds, a network on photographs, and one that is not trained."""
 
     def line(name, training, **scores):
-        return TransferLine(TransferPolicy(name, training, name, None), scores)
+        return TransferLine(TransferPolicy(name, training, name, None, None), "pile", scores)
 
-    missing = TransferPolicy("net", "physics", "runs/none.pt", "python train.py --weights x")
+    missing = TransferPolicy("net", "physics", "runs/none.pt", None, "python train.py --weights x")
     return [
         line("blind", "-", pybullet=Score(20, 100), mujoco=Score(10, 100)),
         line("good", "-", pybullet=Score(80, 100), mujoco=Score(90, 100)),
         line("net", "vision", pybullet=Score(90, 100), mujoco=Score(85, 100), cornell=Score(4, 8)),
-        TransferLine(missing, {}, trained=False),
+        TransferLine(missing, "pile", {}, trained=False),
     ]
 
 
@@ -105,6 +105,23 @@ def test_worlds_agree_as_far_as_they_do(lines):
     assert one.pearson_r == pytest.approx(np.corrcoef([20, 80, 90], [10, 90, 85])[0, 1])
     # "good" and "net" change places; in MuJoCo they differ by 0.05.
     assert one.mmrv == pytest.approx((0 + 0.05 + 0.05) / 3)
+
+
+def test_policies_are_compared_on_the_same_scenes_alone(lines):
+    """One more policy, on other scenes, has nobody to be compared with; two more have."""
+
+    def boxes(name, *rates):
+        scores = {world: Score(n, 100) for world, n in zip(("pybullet", "mujoco"), rates)}
+        who = TransferPolicy(name, "-", name, ("isolated", "box"), None)
+        return TransferLine(who, "isolated of box", scores)
+
+    with_one = [*lines, boxes("a", 100, 0)]
+    assert agreements(with_one) == agreements(lines)
+    piles, alone = agreements([*with_one, boxes("b", 50, 50)])
+    assert piles == agreements(lines)[0]
+    assert (alone.scenes, alone.policies) == ("isolated of box", 2)
+    assert alone.pearson_r == pytest.approx(-1.0)
+    assert alone.mmrv == pytest.approx(0.5)  # the two, 0.5 apart, change places
 
 
 def test_the_table_says_what_is_missing(lines):
@@ -128,21 +145,38 @@ def test_results_and_picture(lines):
 
 def test_the_shipped_report_is_a_config():
     transfer = load_config(REPORT).transfer
-    oracle = "oracle (sees the true scene)"
-    policies = {who.policy for who in transfer.policies}
-    assert policies == {"random", "heuristic", oracle, "GraspNet (shipped)", "GraspNet"}
-    rows = [who for who in transfer.policies if who.policy == "GraspNet"]
+    small = [who for who in transfer.policies if who.policy == "GraspNet, 800 images"]
     parts = ["none", "physics", "vision", "both", "both for longer", "both + adaptation"]
-    assert [who.training for who in rows] == parts
-    for who in rows:  # the commands can be read, and are of one budget
-        words = shlex.split(who.train_with)
-        assert words[:2] == ["python", "train_graspnet.py"] and words[-1] == who.planner
-        config = load_config(REPOSITORY / words[3], [word for word in words[4:-2] if "=" in word])
-        assert (config.data.frames, config.train.backbone) == (800, "tutorial_skip")
-        physics = who.training == "physics" or who.training.startswith("both")
-        assert config.data.randomise_physics == physics
-        assert config.data.randomise == (who.training not in ("none", "physics"))
+    assert [who.training for who in small] == parts
+    for who in small:  # the commands are of one budget
+        assert config_of(who).data.frames == 800
+    learned = [who for who in transfer.policies if who.policy == "PPO"]
+    assert [who.training for who in learned] == ["none (shipped)", "physics", "vision", "both"]
+    assert {who.scenes for who in learned} == {("isolated", "box")}
+    for who in learned:
+        varied = config_of(who).randomization.parts if "Randomized" in who.train_with else ()
+        assert ("physics" in varied) == (who.training in ("physics", "both"))
+        assert ("vision" in varied) == (who.training in ("vision", "both"))
+
+
+def test_the_commands_of_the_report_do_as_its_rows_say():
+    rows = [who for who in load_config(REPORT).transfer.policies if who.policy[:8] == "GraspNet"]
+    for who in rows:
+        config, both = config_of(who), who.training.startswith("both")
+        assert config.train.backbone == "tutorial_skip"
+        assert config.data.randomise_physics == (who.training == "physics" or both)
+        assert config.data.randomise == (who.training.startswith("vision") or both)
+        assert (config.train.depth_noise_share > 0) == config.data.randomise
         assert (config.adaptation.target is not None) == ("adaptation" in who.training)
+
+
+def config_of(who: TransferPolicy) -> Config:
+    """That of the command which trains a row's policy; it leaves what the row's planner reads."""
+    python, script, *words = shlex.split(who.train_with)
+    assert (python, script) in {("python", "train_graspnet.py"), ("python", "train_rl.py")}
+    assert words[-2:] == ["--weights", who.planner.removeprefix("ppo:")]
+    file = REPOSITORY / words[1] if words[0] == "--config" else None
+    return load_config(file, [word for word in words[:-2] if "=" in word])
 
 
 def test_outside_is_outside():
@@ -158,7 +192,7 @@ def test_outside_is_outside():
 def test_the_command_from_end_to_end(tmp_path):
     command = [
         sys.executable, REPOSITORY / "evaluate.py", "--config", REPORT, "evaluate.rounds=1",
-        "evaluate.workers=1", "evaluate.scenarios=isolated", "evaluate.object_sets=box",
+        "evaluate.workers=1", "evaluate.scenarios=isolated", "evaluate.object_sets=primitives",
         "transfer.worlds=pybullet,outside,cornell", "sim.renderer=tiny",
         "--results", "copy.json",
     ]  # fmt: skip
@@ -170,4 +204,8 @@ def test_the_command_from_end_to_end(tmp_path):
     heuristic = next(row for row in rows if row["policy"] == "heuristic")
     assert set(heuristic["worlds"]) == {"pybullet", "outside"}
     (run,) = (tmp_path / "runs" / "evaluate").iterdir()
-    assert (run / "transfer.png").exists() and (run / "outside" / "rounds.jsonl").exists()
+    assert (run / "transfer.png").exists()
+    for scenes in ("isolated_of_primitives", "isolated_of_box"):
+        assert (run / "outside" / scenes / "rounds.jsonl").exists()
+    boxes = [row for row in rows if row["scenes"] == "isolated of box"]
+    assert [row["policy"] for row in boxes] == ["random", "heuristic", *["PPO"] * 4]

@@ -179,17 +179,24 @@ TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell"]
 
 class TransferPolicy(NamedTuple):
     """A row of the transfer report. policy, training: what the reader is told. planner: as in
-    evaluate.policies. train_with: the command that makes the planner's file."""
+    evaluate.policies. scenes: scenario and object set that it is scored on, None for those of the
+    section evaluate. train_with: the command that makes the planner's file."""
 
     policy: str
     training: str
     planner: str
+    scenes: tuple[str, str] | None
     train_with: str | None
 
 
+TransferScenes = Annotated[tuple[ScoredScenario, ObjectSet], Field(strict=False)]
 TransferRow = Annotated[
-    tuple[Name, Name, Name, Name | None],
-    Field(strict=False, description="a list of policy, training, planner, command or null"),
+    tuple[Name, Name, Name, TransferScenes | None, Name | None],
+    Field(
+        strict=False,
+        description="a list of policy, training, planner, [one of evaluate.scenarios, one of "
+        "evaluate.object_sets] or null, command or null",
+    ),
     AfterValidator(lambda values: TransferPolicy(*values)),
 ]
 

@@ -27,6 +27,7 @@ TITLES = {
     "cornell": "Cornell photographs",
 }
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
+_SHAPES = "osD^v"
 PAIRS = (("mujoco", "pybullet"), ("outside", "pybullet"))  # (taken for real, simulation of it)
 
 
@@ -48,19 +49,21 @@ class Score:
 
 @dataclass(frozen=True)
 class TransferLine:
-    """One policy: its score by world. A world that is not there was not scored. trained: whether
-    the planner's file exists."""
+    """One policy: its score by world. A world that is not there was not scored. scenes: what it was
+    scored on. trained: whether the planner's file exists."""
 
     who: TransferPolicy
+    scenes: str
     scores: Mapping[str, Score]
     trained: bool = True
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well the rates of N policies in `simulation` foretell those in `real`: Pearson's r, and
-    the mean maximum rank violation (`utils.statistics`)."""
+    """How well the rates of N policies in `simulation` foretell those in `real`, on the same
+    scenes: Pearson's r, and the mean maximum rank violation (`utils.statistics`)."""
 
+    scenes: str
     real: str
     simulation: str
     policies: int
@@ -75,31 +78,31 @@ def score_of(rounds: Sequence[RoundRecord], planner: str) -> Score:
 
 
 def agreements(lines: Sequence[TransferLine]) -> list[Agreement]:
-    """For each pair of worlds, over the policies that were scored in both."""
+    """For each kind of scenes and each pair of worlds, over the policies that were scored in both;
+    one policy alone has no order."""
     found = []
-    for real, simulation in PAIRS:
-        rates = [
-            (line.scores[real].rate, line.scores[simulation].rate)
-            for line in lines
-            if all(w in line.scores and line.scores[w].trials for w in (real, simulation))
-        ]
-        if rates:
+    for scenes in dict.fromkeys(line.scenes for line in lines):
+        for real, simulation in PAIRS:
+            rates = [
+                (line.scores[real].rate, line.scores[simulation].rate)
+                for line in lines
+                if line.scenes == scenes
+                and all(w in line.scores and line.scores[w].trials for w in (real, simulation))
+            ]
+            if len(rates) < 2:
+                continue
             a, b = zip(*rates)
-            found.append(
-                Agreement(
-                    real, simulation, len(rates), pearson_correlation(a, b),
-                    mean_maximum_rank_violation(a, b),
-                )
-            )  # fmt: skip
+            r, mmrv = pearson_correlation(a, b), mean_maximum_rank_violation(a, b)
+            found.append(Agreement(scenes, real, simulation, len(rates), r, mmrv))
     return found
 
 
 def format_transfer(lines: Sequence[TransferLine], worlds: Sequence[str]) -> str:
     """The table as aligned text."""
-    header = ("policy", "randomised in training", *(TITLES[world] for world in worlds))
+    header = ("policy", "randomised in training", "scenes", *(TITLES[world] for world in worlds))
     table = []
     for line in lines:
-        cells = [line.who.policy, line.who.training]
+        cells = [line.who.policy, line.who.training, line.scenes]
         if line.trained:
             cells += [_cell(line.scores.get(world)) for world in worlds]
         else:
@@ -121,8 +124,8 @@ def transfer_notes(lines: Sequence[TransferLine], worlds: Sequence[str]) -> list
     for one in agreements(lines):
         r = "undefined" if one.pearson_r is None else f"{one.pearson_r:.3f}"
         notes.append(
-            f"{TITLES[one.simulation]} foretells {TITLES[one.real]}: Pearson r {r}, mean maximum "
-            f"rank violation {one.mmrv:.3f}, {one.policies} policies"
+            f"{one.scenes}: {TITLES[one.simulation]} foretells {TITLES[one.real]}: Pearson r {r}, "
+            f"mean maximum rank violation {one.mmrv:.3f}, {one.policies} policies"
         )
     if "cornell" in worlds and not any("cornell" in line.scores for line in lines):
         notes.append("no photographs were scored: add transfer.cornell=path/to/cornell")
@@ -140,6 +143,7 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
             {
                 "policy": line.who.policy,
                 "training": line.who.training,
+                "scenes": line.scenes,
                 "planner": line.who.planner,
                 "trained": line.trained,
                 "worlds": {
@@ -156,6 +160,7 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
         ],
         "agreement": [
             {
+                "scenes": one.scenes,
                 "real": one.real,
                 "simulation": one.simulation,
                 "policies": one.policies,
@@ -170,8 +175,8 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
 def draw_transfer(lines: Sequence[TransferLine], worlds: Sequence[str]) -> bytes:
     """A PNG file's bytes: the rates with their intervals, and one world against the other."""
     shown = [line for line in lines if line.scores]
-    figure = Figure(figsize=(12.5, 1.6 + 0.62 * max(len(shown), 5)), layout="constrained")
-    bars, scatter = figure.subplots(1, 2, width_ratios=(1.7, 1))
+    figure = Figure(figsize=(13.5, 1.6 + 0.62 * max(len(shown), 5)), layout="constrained")
+    bars, scatter = figure.subplots(1, 2, width_ratios=(1.6, 1))
     _draw_bars(bars, shown, worlds)
     _draw_agreement(scatter, shown)
     file = io.BytesIO()
@@ -194,40 +199,57 @@ def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str])
             0.9 * height, xerr=errors, label=TITLES[world], color=_colour(number),
             error_kw={"elinewidth": 1.0, "capsize": 2},
         )  # fmt: skip
-    names = [_name(line, "\n") for line in lines]
+    several = len({line.scenes for line in lines}) > 1
+    names = [_name(line, several) for line in lines]
     axes.set(yticks=range(len(lines)), yticklabels=names, xlim=(0, 105), xlabel="success, %")
-    axes.invert_yaxis()
+    axes.set_ylim(len(lines) - 0.5, -0.5)  # the first row on top
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.45, 1.12), ncols=len(worlds), frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=len(worlds), frameon=False)
 
 
 def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
+    """A colour for each policy, a shape for each kind of scenes; what differs in training alone
+    looks alike."""
     (real, simulation), *_ = PAIRS
     axes.plot([0, 100], [0, 100], color="0.7", linewidth=1)
-    for number, line in enumerate(lines):
-        scores = [line.scores.get(world) for world in (simulation, real)]
-        if not all(score is not None and score.trials for score in scores):
-            continue
+    both = [
+        line
+        for line in lines
+        if all(w in line.scores and line.scores[w].trials for w in (simulation, real))
+    ]
+    policies = list(dict.fromkeys(line.who.policy for line in both))
+    kinds = list(dict.fromkeys(line.scenes for line in both))
+    told = set()
+    for line in both:
+        scores = [line.scores[world] for world in (simulation, real)]
         x, y = (100 * score.rate for score in scores)
         spans = [[[100 * (s.rate - s.ci95[0])], [100 * (s.ci95[1] - s.rate)]] for s in scores]
+        label = f"{line.who.policy}, {line.scenes}"
+        shape = _SHAPES[kinds.index(line.scenes) % len(_SHAPES)]
         axes.errorbar(
-            x, y, xerr=spans[0], yerr=spans[1], fmt="o", color=_colour(number), capsize=2,
-            label=_name(line, ", "),
+            x, y, xerr=spans[0], yerr=spans[1], fmt=shape,
+            color=_colour(policies.index(line.who.policy)), capsize=2, alpha=0.7,
+            label=None if label in told else label,
         )  # fmt: skip
-    found = [one for one in agreements(lines) if (one.real, one.simulation) == (real, simulation)]
-    if found and found[0].pearson_r is not None:
-        axes.set_title(f"r = {found[0].pearson_r:.3f}, MMRV = {found[0].mmrv:.3f}", fontsize=10)
+        told.add(label)
+    titles = [
+        f"{one.scenes}: r = {one.pearson_r:.3f}, MMRV = {one.mmrv:.3f}"
+        for one in agreements(lines)
+        if (one.real, one.simulation) == (real, simulation) and one.pearson_r is not None
+    ]
+    axes.set_title("\n".join(titles), fontsize=10)
     axes.set(
         xlim=(0, 102), ylim=(0, 102), aspect="equal", xlabel=f"{TITLES[simulation]}, %",
         ylabel=f"{TITLES[real]}, %",
     )  # fmt: skip
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=8, frameon=False)
+    if told:
+        axes.legend(loc="lower right", fontsize=8, frameon=False)
 
 
-def _name(line: TransferLine, between: str) -> str:
+def _name(line: TransferLine, with_scenes: bool) -> str:
     training = [line.who.training] if line.who.training != NOT_TRAINED else []
-    return between.join([line.who.policy, *training])
+    return "\n".join([line.who.policy, *training, *([line.scenes] if with_scenes else [])])
 
 
 def _colour(number: int) -> Any:
