@@ -29,6 +29,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         self.randomizer = DomainRandomizer(self.cell, self.config.randomization, ARM, FINGERS)
         self._recorded: Mapping[str, Any] | None = None
         self.cell.on_build = self._change_world
+        self.cell.on_action = self.randomizer.act
 
     def _change_world(self, cell: Any) -> None:
         if self._recorded is None:
@@ -47,8 +48,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     def step(
         self, action: np.ndarray
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        action = self._checked(action) if self._running else action
-        observation, reward, terminated, truncated, info = super().step(self.randomizer.act(action))
+        observation, reward, terminated, truncated, info = super().step(action)
         if terminated or truncated:
             self.randomizer.record_result(info["is_success"])
         return observation, reward, terminated, truncated, info

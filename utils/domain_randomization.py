@@ -41,9 +41,9 @@ class DomainRandomizer:
     """Draws a world for each episode, applies it to a cell, and takes it back.
 
     Call `randomize` when the cell's scene has been built (`Cell.on_build`); in between, `act` gives
-    what becomes of each action. A sample is a plain dict of text, numbers, lists and dicts, the
-    same after a journey through JSON; with the same scene and actions, `replay(sample)` gives the
-    same episode bit for bit. It holds:
+    what becomes of each action (`Cell.on_action`). A sample is a plain dict of text, numbers, lists
+    and dicts, the same after a journey through JSON; with the same scene and actions,
+    `replay(sample)` gives the same episode bit for bit. It holds:
 
         version, seed: the seed is of all that is drawn anew at each action and image
         physics, vision: by parameter [operation, value or list of values]
