@@ -22,6 +22,7 @@ def make_cell(config: Config) -> BaseCell:
     cell = WORLDS[config.world](config)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
+        randomizer.at_limits = True
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
         cell.on_action = randomizer.act
     return cell
