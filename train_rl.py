@@ -54,6 +54,7 @@ from models.rollouts import (
     evaluate_policy,
 )
 from train_graspnet import stop_on_interrupt
+from utils.adaptive_ranges import Bound
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
@@ -83,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with rl_team(config) as us, vector_envs(config, envs_of(config, us)) as envs:
         ppo = make_ppo(config, envs, us)
         run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
-        history = load_progress(ppo, run / "last.pt")
+        history = load_progress(ppo, envs, run / "last.pt")
         announce(config, run, envs, ppo)
 
         finished = train(config, run, envs, ppo, history)
@@ -153,9 +154,19 @@ def open_run(config: Config) -> str:
     return str(new_run_folder("train_rl", config.rl.name, config))
 
 
-def load_progress(ppo: GraspPPO, last: Path) -> list[dict]:
+def load_progress(ppo: GraspPPO, envs: VectorEnvs, last: Path) -> list[dict]:
     """Go on from a checkpoint, if there is one; the evaluations so far."""
-    return ppo.load(last)["history"] if last.is_file() else []
+    if not last.is_file():
+        return []
+    extra = ppo.load(last)
+    if envs.ranges is not None:
+        if "ranges" not in extra:
+            raise UserError(
+                f"{last}: holds no automatic ranges, as before environments shared them; start a "
+                "new run, from its weights with rl.initial"
+            )
+        envs.ranges.load_state(extra["ranges"])
+    return extra["history"]
 
 
 def announce(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO) -> None:
@@ -199,7 +210,7 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                     if not history or history[-1]["update"] < ppo.updates:
                         row = evaluate(config, envs, ppo, watch, step)
                         history.append(row)
-                        save_evaluation(run, config, ppo, history, writer, bar)
+                        save_evaluation(run, config, ppo, envs, history, writer, bar)
                     if reached(config, history[-1]) or ppo.updates == total:
                         break
                     place = (config.seed, TRAINING, us.rank, ppo.updates)
@@ -213,12 +224,15 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                 with watch(NETWORK):
                     losses = ppo.update(rollout, ppo.updates / total)
                 step += per_update
-                episodes = summary(from_all(us, rollout.episodes))
+                played = from_all(us, rollout.episodes)
+                widen(envs, played)
+                episodes = summary(played)
                 bar.update(per_update)
                 bar.set_postfix({k: f"{v:.3g}" for k, v in episodes.items() if k != "length"})
                 if us.leads:
                     log(writer, step, "rollout", episodes)
                     log(writer, step, "update", losses)
+                    log(writer, step, "ranges", widths(envs))
                     rate = per_update / (time.perf_counter() - begun)
                     log(writer, step, "time", {"steps_per_second": rate})
                 if us.any(interrupted.is_set()):
@@ -278,7 +292,8 @@ def evaluate(
             if own
             else []
         )
-    return {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
+    row = {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
+    return row if envs.ranges is None else row | {"range_width": envs.ranges.width}
 
 
 def film(config: Config, run: Path, ppo: GraspPPO) -> None:
@@ -321,6 +336,21 @@ def summary(episodes: Sequence[Episode]) -> dict[str, float]:
     return means | ({"success": float(np.mean(told))} if told else {})
 
 
+def widen(envs: VectorEnvs, episodes: Sequence[Episode]) -> None:
+    """Let automatic ranges learn from the episodes of all environments of all processes. Every
+    process counts the same ones, so that all go on with the same ranges."""
+    if envs.ranges is not None:
+        tried = [(episode.bound, episode.success) for episode in episodes if episode.bound]
+        envs.ranges.record_all(
+            (Bound(name, side), value, success) for (name, side, value), success in tried
+        )
+
+
+def widths(envs: VectorEnvs) -> dict[str, float]:
+    """How far automatic ranges are on the way to their limits: on average, and each bound."""
+    return {} if envs.ranges is None else {"width": envs.ranges.width, **envs.ranges.shares}
+
+
 def score(row: dict[str, Any]) -> tuple[float, float]:
     """What the best evaluation is chosen by: success first, where it is told, then the return."""
     return row.get("success", 0.0), row["return"]
@@ -335,14 +365,18 @@ def reached(config: Config, row: dict[str, Any]) -> bool:
 
 
 def save_evaluation(
-    run: Path, config: Config, ppo: GraspPPO, history: list[dict], writer: SummaryWriter, bar: tqdm
-) -> None:
+    run: Path, config: Config, ppo: GraspPPO, envs: VectorEnvs, history: list[dict],
+    writer: SummaryWriter, bar: tqdm,
+) -> None:  # fmt: skip
     """Checkpoints, TensorBoard and a line for the last row of history."""
     if ppo.team.leads:
         row = history[-1]
+        progress = {"history": history}
+        if envs.ranges is not None:
+            progress["ranges"] = envs.ranges.state()
         if score(row) == max(map(score, history)):
-            ppo.save(run / "best.pt", config, history=history)
-        ppo.save(run / "last.pt", config, history=history)
+            ppo.save(run / "best.pt", config, **progress)
+        ppo.save(run / "last.pt", config, **progress)
         scores = {name: row[name] for name in ("return", "length", "success") if name in row}
         log(writer, row["step"], "evaluation", scores)
         writer.flush()

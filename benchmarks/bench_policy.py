@@ -52,12 +52,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
-    """The config that a checkpoint was trained with, changed by overrides."""
+    """The config that a checkpoint was trained with, changed by overrides, at full difficulty."""
     plain = load_checkpoint(checkpoint, KIND)["config"]
     with NamedTemporaryFile("w", suffix=".yaml") as file:
         json.dump(plain, file)  # JSON is YAML
         file.flush()
-        return load_config(Path(file.name), [*overrides, "env.near_share=0"])
+        full = ["env.near_share=0", "randomization.adaptive.enabled=false"]
+        return load_config(Path(file.name), [*overrides, *full])
 
 
 def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[str, int]]:

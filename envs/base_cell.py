@@ -7,6 +7,7 @@ planners know a cell only as far as it is described here.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +40,8 @@ class BaseCell(ABC):
     dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
     has the interface of `envs.panda.Panda`. bodies: the simulator's numbers of the objects.
     remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
-    built.
+    built. on_action: what becomes of each action of a policy that moves the hand in turns; None: it
+    is carried out as it is.
     """
 
     client: int | None = None
@@ -64,6 +66,7 @@ class BaseCell(ABC):
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
+        self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
 
     def _new_gate(self) -> ArmGate:
         config = self.config

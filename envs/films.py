@@ -10,6 +10,8 @@ import gymnasium
 import imageio
 import numpy as np
 
+from utils.adaptive_ranges import WIDEST
+
 _HOLD = 6  # pictures for which the last one stays
 
 
@@ -18,6 +20,8 @@ def film_episode(
 ) -> str:
     """Play an episode, write it to an MP4 or GIF in real time; how it ended, in a word."""
     options = {"start": "home"} if hasattr(env.unwrapped, "cell") else None
+    if hasattr(env.unwrapped, "randomizer"):
+        options["ranges"] = WIDEST
     observation, info = env.reset(seed=seed, options=options)
     pictures, ended, terminated = [env.render()], False, False
     while not ended:

@@ -265,7 +265,10 @@ class RobotGraspingEnv(gymnasium.Env):
         if not self._running:
             raise ResetNeeded("step() needs a running episode: call reset() first")
         self._looks_left = 0  # an action may change the scene
-        self._hand.command(self._checked(action), self._state)
+        action = self._checked(action)
+        if self.cell.on_action is not None:
+            action = self.cell.on_action(action)
+        self._hand.command(action, self._state)
         self.cell.step(self.settings.substeps)
         self._steps += 1
         try:

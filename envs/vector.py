@@ -26,10 +26,12 @@ import yaml
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from utils.adaptive_ranges import WIDEST, adaptive_ranges
 from utils.config import Config
 from utils.errors import UserError
 
-OWN_ENVS = "RobotGrasping-v0", "RandomizedGrasping-v0"  # are given the whole config
+RANDOMIZED = "RandomizedGrasping-v0"
+OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # are given the whole config
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
@@ -59,12 +61,18 @@ def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
 class VectorEnvs:
     """See `models.rollouts.VectorEnvs` for the methods that stepping takes.
 
-    observation_space, action_space: of a single environment.
+    observation_space, action_space: of a single environment. ranges: automatic ones, None without:
+    those of all environments, which are told of a change when they next begin an episode.
     """
 
     def __init__(self, config: Config, count: int):
         self.num_envs = count
         self._options: dict[str, Any] = {}
+        self._full = {"start": "home"}  # options of an episode that nothing makes easier
+        self.ranges = None
+        if config.rl.env_id == RANDOMIZED:
+            self._full["ranges"] = WIDEST
+            self.ranges = adaptive_ranges(config.randomization)
         self._own = config.rl.env_id in OWN_ENVS
         self._timeout = config.rl.worker_timeout
         makers = [partial(make_env, config, index) for index in range(count)]
@@ -82,7 +90,8 @@ class VectorEnvs:
         self.action_space = self._envs.single_action_space
 
     def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
-        options = self._options | ({} if which is None else {"reset_mask": which})
+        options = {} if self.ranges is None else {"ranges": self.ranges.shares}
+        options |= self._options | ({} if which is None else {"reset_mask": which})
         with _told(self._died):
             if not self._parallel:
                 return self._envs.reset(seed=list(seeds), options=options or None)[0]
@@ -101,7 +110,7 @@ class VectorEnvs:
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:
         """Episodes begun in here are as hard as the task, whatever makes training easier."""
-        with self._begun_with({"start": "home"}):
+        with self._begun_with(self._full):
             yield
 
     @contextmanager

@@ -16,12 +16,15 @@ WORLDS = {"pybullet": Cell, "mujoco": MujocoCell}
 
 def make_cell(config: Config) -> BaseCell:
     """A cell in the configured world; with evaluate.randomise, one that differs from scene to scene
-    by what the section `randomization` says, the same way for the same scene."""
+    by what the section `randomization` says, the same way for the same scene. Noise and bias of
+    actions are a policy's that acts in turns; a planner's trajectories are no actions."""
     check_world(config)
     cell = WORLDS[config.world](config)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
+        randomizer.at_limits = True
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
+        cell.on_action = randomizer.act
     return cell
 
 

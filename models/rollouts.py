@@ -18,6 +18,7 @@ from utils.stopwatch import Stopwatch
 
 SIMULATION, NETWORK = "simulation", "network"  # what the stopwatch tells apart
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
+BOUND = "bound"  # entry of the last info of `envs.randomized_env`
 
 
 class VectorEnvs(Protocol):
@@ -42,11 +43,13 @@ class NotFinite(UserError):
 
 
 class Episode(NamedTuple):
-    """total: undiscounted sum of rewards; success: None where the environment does not tell."""
+    """total: undiscounted sum of rewards; success: None where the environment does not tell. bound:
+    end of an automatic range that was tried out, [parameter, "low" or "high", value], or None."""
 
     total: float
     length: int
     success: bool | None
+    bound: list[str | float] | None = None
 
 
 @dataclass
@@ -187,11 +190,13 @@ class Tally:
         self._lengths += 1
         if not ended.any():
             return []
-        told = infos.get(f"_{SUCCESS}", np.zeros(len(ended), bool))
+        nobody = np.zeros(len(ended), bool)
+        told, tried = (infos.get(f"_{name}", nobody) for name in (SUCCESS, BOUND))
         done = [
             Episode(
                 float(self._totals[i]), int(self._lengths[i]),
                 bool(infos[SUCCESS][i]) if told[i] else None,
+                infos[BOUND][i] if tried[i] else None,
             )
             for i in np.flatnonzero(ended)
         ]  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pybullet
 import pytest
@@ -12,11 +13,14 @@ import torch
 from benchmarks.bench_policy import config_of, run_episodes
 from envs.cell import Cell
 from envs.execution import execute_grasp
+from envs.hand_commands import HandCommands
 from envs.objects import load_object_set
 from envs.policy_approach import PolicyApproach, nowhere_yet
 from envs.scenes import make_scene
 from envs.vector import make_env
+from envs.worlds import make_cell
 from models.grasp_policy import load_policy
+from utils.config import load_config
 
 CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
 
@@ -99,3 +103,87 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
         assert (outcome.reason, approach.closed_at) == ("stopped", None)
         assert "gripped nothing" in outcome.detail
         assert np.abs(cell.robot.q - cell.home).max() < 0.02, "home again"
+
+
+def recorded(hand: HandCommands) -> list[np.ndarray]:
+    """The actions that a hand will be told."""
+    told, command = [], hand.command
+    hand.command = lambda action, state: (told.append(action.copy()), command(action, state))
+    return told
+
+
+def driven(cell, actions, seed=0):
+    """The arm's motion, and the actions that reach the hand, when a policy that does not look plays
+    these in a scene."""
+    objects = load_object_set("box", cache_dir=cell.config.cache_folder)
+    trained = {
+        "env": cell.config.env.model_dump() | {"control": "ee_planar", "observations": ("state",)},
+        "camera": cell.config.camera.model_dump(),
+    }
+    trained["env"]["max_steps"] = len(actions)
+    left = iter(actions)
+    approach = PolicyApproach(cell, lambda observation: next(left), trained)
+    told = recorded(approach.env._hand)
+    cell.load(make_scene("isolated", objects, seed, cell.config, cell.client))
+    execute_grasp(cell, nowhere_yet(None)[0], approach)
+    return np.array(told), cell.robot.q
+
+
+def randomised(*changes):
+    """A cell of evaluate.py in which nothing but the action is changed, and that as told."""
+    still = [
+        f"randomization.physics.{name}={'1,1' if spec.operation == 'scale' else '0,0'},uniform,"
+        f"{'scale' if spec.operation == 'scale' else 'add'},episode"
+        for name, spec in load_config().randomization.physics
+    ]
+    return make_cell(
+        load_config(None, ["sim.renderer=tiny", "evaluate.randomise=true",
+                           "randomization.parts=physics", *still, *changes])
+    )  # fmt: skip
+
+
+BIAS, NOISE = (f"randomization.physics.action_{name}=" for name in ("bias", "noise"))
+ACTIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (12, 5))
+
+
+def test_an_evaluated_policy_s_actions_get_the_bias_and_noise_of_the_sample():
+    """Action + bias + noise by hand: NumPy's normal numbers of (the scene's seed, 3, turn)."""
+    with randomised(
+        BIAS + "0.1,0.1,uniform,set,episode", NOISE + "0.05,0.05,uniform,set,episode"
+    ) as cell:
+        told, q = driven(cell, ACTIONS)
+        noise = [np.random.default_rng([0, 3, turn]).standard_normal(5) for turn in range(12)]
+        np.testing.assert_allclose(told, ACTIONS + 0.1 + 0.05 * np.array(noise), atol=1e-12)
+        again, q_again = driven(cell, ACTIONS)
+        other, _ = driven(cell, ACTIONS, seed=1)
+    assert told.tolist() == again.tolist() and q.tolist() == q_again.tolist(), "bit for bit"
+    assert not np.allclose(told, other), "another scene, another noise"
+
+
+def test_without_noise_an_evaluated_policy_s_actions_are_its_own(config):
+    with randomised() as cell, Cell(config) as plain:
+        told, q = driven(cell, ACTIONS)
+        assert cell.on_action is not None and plain.on_action is None
+        expected, q_plain = driven(plain, ACTIONS)
+    assert told.tolist() == expected.tolist() == ACTIONS.tolist() and q.tolist() == q_plain.tolist()
+
+
+def test_randomised_actions_are_those_of_the_environment():
+    """What evaluate.py does to a policy's actions is what training did to them."""
+    changes = [NOISE + "0.05,0.05,uniform,set,episode", "env.max_steps=12"]
+    with randomised(*changes) as cell:
+        told, _ = driven(cell, ACTIONS)
+        config = cell.config
+    settings = {"config": config, "control": "ee_planar", "observations": ("state",)}
+    env = gymnasium.make("RandomizedGrasping-v0", **settings).unwrapped
+    _, info = env.reset(options={"scene_seed": 0})
+    env.reset(options={"scene_seed": 0, "randomization": info["randomization"] | {"seed": 0}})
+    reached, command = [], env._hand.command
+    env._hand.command = lambda action, state: (
+        reached.append(action.copy()),
+        command(action, state),
+    )
+    for action in ACTIONS:
+        env.step(action)
+    env.close()
+    assert np.array(reached).tolist() == told.tolist()

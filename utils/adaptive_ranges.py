@@ -6,13 +6,15 @@ After OpenAI et al., "Solving Rubik's cube with a robot hand" (2019), and Handa 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from utils.config_ranges import AdaptiveConfig, Range
-from utils.random_ranges import neutral
+from utils.config_ranges import AdaptiveConfig, RandomizationConfig, Range
+from utils.random_ranges import neutral, ranges_of
+
+WIDEST = "widest"  # what an episode of the task itself is asked for, in place of `shares`
 
 
 class Bound(NamedTuple):
@@ -61,32 +63,69 @@ class AdaptiveRanges:
 
     def record(self, bound: Bound, success: bool) -> None:
         """How an episode at a bound ended; after enough of them the bound is judged and moves."""
-        settings, results = self._settings, self._results[bound]
-        results.append(bool(success))
-        if len(results) < settings.episodes:
-            return
-        rate = sum(results) / len(results)
-        results.clear()
-        step = settings.step * ((rate >= settings.widen_at) - (rate <= settings.narrow_at))
-        self._shares[bound] = min(max(self._shares[bound] + step, 0.0), 1.0)
+        self.record_all([(bound, self._end(bound), success)])
+
+    def record_all(self, results: Iterable[tuple[Bound, float, bool]]) -> None:
+        """How episodes of many environments ended, in any order: the bound, the value that it had
+        when the episode began, and whether it succeeded.
+
+        A bound moves one step at most, however many episodes were at it; those that began before it
+        last moved say nothing of where it is now, and do not count.
+        """
+        settings = self._settings
+        for bound, value, success in results:
+            if value == self._end(bound):
+                self._results[bound].append(bool(success))
+        for bound, ends in self._results.items():
+            if len(ends) < settings.episodes:
+                continue
+            rate = sum(ends) / len(ends)
+            ends.clear()
+            step = settings.step * ((rate >= settings.widen_at) - (rate <= settings.narrow_at))
+            self._shares[bound] = min(max(self._shares[bound] + step, 0.0), 1.0)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """By "name.side" how far each bound is on the way to its limit, 0 .. 1: what the ranges of
+        others have to be told to be the same (`take_over`)."""
+        return {_key(bound): share for bound, share in self._shares.items()}
+
+    def take_over(self, shares: Mapping[str, float]) -> None:
+        """Take over the ranges of `shares`. Raises ValueError if they are of other parameters."""
+        self._check(shares)
+        self._shares = {bound: float(shares[_key(bound)]) for bound in self._movable}
 
     def state(self) -> dict[str, Any]:
         """Plain data from which `load_state` goes on."""
         return {
-            f"{bound.name}.{bound.side}": {"share": share, "results": list(self._results[bound])}
+            _key(bound): {"share": share, "results": list(self._results[bound])}
             for bound, share in self._shares.items()
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on from `state()`. Raises ValueError if it is of other parameters."""
-        if set(state) != {f"{bound.name}.{bound.side}" for bound in self._movable}:
-            raise ValueError("AdaptiveRanges: the state is of other parameters")
+        self._check(state)
         for bound in self._movable:
-            entry = state[f"{bound.name}.{bound.side}"]
+            entry = state[_key(bound)]
             self._shares[bound] = float(entry["share"])
             self._results[bound] = [bool(result) for result in entry["results"]]
+
+    def _check(self, by_bound: Mapping[str, Any]) -> None:
+        if set(by_bound) != set(map(_key, self._movable)):
+            raise ValueError("AdaptiveRanges: the state is of other parameters")
 
     def _end(self, bound: Bound) -> float:
         spec = self._limits[bound.name]
         start = neutral(spec)
         return start + self._shares.get(bound, 0.0) * (getattr(spec, bound.side) - start)
+
+
+def adaptive_ranges(settings: RandomizationConfig) -> AdaptiveRanges | None:
+    """The ranges of physics that grow with success, as they are at first; None where none do."""
+    if not settings.adaptive.enabled:
+        return None
+    return AdaptiveRanges(ranges_of(settings.physics), settings.adaptive)
+
+
+def _key(bound: Bound) -> str:
+    return f"{bound.name}.{bound.side}"

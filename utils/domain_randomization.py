@@ -14,12 +14,12 @@ from typing import Any, Protocol
 import numpy as np
 import pybullet
 
-from utils.adaptive_ranges import AdaptiveRanges, Bound
+from utils.adaptive_ranges import Bound, adaptive_ranges
 from utils.config_ranges import RandomizationConfig, Range
 from utils.errors import UserError
 from utils.random_physics import RandomPhysics
 from utils.random_physics import World as PhysicsWorld
-from utils.random_ranges import changed, draw
+from utils.random_ranges import changed, draw, ranges_of
 from utils.random_view import RandomView
 from utils.textures import TextureRandomizer, random_colour
 from utils.transforms import pose_matrix
@@ -41,18 +41,19 @@ class DomainRandomizer:
     """Draws a world for each episode, applies it to a cell, and takes it back.
 
     Call `randomize` when the cell's scene has been built (`Cell.on_build`); in between, `act` gives
-    what becomes of each action. A sample is a plain dict of text, numbers, lists and dicts, the
-    same after a journey through JSON; with the same scene and actions, `replay(sample)` gives the
-    same episode bit for bit. It holds:
+    what becomes of each action (`Cell.on_action`). A sample is a plain dict of text, numbers, lists
+    and dicts, the same after a journey through JSON; with the same scene and actions,
+    `replay(sample)` gives the same episode bit for bit. It holds:
 
         version, seed: the seed is of all that is drawn anew at each action and image
         physics, vision: by parameter [operation, value or list of values]
         each_step: by parameter its Range, where it is drawn anew
         colours: RGB for the table and each object, or None. textures: likewise, each None or a
             description by `TextureRandomizer.draw`. shadow: 0 or 1. depth_noise: true or false
-        bound: None, or [parameter, "low" or "high"] that automatic randomisation tries out
+        bound: None, or [parameter, "low" or "high", value] that automatic randomisation tries out
 
     arm, fingers: link numbers of the robot. seed: of what `randomize` draws when it is given none.
+    at_limits: draw from the widest ranges, automatic or not: the task itself, as evaluations ask.
     """
 
     def __init__(
@@ -68,11 +69,10 @@ class DomainRandomizer:
         self._seeds = np.random.default_rng(seed)
         self.textures = TextureRandomizer(settings.texture_folder)
         self._varies_view = "vision" in settings.parts
-        self._limits = _ranges(settings.physics) if "physics" in settings.parts else {}
-        self._vision = _ranges(settings.vision) if self._varies_view else {}
-        self.adaptive = None
-        if settings.adaptive.enabled:
-            self.adaptive = AdaptiveRanges(self._limits, settings.adaptive)
+        self._limits = ranges_of(settings.physics) if "physics" in settings.parts else {}
+        self._vision = ranges_of(settings.vision) if self._varies_view else {}
+        self.adaptive = adaptive_ranges(settings)
+        self.at_limits = False
         self.sample: dict[str, Any] | None = None
         self._built: object = None  # the robot of the build that `_physics` belongs to
 
@@ -134,14 +134,14 @@ class DomainRandomizer:
     def record_result(self, success: bool) -> None:
         """How the episode ended: automatic randomisation, where enabled, learns from it."""
         if self.adaptive is not None and self.sample is not None and self.sample["bound"]:
-            self.adaptive.record(Bound(*self.sample["bound"]), success)
+            self.adaptive.record(Bound(*self.sample["bound"][:2]), success)
 
     # --- Drawing ------------------------------------------------------------------------------
 
     def _draw(self, seed: int) -> dict[str, Any]:
         settings, rng = self._settings, np.random.default_rng(seed)
         physics, bound = dict(self._limits), None
-        if self.adaptive is not None:
+        if self.adaptive is not None and not self.at_limits:
             physics = self.adaptive.ranges
             if found := self.adaptive.draw_bound(rng):
                 bound, value = found
@@ -160,7 +160,7 @@ class DomainRandomizer:
         return {
             "version": _VERSION,
             "seed": seed,
-            "bound": None if bound is None else list(bound),
+            "bound": None if bound is None else [*bound, value],
             "colours": colours if coloured else None,
             "textures": textures,
             "shadow": int(shadow),
@@ -241,10 +241,6 @@ class DomainRandomizer:
 
 
 _LONGEST_ACTION = 8  # entries
-
-
-def _ranges(section) -> dict[str, Range]:
-    return {name: getattr(section, name) for name in type(section).model_fields}
 
 
 def _draws(

@@ -6,6 +6,7 @@ Knows nothing of what the parameters are.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,11 @@ from utils.config_ranges import Range
 
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
 NEUTRAL = {"scale": 1.0, "add": 0.0}  # changes nothing
+
+
+def ranges_of(section: Any) -> dict[str, Range]:
+    """The ranges of a section of the config, by name."""
+    return {name: getattr(section, name) for name in type(section).model_fields}
 
 
 def draw(spec: Range, rng: np.random.Generator, size: int | None = None):
