@@ -6,6 +6,7 @@
 
 Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
 rl.films=N, films of N episodes in runs/train_rl/<time>/; --weights FILE is the best policy alone.
+RandomizedGrasping-v0 adds episodes/env*.jsonl: what every episode's world was, in evaluations too.
 Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit on the same device and number of
 processes. The first is written after the looks (rl.looks); until then Ctrl-C ends all.
 
@@ -85,6 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ppo = make_ppo(config, envs, us)
         run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
         history = load_progress(ppo, envs, run / "last.pt")
+        envs.keep_episodes(run / "episodes", us.rank * envs.num_envs)
         announce(config, run, envs, ppo)
 
         finished = train(config, run, envs, ppo, history)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -40,8 +41,9 @@ class BaseCell(ABC):
     dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
     has the interface of `envs.panda.Panda`. bodies: the simulator's numbers of the objects.
     remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
-    built. on_action: what becomes of each action of a policy that moves the hand in turns; None: it
-    is carried out as it is.
+    built. sample: what was drawn for this scene alone (`utils.domain_randomization`), None for a
+    nominal cell. on_action: what becomes of each action of a policy that moves the hand in turns;
+    None: it is carried out as it is.
     """
 
     client: int | None = None
@@ -66,6 +68,7 @@ class BaseCell(ABC):
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
+        self.sample: dict[str, Any] | None = None
         self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
 
     def _new_gate(self) -> ArmGate:

@@ -6,7 +6,9 @@ the config's section `randomization`.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,12 +32,16 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     with more environments: either `AdaptiveRanges.shares`, or "widest" for an episode of the task
     itself, which tries out no bound. The last info of an episode has the `bound` that it tried out,
     [parameter, "low" or "high", value], if any.
+
+    journal: file to which every episode that ends adds a line of JSON, None for none: `scene_seed`,
+    `is_success` and `randomization`, the first and last of which are options that repeat it.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.randomizer = DomainRandomizer(self.cell, self.config.randomization, ARM, FINGERS)
         self._recorded: Mapping[str, Any] | None = None
+        self.journal: Path | None = None
         self._shared = False  # whether the ranges are somebody else's
         self.cell.on_build = self._change_world
         self.cell.on_action = self.randomizer.act
@@ -83,4 +89,12 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
                 info["bound"] = bound
             if not self._shared:
                 self.randomizer.record_result(info["is_success"])
+            if self.journal is not None:
+                self._write_down(info)
         return observation, reward, terminated, truncated, info
+
+    def _write_down(self, info: Mapping[str, Any]) -> None:
+        line = {name: info[name] for name in ("scene_seed", "is_success")}
+        line |= {"randomization": self.randomizer.sample}
+        with self.journal.open("a", encoding="utf-8") as journal:
+            journal.write(json.dumps(line, allow_nan=False) + "\n")

@@ -113,7 +113,7 @@ def run_round(
         ended = "lost"
     return RoundRecord(
         contestant(policy, controller), scenario, objects, scene.seed, len(scene.placements),
-        cleared, tuple(attempts), ended, controller,
+        cleared, tuple(attempts), ended, controller, cell.sample,
     )  # fmt: skip
 
 

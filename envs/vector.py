@@ -70,7 +70,8 @@ class VectorEnvs:
         self._options: dict[str, Any] = {}
         self._full = {"start": "home"}  # options of an episode that nothing makes easier
         self.ranges = None
-        if config.rl.env_id == RANDOMIZED:
+        self._randomized = config.rl.env_id == RANDOMIZED
+        if self._randomized:
             self._full["ranges"] = WIDEST
             self.ranges = adaptive_ranges(config.randomization)
         self._own = config.rl.env_id in OWN_ENVS
@@ -106,6 +107,14 @@ class VectorEnvs:
                 return self._envs.step(actions)
             self._envs.step_async(actions)
             return self._envs.step_wait(self._timeout)
+
+    def keep_episodes(self, folder: Path, first: int = 0) -> None:
+        """Have environments that change their world write down every episode, each in a file of its
+        own in a folder: env0.jsonl and so on, counted from `first`."""
+        if self._randomized:
+            folder.mkdir(exist_ok=True)
+            numbers = range(first, first + self.num_envs)
+            self._envs.set_attr("journal", [folder / f"env{number}.jsonl" for number in numbers])
 
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:

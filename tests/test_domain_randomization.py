@@ -12,12 +12,15 @@ import envs  # noqa: F401 - registers the environments
 from envs.cell import Cell
 from envs.objects import load_object_set
 from envs.panda import ARM, FINGERS
+from envs.rounds import run_round
 from envs.scenes import make_scene
+from envs.vector import vector_envs
 from envs.worlds import make_cell
 from utils.config import load_config
 from utils.config_ranges import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
+from utils.round_records import append_round, read_rounds
 
 PHYSICS, VISION = PhysicsRangesConfig.model_fields, VisionRangesConfig.model_fields
 EXTREME = [
@@ -487,6 +490,33 @@ def test_an_episode_is_replayed_bit_for_bit(env):
     assert seeded == first
 
 
+def test_a_line_on_disk_replays_an_episode_bit_for_bit(env, tmp_path, monkeypatch):
+    monkeypatch.setattr(env.unwrapped, "journal", tmp_path / "env0.jsonl")
+    first, info, last = episode(env, seed=4)
+    episode(env)
+    lines = [json.loads(line) for line in (tmp_path / "env0.jsonl").read_text().splitlines()]
+    assert len(lines) == 2 and lines[0]["is_success"] is last["is_success"]
+    options = {name: lines[0][name] for name in ("scene_seed", "randomization")}
+    again, repeated, _ = episode(env, options=options)
+    assert again == first and repeated["randomization"] == info["randomization"]
+
+
+def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
+    config = load_config(
+        None,
+        ["rl.env_id=RandomizedGrasping-v0", "rl.parallel=false", "env.observations=state",
+         "env.max_steps=1", "env.substeps=1", "sim.renderer=tiny"],
+    )  # fmt: skip
+    with vector_envs(config, 2) as several:
+        several.keep_episodes(tmp_path / "episodes", first=2)
+        several.restart([1, 2])
+        several.step(np.zeros((2, *several.action_space.shape), np.float32))
+    files = sorted((tmp_path / "episodes").iterdir())
+    assert [file.name for file in files] == ["env2.jsonl", "env3.jsonl"]
+    one, two = (json.loads(file.read_text()) for file in files)
+    assert one["randomization"]["seed"] != two["randomization"]["seed"]
+
+
 def test_env_keeps_gymnasiums_rules(env):
     from gymnasium.utils.env_checker import check_env
 
@@ -542,3 +572,24 @@ def test_an_evaluation_meets_the_same_world_for_every_policy(scene):
             cell.build(scene)
             frictions.append(pybullet.getDynamicsInfo(cell.bodies[0], -1, cell.client)[1])
     assert frictions[0] == frictions[1] != scene.placements[0].model.friction
+
+
+def test_the_record_of_a_round_replays_its_world(tmp_path):
+    config = load_config(None, ["sim.renderer=tiny", "evaluate.randomise=true"])
+    boxes = load_object_set("box", cache_dir=config.cache_folder)
+    scene = make_scene("isolated", boxes, 3, config)
+    with make_cell(config) as cell:
+        record = run_round(cell, scene, lambda frame: [], policy="p", objects="box", max_failures=1)
+    append_round(tmp_path / "rounds.jsonl", record)
+    (kept,) = read_rounds(tmp_path / "rounds.jsonl")
+    assert kept == record and kept.randomization["physics"]["object_mass"]
+    with Cell(config) as cell:
+        plain = run_round(cell, scene, lambda frame: [], policy="p", objects="box", max_failures=1)
+        assert plain.randomization is None
+        randomizer = DomainRandomizer(cell, config.randomization, ARM, FINGERS)
+        cell.on_build = lambda cell: randomizer.replay(kept.randomization)
+        cell.load(scene)
+        (body,) = cell.bodies
+        mass = pybullet.getDynamicsInfo(body, -1, physicsClientId=cell.client)[0]
+    _, (factor,) = kept.randomization["physics"]["object_mass"]
+    assert mass == pytest.approx(factor * scene.placements[0].model.mass)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from utils.errors import UserError
 from utils.files import write_atomic
@@ -82,7 +83,8 @@ class RoundRecord:
     seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, seed).
     A round that ended with "no_plan" has an attempt with that reason at its end.
     controller: how the arm got to its grasps; a policy of a closed loop is called by both, see
-    `contestant`.
+    `contestant`. randomization: what was drawn for the scene (`utils.domain_randomization`), None
+    where it was the nominal cell's.
     """
 
     policy: str
@@ -94,6 +96,7 @@ class RoundRecord:
     attempts: tuple[AttemptRecord, ...]
     ended: str
     controller: str = OPEN_LOOP
+    randomization: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:
