@@ -18,7 +18,7 @@ from models.grasp_examples import LabelledImages
 from models.graspnet import DEPTH_UNIT, GraspNet, to_input
 from models.graspnet_adaptation import Pair
 from models.graspnet_scores import predict
-from models.photographs import frame_of, from_above
+from models.photographs import K, frame_of, from_above
 from models.real_training_data import IN_MEMORY, Changed, Chosen
 from models.rectangle_examples import RectangleImages, View
 from models.training_data import TrainingData
@@ -27,19 +27,28 @@ from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
 from utils.errors import UserError
 from utils.real_data import RealSample
+from utils.table_camera import FLAT, FROM_BASE, table_misses
 from utils.unlabelled_images import KEY, UnlabelledImages
 
 # Of a photograph, what simulated training images are changed by, too: no change tells the domain.
 AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
 STANDS_OUT = (0.01, 0.15)  # m above the table: what a crop is laid around, as on simulated images
 MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
+CHECKED = 12  # images of a folder, spread over it, that tell whether it holds what it has to
+# How many times worse any other reading of an image has to explain the table for its numbers to be
+# distances from a base. For each of Cornell's 80 photographs in folder 01 that is 17 to 22 (0.8 to
+# 1.2 mm as distances, 16 to 22 mm as depths). For depths rendered in the cell, of cameras 0 to 37
+# degrees from straight down, with a Kinect's noise or without, it is at most 1.01; for distances
+# made of these at least 8.6, or 3.1 where the table fills no more than half of the image's middle.
+DISTINCT = 2.0
 INFORMATION_STEP = 4  # pixels between those whose predictions are asked; neighbours say the same
 
 
 def open_target(config: Config) -> Sequence[RealSample] | None:
     """The images of `adaptation.target`, or None where nothing is adapted.
 
-    Raises UserError for data that cannot be adapted from, and for a folder that cannot be used.
+    Raises UserError for data that cannot be adapted from, and for a folder that cannot be used or
+    whose images hold something else than distances from a robot's base.
     """
     folder = config.adaptation.target
     if folder is None:
@@ -49,7 +58,33 @@ def open_target(config: Config) -> Sequence[RealSample] | None:
             f"{KEY}={folder}: data.kind is {config.data.kind}, but adaptation is from simulated "
             "images; use data.kind=simulated, or leave adaptation.target out"
         )
-    return UnlabelledImages(folder)
+    images = UnlabelledImages(folder)
+    check_distances(images)
+    return images
+
+
+def check_distances(images: UnlabelledImages) -> None:
+    """Raise UserError unless a table explains the typical image as distances from a robot's base,
+    and far better so than as depths or as distances from the camera: it would be misread."""
+    chosen = np.linspace(0, len(images) - 1, min(len(images), CHECKED)).round().astype(int)
+    each = [table_misses(images[i].depth, K) for i in chosen]
+    misses = {reading: float(np.median([one[reading] for one in each])) for reading in each[0]}
+    fits = {reading: f"{1000 * miss:.1f} mm" for reading, miss in misses.items()}
+    likely = min(misses, key=misses.get)
+    if misses[likely] > FLAT:
+        raise UserError(
+            f"{KEY} {images.root}: the files NAMEd.tiff show no flat table: the typical pixel is "
+            f"{fits[likely]} off the best one, at most {1000 * FLAT:g} mm are allowed; give images "
+            "whose middle shows mostly table"
+        )
+    needed = misses.pop(FROM_BASE)
+    likely = min(misses, key=misses.get)
+    if misses[likely] < DISTINCT * needed:
+        raise UserError(
+            f"{KEY} {images.root}: the files NAMEd.tiff seem to hold {likely} (a flat table fits "
+            f"to {fits[likely]}), expected {FROM_BASE} (it fits to {fits[FROM_BASE]}); make these "
+            "of them by utils.table_camera.distances, as docs/sim_to_real.md shows"
+        )
 
 
 def seen_from_above(sample: RealSample, metres_per_pixel: float) -> RealSample:

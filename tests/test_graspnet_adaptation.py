@@ -22,6 +22,7 @@ from models.graspnet import create_model
 from models.graspnet_adaptation import AdaptingTrainer, Pair
 from models.graspnet_io import KIND, load_graspnet
 from models.graspnet_training import Team
+from models.photographs import K, frame_of
 from models.target_images import (
     STANDS_OUT,
     AdaptationData,
@@ -39,6 +40,7 @@ from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, s
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
+from utils.table_camera import distances
 from utils.unlabelled_images import UnlabelledImages
 
 ALONE = Team(0, 1, torch.device("cpu"))
@@ -221,10 +223,17 @@ def test_resumed_steps_are_the_same_bit_for_bit(tmp_path, config, weight):
 # --- Photographs ------------------------------------------------------------------------------
 
 
+def rewrite_depths(folder: Path, change) -> None:
+    for file in folder.glob("*d.tiff"):
+        depth = np.asarray(Image.open(file))
+        Image.fromarray(change(depth).astype(np.float32)).save(file)
+
+
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory) -> Path:
     """Six pairs in Cornell's names whose labels nobody could read."""
     folder = write_cornell(tmp_path_factory.mktemp("target"), 6, shape=KINECT)
+    rewrite_depths(folder, lambda depth: distances(depth, K))
     for labels in folder.glob("*.txt"):
         labels.write_text("no label of the target is ever read")
     return folder
@@ -263,6 +272,40 @@ def test_folders_that_cannot_be_a_target(photographs, tmp_path):
     (other / "pcd0101d.tiff").unlink()
     with pytest.raises(UserError, match="1 files are missing: pcd0101d.tiff"):
         UnlabelledImages(other)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 20.0, 37.0])
+def test_depths_and_distances_from_the_camera_are_not_misread(tmp_path, tilt):
+    """A table under a camera tilted so, 0.9 m along its axis, with 1 mm of noise: read as what it
+    is not, a folder is refused with what it seems to hold; turned into distances it is taken."""
+    rays = (np.moveaxis(np.mgrid[:480, :640], 0, -1)[..., ::-1] - [319.5, 239.5]) / 525
+    slope = np.tan(np.radians(tilt))
+    rng = np.random.default_rng(0)
+    flat = 0.9 / (1 + slope * rays[..., 1])
+
+    def depths(_):
+        return flat + 0.001 * rng.standard_normal(flat.shape)
+
+    folder = write_cornell(tmp_path / "target", 5, shape=KINECT)
+    rewrite_depths(folder, depths)
+    with pytest.raises(UserError, match="adaptation.target .*seem to hold depths along"):
+        open_target(target_config(folder))
+    rewrite_depths(folder, lambda depth: distances(depth, K))
+    sample = open_target(target_config(folder))[0]
+    np.testing.assert_allclose(frame_of(sample, 1.0).depth, flat, atol=0.02)
+    rewrite_depths(folder, lambda _: depths(_) * np.sqrt(1 + (rays**2).sum(axis=-1)))
+    with pytest.raises(UserError, match="seem to hold distances from the camera"):
+        open_target(target_config(folder))
+
+
+def test_images_without_a_table_are_refused(tmp_path):
+    """Waves of 10 cm instead."""
+    v, u = np.mgrid[:480, :640]
+    bumps = 1.0 + 0.1 * np.sin(u / 25) * np.sin(v / 25)
+    folder = write_cornell(tmp_path / "target", 5, shape=KINECT)
+    rewrite_depths(folder, lambda depth: distances(bumps, K))
+    with pytest.raises(UserError, match="adaptation.target .*show no flat table.* at most 3 mm"):
+        open_target(target_config(folder))
 
 
 def test_several_processes_cannot_adapt():

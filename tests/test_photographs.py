@@ -3,16 +3,30 @@
 import numpy as np
 import pytest
 
+from envs.camera import Intrinsics
+from envs.cell import Cell
+from envs.objects import load_object_set
+from envs.scenes import make_scene
 from models import photographs
 from models.graspnet_io import SavedGraspNet
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
+from models.target_images import DISTINCT
 from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
 from tests.test_real_training import write_cornell
+from utils.depth_noise import KinectNoise
 from utils.errors import UserError
 from utils.overhead_view import overhead_view
-from utils.real_data import RealSample
+from utils.real_data import RealSample, fill_depth_holes
 from utils.rectangles import GraspRectangle
-from utils.table_camera import find_table_camera
+from utils.table_camera import (
+    DEPTHS,
+    FLAT,
+    FROM_BASE,
+    FROM_CAMERA,
+    distances,
+    find_table_camera,
+    table_misses,
+)
 from utils.transforms import Grasp, RGBDFrame, deproject, look_at, project
 
 # Cornell's camera looks down like this: 0.73 m over the table, 37 degrees from straight down.
@@ -59,6 +73,50 @@ def test_noise_leaves_heights_true_to_millimetres():
     found = RGBDFrame(true.rgb, camera.depth(sample.depth, K), K, camera.T_WC)
     top = true.points()[..., 2] > BOX[2] - 1e-4
     assert np.median(found.points()[top, 2]) == pytest.approx(BOX[2], abs=2e-3)
+
+
+def test_distances_are_what_the_table_s_camera_undoes():
+    sample, true = photographed()
+    from_robot = true.T_WC[:3, :3].T @ (ROBOT - true.T_WC[:3, 3])
+    np.testing.assert_allclose(distances(true.depth, K, from_robot), sample.depth, atol=1e-6)
+    found = find_table_camera(distances(true.depth, K), K).depth(distances(true.depth, K), K)
+    np.testing.assert_allclose(found, true.depth, atol=3e-3)
+
+
+def test_a_bare_table_tells_what_an_image_holds():
+    """Without noise only what is true explains it exactly; a reading that is not is off by more
+    than a Kinect's noise, but for depths read as distances from a base."""
+    sample, true = photographed(box=None)
+    slant = np.linalg.norm(true.points() - T_WC[:3, 3], axis=-1)
+    for image, reading in (
+        (sample.depth, FROM_BASE), (true.depth, DEPTHS), (slant, FROM_CAMERA),
+    ):  # fmt: skip
+        misses = table_misses(image, K)
+        assert misses[reading] < 1e-4
+        assert all(miss > FLAT for other, miss in misses.items()
+                   if other not in (reading, FROM_BASE))  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tilt", [0, 15, 37])
+def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
+    """With a Kinect's noise: what `models.target_images.DISTINCT` lies between."""
+    vertical = float(np.degrees(2 * np.arctan(240 / 525)))
+    angle, middle = np.radians(tilt), np.array([0.5, 0.0, 0.0])
+    eye = middle + 0.75 * np.array([-np.sin(angle), 0.0, np.cos(angle)])
+    objects = load_object_set("primitives", cache_dir=config.cache_folder)
+    with Cell(config) as cell:
+        cell.load(make_scene("pile", objects, 1, config, cell.client))
+        T_WC = look_at(eye, middle, (0.0, 1.0, 0.0))
+        clean = cell.image(Intrinsics(640, 480, vertical, 0.1, 2.0), T_WC).depth
+    depth = fill_depth_holes(KinectNoise()(clean, np.random.default_rng(0)))
+
+    def other_readings(image: np.ndarray) -> float:
+        misses = table_misses(image, K)
+        base = misses.pop(FROM_BASE)
+        return min(misses.values()) / base
+
+    assert other_readings(depth) < 1.1 < DISTINCT < 3 < other_readings(distances(depth, K))
 
 
 # --- From above ------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ robot they leave it flat, and say where camera and robot are. This module knows 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,10 @@ FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel coun
 # the robot on the camera's side of the table.
 STEEP = np.array([0.0, 0.8, 1.0])
 ROBOT = np.array([0.0, 0.8, 0.2])
+# What an image of distances in metres may hold.
+FROM_BASE = "distances from a robot's base"
+DEPTHS = "depths along the optical axis"
+FROM_CAMERA = "distances from the camera"
 
 
 @dataclass(frozen=True)
@@ -60,20 +65,59 @@ def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
     A robust fit (Cauchy's loss), for which objects and walls hardly count. An origin on either
     side of the table would explain the image alike; the search starts from the upper one.
     """
-    height, width = distance.shape
-    rows, columns = (
-        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP)
-        for length in (height, width)
-    )
-    rays = _rays(distance.shape, K)[rows, columns].reshape(-1, 3)
-    seen = distance[rows, columns].ravel().astype(float)
+    found, _ = _fit_distances(*_middle(distance, K))
+    return TableCamera(found[:3], found[3:])
+
+
+def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
+    """By what an image (H, W) of metres may hold: how far, in metres, the typical pixel of its
+    middle is from the table that explains it best as that (the median of the absolute values).
+
+    Six numbers explain an image of distances from a base, three one of depths or of distances from
+    the camera; so the former can be no worse by much even where one of the latter is the truth.
+    """
+    rays, seen = _middle(image, K)
+    slant = np.linalg.norm(rays, axis=1)
+
+    def off(guess: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+        return stretch / (rays @ guess) - seen
+
+    misses = {FROM_BASE: _fit_distances(rays, seen)[1]}
+    for reading, stretch in ((DEPTHS, np.ones_like(slant)), (FROM_CAMERA, slant)):
+        misses[reading] = _robust(off, STEEP, stretch)[1]
+    return misses
+
+
+def distances(depth: np.ndarray, K: np.ndarray, origin: np.ndarray = ROBOT) -> np.ndarray:
+    """(H, W) float32 metres from an origin (3,) in the optical frame, not the camera itself, of
+    what is seen at depths (H, W): the inverse of `TableCamera.depth`."""
+    points = _rays(depth.shape, K) * depth[..., None]
+    return np.linalg.norm(points - origin, axis=-1).astype(np.float32)
+
+
+def _fit_distances(rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
+    """(6,) table and origin, and how far the typical pixel is from them."""
 
     def off(guess: np.ndarray) -> np.ndarray:
         points = rays / (rays @ guess[:3])[:, None]
         return np.linalg.norm(points - guess[3:], axis=1) - seen
 
-    found = least_squares(off, np.concatenate([STEEP, ROBOT]), loss="cauchy", f_scale=FLAT).x
-    return TableCamera(found[:3], found[3:])
+    return _robust(off, np.concatenate([STEEP, ROBOT]))
+
+
+def _robust(off: Callable[..., np.ndarray], start: np.ndarray, *given) -> tuple[np.ndarray, float]:
+    """What makes most of the errors `off` small, and the median of their absolute values there."""
+    found = least_squares(off, start, loss="cauchy", f_scale=FLAT, args=given)
+    return found.x, float(np.median(np.abs(found.fun)))
+
+
+def _middle(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) rays of pixels in the middle of an image, and what it holds there (n,)."""
+    rows, columns = (
+        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP) for length in image.shape
+    )
+    rays = _rays(image.shape, K)[rows, columns].reshape(-1, 3)
+    return rays, image[rows, columns].ravel().astype(float)
 
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:

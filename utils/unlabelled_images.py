@@ -32,7 +32,7 @@ class UnlabelledImages(RealDataset):
 
     Cornell's names `pcdNNNNr.png` are such names. Raises UserError, when it is opened, if there is
     no such folder, if a file of a pair is missing, if there are fewer than `FEWEST` images, or
-    if one is not of `SIZE`.
+    if one is not of `SIZE`. What the depths hold is for others to check (`models.target_images`).
     """
 
     def __init__(self, root: str | Path) -> None:
