@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
+import evaluate
 from envs.beliefs import teach, true_beliefs
 from envs.cell import Cell, wrist_mount
 from envs.challenges import CHALLENGES
@@ -24,6 +28,8 @@ from envs.wrist_camera import WristCamera
 from utils.config import load_config
 from utils.tabletop import planar_part
 from utils.transforms import Grasp, top_down_pose
+
+REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +181,22 @@ def test_a_wrong_calibration_does_not_hurt_what_was_shown(cell, scene, controlle
         max_failures=1, scenario="miscalibrated", controller=controller,
     )  # fmt: skip
     assert record.successes == 1
+
+
+@pytest.mark.slow
+def test_evaluate_scores_closed_loops(tmp_path, monkeypatch):
+    """The command of docs/sim_to_real.md, on one object."""
+    monkeypatch.chdir(tmp_path)
+    settings = (
+        "world=mujoco", "sim.renderer=tiny", "evaluate.object_sets=box", "evaluate.rounds=1",
+        "evaluate.scenarios=moved", "evaluate.controllers=open_loop,hybrid", "evaluate.workers=1",
+    )  # fmt: skip
+    config = REPOSITORY / "configs" / "servo.yaml"
+    assert evaluate.main(["--config", str(config), "--results", "results.json", *settings]) == 0
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    assert [(row["policy"], row["success_rate"]) for row in rows] == [
+        ("heuristic", 0.0), ("heuristic+hybrid", 1.0),
+    ]  # fmt: skip
 
 
 def test_a_frozen_camera_stops_the_arm(cell):
