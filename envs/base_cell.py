@@ -1,7 +1,7 @@
 """What is the same in every world's cell: cameras, frames, truth, which objects are in the game.
 
-`envs.cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, rounds and
-planners know a cell only as far as it is described here.
+`envs.cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, closed loops,
+disturbances, rounds and planners know a cell only as far as it is described here.
 """
 
 from __future__ import annotations
