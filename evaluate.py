@@ -4,7 +4,7 @@
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
     python evaluate.py --config configs/servo.yaml     # closed loops on what moves
-    python evaluate.py world=mujoco                    # in another simulator
+    python evaluate.py world=mujoco                    # in another simulator, closed loops too
     python evaluate.py --config configs/sim_to_real.yaml  # what is lost from world to world
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in

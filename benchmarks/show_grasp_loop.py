@@ -1,8 +1,8 @@
 """A picture of a closed loop at work: python -m benchmarks.show_grasp_loop [FILE] [SCENARIO]
 
-KEY=VALUE overrides may follow. Above what a bystander sees, below the wrist camera's depth image
-with the points that the law looks at, at four moments of one grasp of the test object that `seed`
-chooses.
+KEY=VALUE overrides may follow, world=mujoco too. Above what a bystander sees, below the wrist
+camera's depth image with the points that the law looks at, at four moments of one grasp of the test
+object that `seed` chooses.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import imageio.v3 as iio
 import numpy as np
 
 from envs.beliefs import teach
-from envs.cell import Cell
 from envs.challenges import CHALLENGES
 from envs.disturbances import disturbed
 from envs.execution import execute_grasp
@@ -25,6 +24,7 @@ from envs.kinematics import forward_kinematics
 from envs.objects import load_object_set
 from envs.scenes import make_scene
 from envs.studio import Studio
+from envs.worlds import make_cell
 from envs.wrist_camera import DepthSight
 from models.planners import make_planner
 from utils.config import load_config
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
-    with Cell(config) as cell:
+    with make_cell(config) as cell:
         taught, challenge = teach(cell), CHALLENGES[scenario]
         cell.load(make_scene(challenge.layout, objects, config.seed, config))
         beliefs, frame = challenge.beliefs(cell), cell.frame()

@@ -1,7 +1,7 @@
 """What is the same in every world's cell: cameras, frames, truth, which objects are in the game.
 
-`envs.cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, rounds and
-planners know a cell only as far as it is described here.
+`envs.cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, closed loops,
+disturbances, rounds and planners know a cell only as far as it is described here.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from envs.camera import Image, Intrinsics
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.safety import ArmGate
 from envs.scenes import Scene
+from envs.servo_target import Board
 from envs.world import on_table
 from utils.config import CameraConfig, Config
 from utils.depth_noise import KinectNoise
@@ -41,9 +42,10 @@ class BaseCell(ABC):
     dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
     has the interface of `envs.panda.Panda`. bodies: the simulator's numbers of the objects.
     remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
-    built. sample: what was drawn for this scene alone (`utils.domain_randomization`), None for a
-    nominal cell. on_action: what becomes of each action of a policy that moves the hand in turns;
-    None: it is carried out as it is.
+    built. on_step is called after every physics step with the cell (used to film), before_step
+    before it (used to disturb the objects). sample: what was drawn for this scene alone
+    (`utils.domain_randomization`), None for a nominal cell. on_action: what becomes of each action
+    of a policy that moves the hand in turns; None: it is carried out as it is.
     """
 
     client: int | None = None
@@ -68,6 +70,8 @@ class BaseCell(ABC):
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
+        self.on_step: Callable[[BaseCell], None] | None = None
+        self.before_step: Callable[[BaseCell], None] | None = None
         self.sample: dict[str, Any] | None = None
         self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
 
@@ -82,6 +86,11 @@ class BaseCell(ABC):
     @abstractmethod
     def build(self, scene: Scene) -> None:
         """Rebuild the world from nothing and put the scene's objects at their poses."""
+
+    @abstractmethod
+    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
+        """Rebuild the world with nothing in it but what every scene has and a board that stays at
+        T_WO (4, 4)."""
 
     @abstractmethod
     def step(self, count: int = 1) -> None:
@@ -106,6 +115,11 @@ class BaseCell(ABC):
     @abstractmethod
     def speed(self, index: int) -> float:
         """m/s of an object's centre of mass."""
+
+    @abstractmethod
+    def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
+        """Put an object's body frame at T_WO (4, 4), on its way at `velocity` (3,) m/s and turning
+        at `turn_rate` rad/s about +z of W; physics has it from there."""
 
     @abstractmethod
     def touches_table(self, index: int) -> bool:

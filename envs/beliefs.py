@@ -13,14 +13,11 @@ import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pybullet
 from scipy.spatial.transform import Rotation
 
 from envs.base_cell import BaseCell, wrist_mount
 from envs.camera import Intrinsics
-from envs.cell import Cell
 from envs.kinematics import forward_kinematics
-from envs.scenes import Scene
 from envs.servo_target import Board
 from utils.tabletop import table_plane
 from utils.transforms import RGBDFrame, inverse_pose
@@ -81,7 +78,7 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
 
 
 @functools.lru_cache(maxsize=2)
-def teach(cell: Cell) -> np.ndarray:
+def teach(cell: BaseCell) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: the board's pose in one image, taken while
     the jig holds the board at a known pose in E. Empties the cell, the first time: a camera has to
     be shown something once only."""
@@ -89,13 +86,11 @@ def teach(cell: Cell) -> np.ndarray:
     intrinsics = Intrinsics(
         servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far
     )
-    cell.build(Scene("isolated", 0, ()))
     T_EB = np.eye(4)  # how the jig is built: the board's middle before the camera's nominal place
     T_EB[:3, :3] = wrist_mount(camera)[:3, :3] @ _BOARD_TURN
     T_EB[:3, 3] = np.add(camera.wrist_position, [0.0, 0.0, _BOARD_DEPTH])
-    board, T_WE = Board(cell=0.009), forward_kinematics(cell.robot.q)
-    body = board.add(cell.client, T_WE @ T_EB)
+    board = Board(cell=0.009)
+    cell.show_board(board, forward_kinematics(cell.home) @ T_EB)
     rgb = cell.look(intrinsics, cell.camera_pose("wrist")).rgb
     T_CB = board.pose(board.find(rgb), intrinsics.K)
-    pybullet.removeBody(body, physicsClientId=cell.client)
     return T_CB @ inverse_pose(T_EB)

@@ -24,11 +24,13 @@ from envs.base_cell import (
 from envs.camera import DEFAULT_LIGHT, Image, Intrinsics, load_renderer, render
 from envs.objects import spawn
 from envs.panda import Panda, panda_urdf
-from envs.scenes import Scene, settle
+from envs.scenes import EMPTY, Scene, settle
+from envs.servo_target import Board
 from envs.world import SOLVER_RESIDUAL, add_bin, add_table, set_up_physics
 from utils.config import Config
 from utils.errors import UserError
 from utils.random_view import RandomView
+from utils.transforms import position_quaternion
 
 __all__ = [
     "ROBOT", "TABLE_OR_BACKGROUND", "Cell", "PhysicsError", "camera_intrinsics", "wrist_mount",
@@ -42,10 +44,9 @@ _CALM_LOOKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
 class Cell(BaseCell):
     """A simulated robot cell.
 
-    `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_step` is called
-    after every physics step with the cell (used to film), `before_step` before it (used to disturb
-    the objects), `on_build` when a scene has been built and nothing has moved yet; `view` changes
-    what cameras see. Close it, or use it in a `with` block.
+    `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_build` is called
+    with the cell when a scene has been built and nothing has moved yet; `view` changes what cameras
+    see. Close it, or use it in a `with` block.
     """
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
@@ -56,8 +57,6 @@ class Cell(BaseCell):
                 "or set world=pybullet"
             )
         self.fine = fine
-        self.on_step: Callable[[Cell], None] | None = None
-        self.before_step: Callable[[Cell], None] | None = None
         self.on_build: Callable[[Cell], None] | None = None
         self.view: RandomView | None = None
         self._gui = gui
@@ -93,6 +92,10 @@ class Cell(BaseCell):
         self.frames = 0
         if self.on_build is not None:
             self.on_build(self)
+
+    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
+        self.build(EMPTY)
+        board.add(self.client, T_WO)
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
@@ -173,6 +176,12 @@ class Cell(BaseCell):
     def speed(self, index: int) -> float:
         velocity, _ = pybullet.getBaseVelocity(self.bodies[index], physicsClientId=self.client)
         return math.hypot(*velocity)
+
+    def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
+        body, client = self.bodies[index], self.client
+        position, quaternion = position_quaternion(T_WO)
+        pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
+        pybullet.resetBaseVelocity(body, velocity, [0, 0, turn_rate], physicsClientId=client)
 
     def touches_table(self, index: int) -> bool:
         contacts = pybullet.getContactPoints(

@@ -32,11 +32,6 @@ class Challenge:
     miscalibrated: bool = False
     latency: float = 0.0
 
-    @property
-    def plain(self) -> bool:
-        """Whether nothing makes it hard beside its layout."""
-        return self == Challenge(self.layout)
-
     def motion(self, cell: BaseCell, attempt: int) -> Displacement | Conveyor | None:
         """What happens to the objects during an attempt, 0 being the first."""
         rng = self._rng(cell, attempt)

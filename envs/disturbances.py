@@ -13,11 +13,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import pybullet
 
-from envs.cell import Cell
+from envs.base_cell import BaseCell
 from utils.tabletop import planar
-from utils.transforms import inverse_pose, position_quaternion
+from utils.transforms import inverse_pose
 
 _START_SECONDS = 0.2  # in which a conveyor gets up to speed: what stands must not topple
 
@@ -70,7 +69,7 @@ class Conveyor:
 
 
 @contextlib.contextmanager
-def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[None]:
+def disturbed(cell: BaseCell, motion: Displacement | Conveyor | None) -> Iterator[None]:
     """Within the block a motion carries the objects of the cell, from now on, unless it is None."""
     if motion is None or not cell.remaining:
         yield
@@ -85,37 +84,27 @@ def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[No
 class _Carrier:
     """Carries all bodies along one motion, until something ends it."""
 
-    def __init__(self, cell: Cell, motion: Displacement | Conveyor):
+    def __init__(self, cell: BaseCell, motion: Displacement | Conveyor):
         self.motion, self.start = motion, cell.seconds
         self.poses = {index: cell.object_pose(index) for index in cell.remaining}
         first = self.poses[min(self.poses)]
         self.pivot = planar(*first[:2, 3], 0.0)
         self.over = False
 
-    def __call__(self, cell: Cell) -> None:
+    def __call__(self, cell: BaseCell) -> None:
         if self.over:
             return
         now = cell.seconds - self.start
-        if now > self.motion.end or any(self._touched(cell, index) for index in self.poses):
+        touched = (cell.robot.touches_body(cell.bodies[index]) for index in self.poses)
+        if now > self.motion.end or any(touched):
             self.over = True
             return
         T, ahead = self._planar(now), self._planar(now + cell.dt)
-        omega = (self.motion(now + cell.dt)[2] - self.motion(now)[2]) / cell.dt
+        turn_rate = (self.motion(now + cell.dt)[2] - self.motion(now)[2]) / cell.dt
         for index, pose in self.poses.items():
-            position, quaternion = position_quaternion(T @ pose)
             velocity = ((ahead - T) @ pose)[:3, 3] / cell.dt
-            body = cell.bodies[index]
-            pybullet.resetBasePositionAndOrientation(
-                body, position, quaternion, physicsClientId=cell.client
-            )
-            pybullet.resetBaseVelocity(body, velocity, [0, 0, omega], physicsClientId=cell.client)
+            cell.carry(index, T @ pose, velocity, turn_rate)
 
     def _planar(self, seconds: float) -> np.ndarray:
         """(4, 4) motion in W, about the first object's centre."""
         return self.pivot @ planar(*self.motion(seconds)) @ inverse_pose(self.pivot)
-
-    def _touched(self, cell: Cell, index: int) -> bool:
-        contacts = pybullet.getContactPoints(
-            bodyA=cell.robot.body, bodyB=cell.bodies[index], physicsClientId=cell.client
-        )
-        return any(contact[8] <= 0.0 for contact in contacts)

@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from envs.base_cell import BaseCell
 from envs.beliefs import CameraBeliefs
 from envs.blind_descent import AVOIDANCE_GAIN, DAMPING, BlindDescent
 from envs.camera import Intrinsics
-from envs.cell import Cell
 from envs.execution import HALF_TURN, Around, GraspFailure
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.panda import MAX_OPENING
@@ -107,7 +107,7 @@ class ClosedLoop:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: BaseCell,
         controller: str,
         frame: RGBDFrame,
         beliefs: CameraBeliefs,
@@ -128,7 +128,7 @@ class ClosedLoop:
         self.goal_T_CE = T_CE
         self.record = LoopRecord()
 
-    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+    def __call__(self, cell: BaseCell, grasp: Grasp) -> Around:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
         robot, settings = cell.robot, cell.config.grasp
         robot.command_gripper(min(grasp.width, MAX_OPENING))

@@ -126,11 +126,13 @@ def _shine(model: mujoco.MjModel, light: dict) -> None:
     number = model.light(LIGHT).id
     model.light_dir[number] = -direction / np.linalg.norm(direction)
     model.light_pos[number] = light["lightDistance"] * -model.light_dir[number]
-    model.light_ambient[number] = light["lightAmbientCoeff"] * colour
     model.light_diffuse[number] = light["lightDiffuseCoeff"] * colour
     model.light_specular[number] = light["lightSpecularCoeff"] * colour
     model.light_castshadow[number] = bool(light["shadow"])
-    for part in ("ambient", "diffuse", "specular"):
+    # A light's own ambient share is missing in its shadow, the headlight's is not.
+    model.light_ambient[number] = 0.0
+    model.vis.headlight.ambient = light["lightAmbientCoeff"] * colour
+    for part in ("diffuse", "specular"):
         setattr(model.vis.headlight, part, [0.0, 0.0, 0.0])
 
 

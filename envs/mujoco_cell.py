@@ -1,13 +1,13 @@
 """The robot cell in MuJoCo: the same scenes, cameras and robot as in PyBullet, other physics.
 
-What PyBullet's cell can do beyond `envs.base_cell`, such as being disturbed or randomised, is not
-to be had here.
+What PyBullet's cell can do beyond `envs.base_cell`, which is to be randomised and to spare its
+solver, is not to be had here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,24 +15,24 @@ from envs.base_cell import ROBOT, TABLE_OR_BACKGROUND, BaseCell, PhysicsError
 from envs.camera import Image, Intrinsics
 from envs.mujoco_camera import MujocoCamera
 from envs.mujoco_panda import MujocoPanda, load_mujoco
-from envs.mujoco_scene import scene_spec
-from envs.scenes import LOOK_EVERY, REST_SPEED, Scene
+from envs.mujoco_scene import add_board, scene_spec
+from envs.scenes import EMPTY, LOOK_EVERY, REST_SPEED, Scene
+from envs.servo_target import Board
 from utils.config import Config
-from utils.transforms import pose_matrix
+from utils.transforms import pose_matrix, position_quaternion
+
+if TYPE_CHECKING:
+    import mujoco
 
 SUBSTEPS = 4  # of MuJoCo in one of the cell's steps: a grip lasts through about one millisecond
 
 
 class MujocoCell(BaseCell):
-    """A cell simulated by MuJoCo. `on_step` is called after every step with the cell.
-
-    Raises UserError where MuJoCo is not installed.
-    """
+    """A cell simulated by MuJoCo. Raises UserError where MuJoCo is not installed."""
 
     def __init__(self, config: Config):
         super().__init__(config)
         self._mujoco = load_mujoco()
-        self.on_step: Callable[[MujocoCell], None] | None = None
         self._camera: MujocoCamera | None = None
 
     def load(self, scene: Scene) -> None:
@@ -43,10 +43,18 @@ class MujocoCell(BaseCell):
                 break
 
     def build(self, scene: Scene) -> None:
+        self._build(scene, scene_spec(scene))
+
+    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
+        spec = scene_spec(EMPTY)
+        add_board(spec, board, T_WO)
+        self._build(EMPTY, spec)
+
+    def _build(self, scene: Scene, spec: mujoco.MjSpec) -> None:
         self._free_camera()
         self.scene = scene
         grip_force = self.config.robot.grip_force
-        self.robot = MujocoPanda(self._new_gate(), scene_spec(scene), self.dt, SUBSTEPS, grip_force)
+        self.robot = MujocoPanda(self._new_gate(), spec, self.dt, SUBSTEPS, grip_force)
         model = self.robot.model
         # A blown-up world is for `check_physics` to tell; MuJoCo would quietly start it again.
         model.opt.disableflags |= self._mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -65,14 +73,17 @@ class MujocoCell(BaseCell):
         return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
 
     def step(self, count: int = 1) -> None:
-        if self.on_step is None:
+        if self.on_step is None and self.before_step is None:
             self.robot.step(count)
             self.steps += count
             return
         for _ in range(count):
+            if self.before_step is not None:
+                self.before_step(self)
             self.robot.step()
             self.steps += 1
-            self.on_step(self)
+            if self.on_step is not None:
+                self.on_step(self)
 
     def check_physics(self) -> None:
         super().check_physics()
@@ -96,6 +107,13 @@ class MujocoCell(BaseCell):
     def speed(self, index: int) -> float:
         start = self._speeds[index]
         return math.hypot(*self.robot.data.qvel[start : start + 3])
+
+    def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
+        place, speed, data = self._places[index], self._speeds[index], self.robot.data
+        position, quaternion = position_quaternion(T_WO)
+        data.qpos[place : place + 7] = [*position, *np.roll(quaternion, 1)]
+        # A free joint turns about the body's own axes, along which +z of W is this row.
+        data.qvel[speed : speed + 6] = [*velocity, *(turn_rate * T_WO[2, :3])]
 
     def touches_table(self, index: int) -> bool:
         return self.robot.meet(self.bodies[index], self._table)

@@ -309,6 +309,11 @@ class MujocoPanda(GuardedArm):
         """Whether anything touches the robot."""
         return len(self._robot_contacts()) > 0
 
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body, by MuJoCo's number, are in contact."""
+        touching = self.data.contact.geom[self._robot_contacts()]
+        return bool((self.model.geom_bodyid[touching] == body).any())
+
     def palm_touches(self) -> bool:
         """Whether anything presses on the hand itself, not only on its fingers."""
         hand = [self._links[name] for name in _HAND_LINKS]

@@ -15,7 +15,9 @@ from envs.mujoco_camera import add_view
 from envs.mujoco_panda import load_mujoco, panda_spec
 from envs.objects import ObjectModel
 from envs.scenes import Scene
+from envs.servo_target import BLACK, WHITE, Board
 from envs.world import BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, GRAVITY, TABLE_CENTRE, TABLE_SIZE
+from utils.transforms import position_quaternion
 
 if TYPE_CHECKING:
     import mujoco
@@ -60,6 +62,24 @@ def scene_spec(scene: Scene) -> mujoco.MjSpec:
         geom.solref[0] = _CONTACT_TIME
     add_view(spec)
     return spec
+
+
+def add_board(spec: mujoco.MjSpec, board: Board, T_WO: np.ndarray) -> None:
+    """Add a board to a model that is only looked at: it stays at T_WO (4, 4) and collides with
+    nothing."""
+    mujoco = load_mujoco()
+    position, quaternion = position_quaternion(T_WO)
+    body = spec.worldbody.add_body(
+        name="board", pos=list(position), quat=np.roll(quaternion, 1).tolist()
+    )
+    half, middle = board.white()
+    white = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=middle, rgba=list(WHITE))
+    vertices, triangles = board.black()
+    mesh = spec.add_mesh(name="board", uservert=np.ravel(vertices), userface=triangles)
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a plane has no volume
+    black = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=list(BLACK))
+    for geom in (white, black):
+        geom.contype = geom.conaffinity = 0
 
 
 def _box(mujoco, spec: mujoco.MjSpec, name: str, half_size, position, colour) -> None:

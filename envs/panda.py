@@ -217,6 +217,13 @@ class Panda(GuardedArm):
         """Whether anything touches the robot, or is so near that Bullet already looks at it."""
         return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
 
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body are in contact."""
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body, bodyB=body, physicsClientId=self.client
+        )
+        return any(contact[8] <= 0.0 for contact in contacts)
+
     def palm_touches(self) -> bool:
         """Whether anything presses on the hand itself, not only on its fingers."""
         contacts = pybullet.getContactPoints(

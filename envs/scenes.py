@@ -46,6 +46,9 @@ class Scene:
     placements: tuple[Placement, ...]
 
 
+EMPTY = Scene("isolated", 0, ())
+
+
 class SceneError(UserError):
     """No valid scene could be made."""
 

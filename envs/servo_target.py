@@ -35,7 +35,7 @@ _CELL_PIXELS = 10  # of the pattern to which the image is aligned
 _BLACK_HEIGHT = 1e-4  # m by which the black stands out of the white, so that it is what is seen
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners' columns and rows, clockwise
 _OUTERMOST = _MARGIN + (_CELLS - 2 * _MARGIN) * _SQUARE  # corners of the markers
-_WHITE, _BLACK = (0.95, 0.95, 0.95, 1.0), (0.03, 0.03, 0.03, 1.0)
+WHITE, BLACK = (0.95, 0.95, 0.95, 1.0), (0.03, 0.03, 0.03, 1.0)
 _MASS = 0.05  # kg, of a board that is carried
 _ALIGNED = 0.9  # least correlation of the board's image with its pattern; a free view has 0.98
 
@@ -77,18 +77,17 @@ class Board:
 
         It stays where it is unless it is `carried`, which gives it a mass.
         """
-        half = [self.size / 2, self.size / 2, self.thickness / 2]
-        below = [0.0, 0.0, -_BLACK_HEIGHT - self.thickness / 2]
-        vertices, triangles = self._black()
+        half, below = self.white()
+        vertices, triangles = self.black()
         position, quaternion = position_quaternion(T_WO)
         white = pybullet.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=half, visualFramePosition=below, rgbaColor=_WHITE,
+            pybullet.GEOM_BOX, halfExtents=half, visualFramePosition=below, rgbaColor=WHITE,
             specularColor=[0, 0, 0], physicsClientId=client,
         )  # fmt: skip
         # Geometry and not a texture: its edges are where they are said to be to the last digit.
         black = pybullet.createVisualShape(
             pybullet.GEOM_MESH, vertices=vertices, indices=triangles,
-            normals=[[0, 0, 1]] * len(vertices), rgbaColor=_BLACK, specularColor=[0, 0, 0],
+            normals=[[0, 0, 1]] * len(vertices), rgbaColor=BLACK, specularColor=[0, 0, 0],
             physicsClientId=client,
         )  # fmt: skip
         solid = pybullet.createCollisionShape(
@@ -141,8 +140,13 @@ class Board:
         T_CO[:3, :3], T_CO[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
         return T_CO
 
-    def _black(self) -> tuple[list, list]:
-        """Vertices (n, 3) in O and triangles (3 m,) of all black cells."""
+    def white(self) -> tuple[list[float], list[float]]:
+        """Half sizes (3,) of the box behind the black cells, and its middle (3,) in O, metres."""
+        half = [self.size / 2, self.size / 2, self.thickness / 2]
+        return half, [0.0, 0.0, -_BLACK_HEIGHT - self.thickness / 2]
+
+    def black(self) -> tuple[list, list]:
+        """Vertices (n, 3) in O and triangles (3 m,), their corners' numbers, of all black cells."""
         black = np.argwhere(_cells() == 0)[:, ::-1]
         vertices = self._place((black[:, None] + _SQUARE[::-1]).reshape(-1, 2))
         first = 4 * np.arange(len(black))[:, None]

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import pybullet
 
+from envs.base_cell import BaseCell, wrist_mount
 from envs.camera import Intrinsics
-from envs.cell import Cell, wrist_mount
+from envs.cell import Cell
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.panda import ARM
 from envs.safety import ArmStoppedError, SafetyGate
@@ -44,19 +45,19 @@ class Sight(NamedTuple):
     seconds: float
 
 
-def servo_period(cell: Cell) -> int:
+def servo_period(cell: BaseCell) -> int:
     """Physics steps from one image to the next."""
     return max(1, round(cell.config.sim.frequency / cell.config.servo.rate))
 
 
-def servo_intrinsics(cell: Cell, mounting: str) -> Intrinsics:
+def servo_intrinsics(cell: BaseCell, mounting: str) -> Intrinsics:
     """Of the wrist (eye_in_hand) or overhead (eye_to_hand) camera, in the servo's resolution."""
     camera, servo = cell.config.camera, cell.config.servo
     fov = camera.wrist_fov_deg if _mount(mounting) == "wrist" else camera.fov_deg
     return Intrinsics(servo.width, servo.height, fov, camera.near, camera.far)
 
 
-def servo_settings(cell: Cell, mounting: str) -> dict:
+def servo_settings(cell: BaseCell, mounting: str) -> dict:
     """Arguments for a `VisualServo` of this cell: `camera_config`, and `dt` between two images."""
     intrinsics = servo_intrinsics(cell, mounting)
     config = {
@@ -87,7 +88,7 @@ def view_of(board: Board, camera: ServoCamera, T_CO: np.ndarray) -> View:
 class BoardCamera:
     """One of the cell's cameras, and the eyes that find the board in its images."""
 
-    def __init__(self, cell: Cell, board: Board, mounting: str):
+    def __init__(self, cell: BaseCell, board: Board, mounting: str):
         self.cell, self.board = cell, board
         self.intrinsics, self.mount = servo_intrinsics(cell, mounting), _mount(mounting)
 
@@ -135,7 +136,7 @@ class GuardedArm:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: BaseCell,
         carried: CarriedBoard | None = None,
         safety: SafetyConfig | None = None,
     ):
@@ -185,7 +186,7 @@ class GuardedArm:
 
 
 def servo_arm(
-    cell: Cell,
+    cell: BaseCell,
     servo: VisualServo,
     goal: View,
     see: Callable[[], Sight | None],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.cell import Cell
+from envs.base_cell import BaseCell
 from envs.execution import HALF_TURN
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, UnreachableError, inverse_kinematics
 
@@ -17,7 +17,7 @@ _LITTLE_ROOM = 0.3  # rad of it at which the other way round is looked at
 _LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
 
 
-def turned_is_better(cell: Cell, T_WE: np.ndarray) -> bool:
+def turned_is_better(cell: BaseCell, T_WE: np.ndarray) -> bool:
     """Whether to turn a gripper pose (4, 4) round before setting out for it: the smaller turn of
     the wrist that leaves it room to turn with the object. Raises UnreachableError if neither way
     is in reach."""
@@ -26,7 +26,7 @@ def turned_is_better(cell: Cell, T_WE: np.ndarray) -> bool:
     return min(roomy, key=lambda turned: abs(ways[turned][-1] - now))
 
 
-def must_turn(cell: Cell, T_WE: np.ndarray) -> bool:
+def must_turn(cell: BaseCell, T_WE: np.ndarray) -> bool:
     """Whether to turn round on the way to a gripper pose (4, 4), where the wrist, following the
     object, is about to meet its limit."""
     try:
@@ -38,7 +38,7 @@ def must_turn(cell: Cell, T_WE: np.ndarray) -> bool:
     return kept < _LITTLE_ROOM < other and abs(ways[True][-1] - now) < _LONGEST_TURN
 
 
-def _ways(cell: Cell, T_WE: np.ndarray) -> dict[bool, np.ndarray]:
+def _ways(cell: BaseCell, T_WE: np.ndarray) -> dict[bool, np.ndarray]:
     """Joint positions (7,) at a pose as it is (False) and turned by half a turn (True), those that
     can be reached; raises UnreachableError if there are none."""
     ways, error = {}, None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from envs.base_cell import BaseCell
 from envs.cell import Cell
-from envs.challenges import CHALLENGES
 from envs.mujoco_cell import MujocoCell
 from utils.config import Config, with_settings
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
-from utils.round_records import OPEN_LOOP
 
 WORLDS = {"pybullet": Cell, "mujoco": MujocoCell}
 
@@ -41,21 +39,5 @@ def in_world(config: Config, world: str) -> Config:
 
 def check_world(config: Config) -> None:
     """Raise UserError for what is to be evaluated and cannot be had in the configured world."""
-    if config.world == "pybullet":
-        return
-    plan = config.evaluate
-    if plan.randomise:
+    if config.world != "pybullet" and config.evaluate.randomise:
         raise UserError("evaluate.randomise=true changes PyBullet's physics; use world=pybullet")
-    plain = [name for name, challenge in CHALLENGES.items() if challenge.plain]
-    for scenario in plan.scenarios:
-        if scenario not in plain:
-            raise UserError(
-                f"evaluate.scenarios: {scenario} disturbs the cell, which world={config.world} "
-                f"cannot; there are {', '.join(plain)}, or use world=pybullet"
-            )
-    for controller in plan.controllers or (config.grasp.controller,):
-        if controller != OPEN_LOOP:
-            raise UserError(
-                f"controller {controller} needs the wrist camera of world=pybullet; use it or "
-                f"evaluate.controllers={OPEN_LOOP}"
-            )

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.base_cell import BaseCell
 from envs.camera import Intrinsics
-from envs.cell import Cell
 from utils.depth_noise import KinectNoise
 
 _NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
@@ -33,7 +33,7 @@ class WristCamera:
     the image: every controller meets the same.
     """
 
-    def __init__(self, cell: Cell, latency: float = 0.0):
+    def __init__(self, cell: BaseCell, latency: float = 0.0):
         camera, grasp = cell.config.camera, cell.config.grasp
         self.cell, self.latency = cell, latency
         self.intrinsics = Intrinsics(
