@@ -34,7 +34,7 @@ from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.studio import Film
 from envs.worlds import in_world, make_cell
-from models.photographs import judge_photographs, photographs, sees_photographs
+from models.photographs import judge_as_taken, judge_photographs, photographs
 from models.planners import make_planner
 from models.rectangle_pictures import draw_rectangles
 from utils.config import (
@@ -80,7 +80,8 @@ from utils.transfer import (
 )
 from utils.transforms import Grasp, RGBDFrame
 
-PHOTOGRAPHS = "cornell"  # the one world of the transfer report that is not simulated
+# The worlds of the transfer report that are not simulated.
+PHOTOGRAPHS = {"cornell": judge_photographs, "cornell_as_taken": judge_as_taken}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -254,7 +255,7 @@ def contests(config: Config) -> list[Contest]:
             plan |= {"scenarios": [scenes[0]], "object_sets": [scenes[1]]}
         here = with_settings(config, "evaluate", plan)
         for world in config.transfer.worlds:
-            if world != PHOTOGRAPHS:
+            if world not in PHOTOGRAPHS:
                 name = scenes_of(rows[0], config)
                 found.append(Contest(world, name, rows, in_world(here, world)))
     return found
@@ -300,17 +301,18 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
         error, interrupted = outcome.error, outcome.interrupted
         if error is not None or interrupted:
             break
-    for who in policies if samples and PHOTOGRAPHS in worlds else []:
+    for who in policies if samples else []:
         # A row with scenes of its own is there to be compared on these.
         if who.scenes is not None or not is_trained(who) or is_learned(who.planner):
             continue
-        if not sees_photographs(who.planner, config.seed):
-            continue
-        judged = judge_photographs(who.planner, samples, config.seed)
-        shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
-        scores[who][PHOTOGRAPHS] = Score(sum(one.correct for _, one in shown), len(samples))
-        if shown:
-            draw_rectangles(run / f"{Path(who.planner).stem}-{PHOTOGRAPHS}.png", *zip(*shown))
+        for world in (world for world in worlds if world in PHOTOGRAPHS):
+            judged = PHOTOGRAPHS[world](who.planner, samples, config.seed)
+            if judged is None:
+                continue
+            shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
+            scores[who][world] = Score(sum(one.correct for _, one in shown), len(samples))
+            if shown:
+                draw_rectangles(run / f"{Path(who.planner).stem}-{world}.png", *zip(*shown))
 
     lines = [
         TransferLine(who, scenes_of(who, config), scores[who], is_trained(who)) for who in policies

@@ -22,7 +22,9 @@ from models.graspnet import to_input
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_planner import GraspNetPlanner
 from models.planners import Planner, make_planner
-from models.rectangle_scores import Judged, judged
+from models.real_training_data import VIEWS
+from models.rectangle_examples import View
+from models.rectangle_scores import Judged, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.overhead_view import overhead_view
@@ -66,17 +68,14 @@ def frame_of(sample: RealSample, shrunk: float = SHRUNK) -> RGBDFrame:
     return RGBDFrame(sample.rgb, depth, K, T_WC)
 
 
-def sees_photographs(planner: str, seed: int) -> bool:
-    """Whether a planner needs no more than a frame."""
-    return not make_planner(planner, HAND, WORKSPACE, seed).needs_truth
-
-
 def judge_photographs(
     planner: str, samples: Sequence[RealSample], seed: int
-) -> list[Judged | None]:
+) -> list[Judged | None] | None:
     """The rectangle metric of a planner's best grasp, or a network's, on every photograph; None
-    where it finds none."""
+    where it finds none, and for a planner that needs more than a frame."""
     planned = make_planner(planner, HAND, WORKSPACE, seed)
+    if planned.needs_truth:
+        return None
     found: list[Judged | None] = []
     for sample in samples:
         frame = frame_of(sample)
@@ -86,6 +85,32 @@ def judge_photographs(
         else:
             found.append(judged(sample, rectangle_of(grasp, frame), grasp.quality))
     return found
+
+
+def judge_as_taken(
+    planner: str, samples: Sequence[RealSample], seed: int
+) -> list[Judged | None] | None:
+    """The same of a network that is given the photographs as one that is trained on them sees them:
+    levelled, at its own scale, but neither from above nor in a smaller world. None for planners of
+    another kind, which have to know where the camera is."""
+    planned = make_planner(planner, HAND, WORKSPACE, seed)
+    if not isinstance(planned, GraspNetPlanner):
+        return None
+    model, view = planned.network.model.eval(), _as_taken(planned.network.metres_per_pixel)
+    found: list[Judged | None] = []
+    for sample in samples:
+        rectangle, quality = best_rectangle(model, view.levelled(sample), view, plate_length=1.0)
+        half_as_long = replace(rectangle, height=rectangle.width / 2)
+        found.append(judged(sample, half_as_long, quality))
+    return found
+
+
+def _as_taken(metres_per_pixel: float) -> View:
+    """Cornell's view in pixels that span `metres_per_pixel`, a multiple of 8 of them."""
+    view = VIEWS["cornell"]
+    span = view.size * view.metres_per_pixel  # m
+    size = 8 * round(span / metres_per_pixel / 8)
+    return replace(view, size=size, metres_per_pixel=span / size)
 
 
 def best_grasp(planner: Planner, frame: RGBDFrame) -> Grasp | None:

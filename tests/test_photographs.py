@@ -9,6 +9,7 @@ from envs.objects import load_object_set
 from envs.scenes import make_scene
 from models import photographs
 from models.graspnet_io import SavedGraspNet
+from models.graspnet_planner import GraspNetPlanner
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
 from models.target_images import DISTINCT
 from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
@@ -209,9 +210,27 @@ def test_the_hand_opens_as_wide_as_the_tutorial_s_network_can_tell():
     assert SHRUNK * HAND.max_opening == pytest.approx(0.15)
 
 
-def test_whoever_needs_the_truth_sees_no_photographs():
-    assert not photographs.sees_photographs("oracle", 0)
-    assert photographs.sees_photographs("random", 0)
+def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monkeypatch):
+    """Of the middle 400 pixels of a photograph, each 1.2 m / 525 wide, a network of 2 mm a pixel
+    sees 8 round(400 * 1.2 / 525 / 0.002 / 8) = 456."""
+    label = GraspRectangle(np.array([320.0, 240.0]), 0.0, 40.0, 20.0)
+    sample, _ = photographed(labels=(label,))
+    network = SavedGraspNet(Opinion((285, 227), radius=0.5), 0.002, {}, {})
+    monkeypatch.setattr(
+        photographs, "make_planner", lambda *_: GraspNetPlanner(network, HAND, WORKSPACE)
+    )
+    (found,) = photographs.judge_as_taken("network.pt", [sample], seed=0)
+    right, down = 400 / 456 * (np.array([285, 227]) - 455 / 2)
+    assert found.rectangle.centre == pytest.approx((319.5 + right, 239.5 + down), abs=1e-3)
+    assert found.rectangle.width == pytest.approx(0.05 / (1.2 / 525), rel=0.01)
+    assert found.rectangle.height == pytest.approx(found.rectangle.width / 2)
+
+
+def test_whoever_cannot_see_photographs_is_not_judged_by_them():
+    sample, _ = photographed()
+    assert judge_photographs("oracle", [sample], seed=0) is None
+    assert judge_photographs("heuristic", [], seed=0) == []
+    assert photographs.judge_as_taken("heuristic", [sample], seed=0) is None
 
 
 def test_images_of_another_size_are_refused(tmp_path):

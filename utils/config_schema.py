@@ -174,7 +174,7 @@ class EvaluateConfig(Section):
     name: Name | None
 
 
-TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell"]
+TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell", "cornell_as_taken"]
 
 
 class TransferPolicy(NamedTuple):

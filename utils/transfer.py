@@ -25,6 +25,7 @@ TITLES = {
     "outside": "PyBullet outside the ranges",
     "mujoco": "MuJoCo",
     "cornell": "Cornell photographs",
+    "cornell_as_taken": "Cornell as taken",
 }
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
 _SHAPES = "osD^v"
