@@ -23,6 +23,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from envs.base_cell import BaseCell
 from envs.challenges import CHALLENGES
@@ -234,12 +235,22 @@ def _film_name(task: Task, policy: str) -> str:
 # --- From one world to another --------------------------------------------------------------
 
 
+class Scenes(NamedTuple):
+    """What a row of the report is scored on."""
+
+    scenarios: tuple[str, ...]
+    objects: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{', '.join(self.scenarios)} of {', '.join(self.objects)}"
+
+
 @dataclass(frozen=True)
 class Contest:
     """Rows of the report that are scored on the same scenes in one world, and how."""
 
     world: str
-    scenes: str
+    scenes: Scenes
     rows: tuple[TransferPolicy, ...]
     config: Config
 
@@ -248,30 +259,48 @@ def contests(config: Config) -> list[Contest]:
     """What there is to play for the transfer report; rows that are not trained are left out."""
     trained = [who for who in config.transfer.policies if is_trained(who)]
     found = []
-    for scenes in dict.fromkeys(who.scenes for who in trained):
-        rows = tuple(who for who in trained if who.scenes == scenes)
+    for scenes in dict.fromkeys(scenes_of(who, config) for who in trained):
+        rows = tuple(who for who in trained if scenes_of(who, config) == scenes)
         plan = {"policies": list(dict.fromkeys(who.planner for who in rows))}
-        if scenes is not None:
-            plan |= {"scenarios": [scenes[0]], "object_sets": [scenes[1]]}
+        plan |= {"scenarios": list(scenes.scenarios), "object_sets": list(scenes.objects)}
         here = with_settings(config, "evaluate", plan)
         for world in config.transfer.worlds:
             if world not in PHOTOGRAPHS:
-                name = scenes_of(rows[0], config)
-                found.append(Contest(world, name, rows, in_world(here, world)))
+                found.append(Contest(world, scenes, rows, in_world(here, world)))
     return found
 
 
-def scenes_of(who: TransferPolicy, config: Config) -> str:
-    """What a row is scored on, in words: 'pile of random_urdfs'."""
-    plan = config.evaluate
-    scenarios, objects = plan.scenarios, plan.object_sets
-    if who.scenes is not None:
-        scenarios, objects = ([one] for one in who.scenes)
-    return f"{', '.join(scenarios)} of {', '.join(Path(name).name for name in objects)}"
+def scenes_of(who: TransferPolicy, config: Config) -> Scenes:
+    """A row's own scenes, or those of the section evaluate."""
+    if who.scenes is None:
+        return Scenes(config.evaluate.scenarios, config.evaluate.object_sets)
+    scenario, objects = who.scenes
+    return Scenes((scenario,), (objects,))
+
+
+def folder_name(scenes: Scenes) -> str:
+    return str(scenes).replace(", ", "-").replace(" ", "_").replace(os.sep, "_")
+
+
+def check_contest(contest: Contest) -> None:
+    """Raise UserError for what cannot be played."""
+    for who in contest.rows:
+        if is_learned(who.planner):
+            try:
+                check_learned(who.planner, contest.scenes.scenarios, [OPEN_LOOP])
+            except UserError as error:
+                raise UserError(
+                    f"transfer.policies: the row {who.policy}, {who.training} is scored on "
+                    f"{contest.scenes}; give it scenes that it can play, such as [isolated, box] "
+                    f"({error})"
+                ) from None
+    check_policies(contest.config)
+    check_cell(contest.config)
+    check_objects(contest.config)
 
 
 def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
-    """The same policies on the same scenes in every world, and how well one foretells another."""
+    """Each policy on the same scenes in every world, and how well one foretells another."""
     worlds, policies = config.transfer.worlds, config.transfer.policies
     if any(controller != OPEN_LOOP for _, controller in contestants(config)):
         raise UserError(
@@ -280,9 +309,7 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
         )
     to_play = contests(config)
     for contest in to_play:
-        check_policies(contest.config)
-        check_cell(contest.config)
-        check_objects(contest.config)
+        check_contest(contest)
     check_resume(config, resume)
     check_writable("--results", results)
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
@@ -291,7 +318,7 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
     scores: dict[TransferPolicy, dict[str, Score]] = {who: {} for who in policies}
     error, interrupted = None, False
     for contest in to_play:
-        folder = run / contest.world / contest.scenes.replace(" ", "_")
+        folder = run / contest.world / folder_name(contest.scenes)
         folder.mkdir(parents=True, exist_ok=True)
         announce(contest.config, folder)
         outcome = evaluate(contest.config, folder)
@@ -315,7 +342,8 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
                 draw_rectangles(run / f"{Path(who.planner).stem}-{world}.png", *zip(*shown))
 
     lines = [
-        TransferLine(who, scenes_of(who, config), scores[who], is_trained(who)) for who in policies
+        TransferLine(who, str(scenes_of(who, config)), scores[who], is_trained(who))
+        for who in policies
     ]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
     complete = error is None and not interrupted

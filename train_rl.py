@@ -6,7 +6,8 @@
 
 Leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
 rl.films=N, films of N episodes in runs/train_rl/<time>/; --weights FILE is the best policy alone.
-RandomizedGrasping-v0 adds episodes/env*.jsonl: what every episode's world was, in evaluations too.
+RandomizedGrasping-v0 adds episodes/STEP/env*.jsonl: the worlds of all episodes of training, in a
+folder for the steps from one checkpoint to the next.
 Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit on the same device and number of
 processes. The first is written after the looks (rl.looks); until then Ctrl-C ends all.
 
@@ -38,7 +39,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.films import film_episode
-from envs.vector import VectorEnvs, WorkerError, make_env, vector_envs
+from envs.vector import VectorEnvs, WorkerError, full_difficulty, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy, policy_for, save_policy
 from models.graspnet_training import Team, choose_device, team
 from models.observations import ObservationLayout
@@ -86,7 +87,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         ppo = make_ppo(config, envs, us)
         run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
         history = load_progress(ppo, envs, run / "last.pt")
-        envs.keep_episodes(run / "episodes", us.rank * envs.num_envs)
         announce(config, run, envs, ppo)
 
         finished = train(config, run, envs, ppo, history)
@@ -96,7 +96,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             save_results(run, history, options.weights if finished else None)
             film(config, run, ppo)
             if not finished:
-                print(f"stopped; go on after {history[-1]['step']:,} steps with --resume {run}")
+                more = "" if options.weights is None else f" --weights {options.weights}"
+                done = history[-1]["step"]
+                print(f"stopped; go on after {done:,} steps with --resume {run}{more}")
     return 0 if finished else 130
 
 
@@ -209,12 +211,14 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
         with stop_on_interrupt() as interrupted, bar:
             while True:
                 if ppo.updates % settings.evaluate_every == 0 or ppo.updates == total:
+                    envs.keep_episodes(None)
                     if not history or history[-1]["update"] < ppo.updates:
                         row = evaluate(config, envs, ppo, watch, step)
                         history.append(row)
                         save_evaluation(run, config, ppo, envs, history, writer, bar)
                     if reached(config, history[-1]) or ppo.updates == total:
                         break
+                    envs.keep_episodes(run / "episodes" / f"{step:09}", us.rank * envs.num_envs)
                     place = (config.seed, TRAINING, us.rank, ppo.updates)
                     collector.restart(derived_seeds(envs.num_envs, *place))
                     ppo.rewards.restart()
@@ -305,7 +309,8 @@ def film(config: Config, run: Path, ppo: GraspPPO) -> None:
         seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
         for number, seed in enumerate(seeds[: config.rl.films]):
             path = run / "films" / f"{number}.mp4"
-            reason = film_episode(env, partial(act_on_one, ppo), seed, path)
+            options = full_difficulty(config.rl.env_id)
+            reason = film_episode(env, partial(act_on_one, ppo), seed, path, options)
             print(f"{path}: {reason}")
         env.close()
 

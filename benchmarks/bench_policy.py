@@ -16,7 +16,7 @@ from tempfile import NamedTemporaryFile
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.vector import make_env
+from envs.vector import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo import KIND
 from models.rollouts import derived_seeds
@@ -52,20 +52,20 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
-    """The config that a checkpoint was trained with, changed by overrides, at full difficulty."""
+    """The config that a checkpoint was trained with, changed by overrides."""
     plain = load_checkpoint(checkpoint, KIND)["config"]
     with NamedTemporaryFile("w", suffix=".yaml") as file:
         json.dump(plain, file)  # JSON is YAML
         file.flush()
-        full = ["env.near_share=0", "randomization.adaptive.enabled=false"]
-        return load_config(Path(file.name), [*overrides, *full])
+        return load_config(Path(file.name), overrides)
 
 
 def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[str, int]]:
-    """Why each of so many deterministic episodes ended, and after how many steps."""
+    """Why each of so many deterministic episodes at full difficulty ended, and after how many
+    steps."""
     env, ends = make_env(config), []
     for seed in derived_seeds(count, config.seed, FRESH):
-        observation, _ = env.reset(seed=seed)
+        observation, _ = env.reset(seed=seed, options=full_difficulty(config.rl.env_id))
         ended, length = False, 0
         while not ended:
             observation, _, terminated, truncated, info = env.step(policy(observation))

@@ -10,18 +10,15 @@ import gymnasium
 import imageio
 import numpy as np
 
-from utils.adaptive_ranges import WIDEST
-
 _HOLD = 6  # pictures for which the last one stays
 
 
 def film_episode(
-    env: gymnasium.Env, act: Callable[[Any], np.ndarray], seed: int, path: Path
-) -> str:
-    """Play an episode, write it to an MP4 or GIF in real time; how it ended, in a word."""
-    options = {"start": "home"} if hasattr(env.unwrapped, "cell") else None
-    if hasattr(env.unwrapped, "randomizer"):
-        options["ranges"] = WIDEST
+    env: gymnasium.Env, act: Callable[[Any], np.ndarray], seed: int, path: Path,
+    options: dict[str, Any] | None = None,
+) -> str:  # fmt: skip
+    """Play an episode, write it to an MP4 or GIF in real time; how it ended, in a word. options: of
+    its reset."""
     observation, info = env.reset(seed=seed, options=options)
     pictures, ended, terminated = [env.render()], False, False
     while not ended:

@@ -105,7 +105,7 @@ class RobotGraspingEnv(gymnasium.Env):
     begins: "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is easier;
     or "look", anywhere that an episode may lead to, to learn to see from: up to 16 looks one after
     the other, without a seed, are at the same scene. Without it a share `near_share` of the
-    episodes begins near.
+    episodes begins near. The attribute `start` is the option that begins there again.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
@@ -142,6 +142,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._studio: Studio | None = None
         self._running = False
         self._looks_left = 0
+        self.start: str | dict[str, Any] = "home"
         self._closed = False
         self._intrinsics = camera_intrinsics(self.config.camera)
         self._T_EC = wrist_mount(self.config.camera)
@@ -185,9 +186,14 @@ class RobotGraspingEnv(gymnasium.Env):
         if self._looks_left <= 0:
             self._make_scene(drawn if asked is None else asked)
             self._looks_left = _LOOKS if start == "look" else 0
+        self.start = start
         if start == "home":
             return self._begin(self.cell.home.copy())
-        q, opening, command = self._start_hand(start)
+        if isinstance(start, str):
+            q, opening, command = self._start_hand(start)
+            self.start = {"q": q.tolist(), "opening": float(opening), "command": float(command)}
+        else:
+            q, opening, command = np.array(start["q"]), start["opening"], start["command"]
         self.cell.robot.place(q, opening)
         return self._begin(q, command)
 
@@ -425,17 +431,24 @@ class RobotGraspingEnv(gymnasium.Env):
         return info
 
 
-def _checked_options(options: dict[str, Any] | None) -> tuple[int | None, str | None]:
+def _checked_options(
+    options: dict[str, Any] | None,
+) -> tuple[int | None, str | dict[str, Any] | None]:
     """The scene's seed that reset's options ask for, and where to start; None for what they leave
     open. Raises UserError."""
     options = dict(options or {})
     seed, start = options.pop("scene_seed", None), options.pop("start", None)
     if options:
         raise UserError(
-            f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start'"
+            f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start', "
+            "and for RandomizedGrasping-v0 'randomization' and 'ranges'"
         )
-    if start not in (None, "home", "near", "look"):
-        raise UserError(f"reset: start must be 'home', 'near' or 'look', got {start!r}")
+    known = set(start) == {"q", "opening", "command"} if isinstance(start, dict) else False
+    if not known and start not in (None, "home", "near", "look"):
+        raise UserError(
+            f"reset: start must be 'home', 'near', 'look' or an episode's own (q, opening and "
+            f"command), got {start!r}"
+        )
     if seed is None:
         return None, start
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.cell import Cell, PhysicsError
+from envs.base_cell import BaseCell, PhysicsError
 from envs.execution import Around, GraspFailure
 from envs.grasping_env import RobotGraspingEnv
 from envs.kinematics import forward_kinematics
@@ -35,7 +35,7 @@ class PolicyApproach:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: BaseCell,
         policy: Callable[[dict[str, np.ndarray]], np.ndarray],
         trained: dict[str, dict[str, Any]],
     ):
@@ -46,7 +46,7 @@ class PolicyApproach:
         self.policy = policy
         self.closed_at: Grasp | None = None
 
-    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+    def __call__(self, cell: BaseCell, grasp: Grasp) -> Around:
         """Raises GraspFailure when nothing is gripped in as many actions as in training."""
         self.closed_at, ended, gripped = None, False, 0
         try:
@@ -73,7 +73,7 @@ def nowhere_yet(frame: RGBDFrame) -> list[Grasp]:
     return [Grasp(np.array([0.5, 0.0, 0.0]), 0.0, 0.0, 0.0)]
 
 
-def _grasp_of(cell: Cell) -> Grasp:
+def _grasp_of(cell: BaseCell) -> Grasp:
     """The hand's pose as a planar grasp."""
     T_WE = forward_kinematics(cell.robot.q)
     angle = math.atan2(T_WE[1, 1], T_WE[0, 1]) % math.pi

@@ -24,8 +24,8 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     """`RobotGraspingEnv` whose every episode has physics and looks of its own.
 
     info at reset has the episode's sample as `randomization`.
-    `reset(options={"randomization": sample})` replays it; together with the scene's seed and the
-    same actions that gives the same episode bit for bit.
+    `reset(options={"randomization": sample})` replays it; together with the scene's seed, the
+    `start` and the same actions that gives the same episode bit for bit.
 
     Automatic ranges (`randomization.adaptive`) are the environment's own, and learn from how its
     episodes end. With the option "ranges" they are somebody else's from then on, who shares them
@@ -33,8 +33,8 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     itself, which tries out no bound. The last info of an episode has the `bound` that it tried out,
     [parameter, "low" or "high", value], if any.
 
-    journal: file to which every episode that ends adds a line of JSON, None for none: `scene_seed`,
-    `is_success` and `randomization`, the first and last of which are options that repeat it.
+    journal: file to which every episode that ends adds a line of JSON, None for none: `is_success`,
+    and the options that repeat it, `scene_seed`, `start` and `randomization`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -68,7 +68,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         if self.randomizer.adaptive is None:
             raise UserError(
                 "reset: the option 'ranges' shares automatic ranges, which are off; set "
-                "randomization.adaptive.enabled=true"
+                f"randomization.adaptive.enabled=true, or ask for {WIDEST!r}"
             )
         try:
             self.randomizer.adaptive.take_over(ranges)
@@ -94,7 +94,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         return observation, reward, terminated, truncated, info
 
     def _write_down(self, info: Mapping[str, Any]) -> None:
-        line = {name: info[name] for name in ("scene_seed", "is_success")}
-        line |= {"randomization": self.randomizer.sample}
+        line = {name: info[name] for name in ("is_success", "scene_seed")}
+        line |= {"start": self.start, "randomization": self.randomizer.sample}
         with self.journal.open("a", encoding="utf-8") as journal:
             journal.write(json.dumps(line, allow_nan=False) + "\n")

@@ -58,6 +58,12 @@ def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
     envs.close()
 
 
+def full_difficulty(env_id: str) -> dict[str, Any]:
+    """Options of a reset for an episode of the task itself, whatever makes training easier."""
+    options = {"start": "home"} if env_id in OWN_ENVS else {}
+    return options | ({"ranges": WIDEST} if env_id == RANDOMIZED else {})
+
+
 class VectorEnvs:
     """See `models.rollouts.VectorEnvs` for the methods that stepping takes.
 
@@ -68,13 +74,9 @@ class VectorEnvs:
     def __init__(self, config: Config, count: int):
         self.num_envs = count
         self._options: dict[str, Any] = {}
-        self._full = {"start": "home"}  # options of an episode that nothing makes easier
-        self.ranges = None
-        self._randomized = config.rl.env_id == RANDOMIZED
-        if self._randomized:
-            self._full["ranges"] = WIDEST
-            self.ranges = adaptive_ranges(config.randomization)
-        self._own = config.rl.env_id in OWN_ENVS
+        self._id = config.rl.env_id
+        randomized = self._id == RANDOMIZED
+        self.ranges = adaptive_ranges(config.randomization) if randomized else None
         self._timeout = config.rl.worker_timeout
         makers = [partial(make_env, config, index) for index in range(count)]
         self._parallel = config.rl.parallel and count > 1
@@ -108,18 +110,25 @@ class VectorEnvs:
             self._envs.step_async(actions)
             return self._envs.step_wait(self._timeout)
 
-    def keep_episodes(self, folder: Path, first: int = 0) -> None:
-        """Have environments that change their world write down every episode, each in a file of its
-        own in a folder: env0.jsonl and so on, counted from `first`."""
-        if self._randomized:
-            folder.mkdir(exist_ok=True)
-            numbers = range(first, first + self.num_envs)
-            self._envs.set_attr("journal", [folder / f"env{number}.jsonl" for number in numbers])
+    def keep_episodes(self, folder: Path | None, first: int = 0) -> None:
+        """Have environments that change their world write down every episode from now on, each in a
+        new file of its own in a folder: env0.jsonl and so on, counted from `first`. None: no more.
+        """
+        if self._id != RANDOMIZED:
+            return
+        journals: list[Path | None] = [None] * self.num_envs
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            journals = [folder / f"env{first + number}.jsonl" for number in range(self.num_envs)]
+            for journal in journals:
+                journal.unlink(missing_ok=True)
+        with _told(self._died):
+            self._envs.set_attr("journal", journals)
 
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:
         """Episodes begun in here are as hard as the task, whatever makes training easier."""
-        with self._begun_with(self._full):
+        with self._begun_with(full_difficulty(self._id)):
             yield
 
     @contextmanager
@@ -131,7 +140,7 @@ class VectorEnvs:
     @contextmanager
     def _begun_with(self, options: dict[str, Any]) -> Iterator[None]:
         """Options of the cell's resets; other environments know none of them."""
-        self._options = options if self._own else {}
+        self._options = options if self._id in OWN_ENVS else {}
         try:
             yield
         finally:

@@ -21,11 +21,7 @@ def make_cell(config: Config) -> BaseCell:
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
         randomizer.at_limits = True
-
-        def change(cell: BaseCell) -> None:
-            cell.sample = randomizer.randomize(cell.scene.seed)
-
-        cell.on_build = change
+        cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
         cell.on_action = randomizer.act
     return cell
 

@@ -496,9 +496,25 @@ def test_a_line_on_disk_replays_an_episode_bit_for_bit(env, tmp_path, monkeypatc
     episode(env)
     lines = [json.loads(line) for line in (tmp_path / "env0.jsonl").read_text().splitlines()]
     assert len(lines) == 2 and lines[0]["is_success"] is last["is_success"]
-    options = {name: lines[0][name] for name in ("scene_seed", "randomization")}
+    options = {name: lines[0][name] for name in ("scene_seed", "start", "randomization")}
     again, repeated, _ = episode(env, options=options)
     assert again == first and repeated["randomization"] == info["randomization"]
+
+
+def test_an_episode_that_began_near_is_replayed_too(tmp_path):
+    config = load_config(None, ["sim.renderer=tiny", "env.near_share=1", "env.max_steps=2"])
+    env = gymnasium.make(
+        "RandomizedGrasping-v0", config=config, observations=["state"], control="ee_planar"
+    )
+    env.unwrapped.journal = tmp_path / "env0.jsonl"
+    first, *_ = episode(env, seed=4, steps=2)
+    line = json.loads((tmp_path / "env0.jsonl").read_text())
+    assert len(line["start"]["q"]) == 7
+    episode(env, steps=2)
+    options = {name: line[name] for name in ("scene_seed", "start", "randomization")}
+    again, *_ = episode(env, options=options, steps=2)
+    env.close()
+    assert again == first
 
 
 def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
@@ -510,7 +526,11 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
     with vector_envs(config, 2) as several:
         several.keep_episodes(tmp_path / "episodes", first=2)
         several.restart([1, 2])
-        several.step(np.zeros((2, *several.action_space.shape), np.float32))
+        still = np.zeros((2, *several.action_space.shape), np.float32)
+        several.step(still)
+        several.keep_episodes(None)
+        several.restart([3, 4])
+        several.step(still)
     files = sorted((tmp_path / "episodes").iterdir())
     assert [file.name for file in files] == ["env2.jsonl", "env3.jsonl"]
     one, two = (json.loads(file.read_text()) for file in files)

@@ -217,7 +217,7 @@ def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monke
     sample, _ = photographed(labels=(label,))
     network = SavedGraspNet(Opinion((285, 227), radius=0.5), 0.002, {}, {})
     monkeypatch.setattr(
-        photographs, "make_planner", lambda *_: GraspNetPlanner(network, HAND, WORKSPACE)
+        photographs, "make_planner", lambda *_: GraspNetPlanner(HAND, WORKSPACE, network=network)
     )
     (found,) = photographs.judge_as_taken("network.pt", [sample], seed=0)
     right, down = 400 / 456 * (np.array([285, 227]) - 455 / 2)

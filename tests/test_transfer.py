@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import evaluate
 from utils.config import Config, TransferPolicy, load_config
+from utils.errors import UserError
 from utils.round_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
 from utils.transfer import (
@@ -151,7 +153,10 @@ def test_the_shipped_report_is_a_config():
     for who in small:  # the commands are of one budget
         assert config_of(who).data.frames == 800
     learned = [who for who in transfer.policies if who.policy == "PPO"]
-    assert [who.training for who in learned] == ["none (shipped)", "physics", "vision", "both"]
+    assert [who.training for who in learned] == ["none", "physics", "vision", "both"]
+    assert {
+        (config_of(who).rl.total_steps, config_of(who).rl.target_success) for who in learned
+    } == {(102400, 0.98)}
     assert {who.scenes for who in learned} == {("isolated", "box")}
     for who in learned:
         varied = config_of(who).randomization.parts if "Randomized" in who.train_with else ()
@@ -177,6 +182,37 @@ def config_of(who: TransferPolicy) -> Config:
     assert words[-2:] == ["--weights", who.planner.removeprefix("ppo:")]
     file = REPOSITORY / words[1] if words[0] == "--config" else None
     return load_config(file, [word for word in words[:-2] if "=" in word])
+
+
+def test_rows_on_the_same_scenes_are_one_contest():
+    """However the scenes are told; and a folder goes by its path, as another may have its name."""
+    rows = [
+        ["a", "-", "heuristic", None, None],
+        ["b", "-", "random", ["pile", "box"], None],
+        ["c", "-", "random", ["isolated", "box"], None],
+        ["d", "-", "random", None, "never trained: a.pt"],
+    ]
+    config = load_config(
+        None,
+        [f"transfer.policies={json.dumps(rows)}", "evaluate.scenarios=pile",
+         "evaluate.object_sets=box", "transfer.worlds=[outside,mujoco,cornell]"],
+    )  # fmt: skip
+    played = evaluate.contests(config)
+    told = [(one.world, str(one.scenes), [who.policy for who in one.rows]) for one in played]
+    assert told == [
+        ("outside", "pile of box", ["a", "b", "d"]), ("mujoco", "pile of box", ["a", "b", "d"]),
+        ("outside", "isolated of box", ["c"]), ("mujoco", "isolated of box", ["c"]),
+    ]  # fmt: skip
+    one, two = (evaluate.Scenes(("isolated",), (name,)) for name in ("a/meshes", "b/meshes"))
+    assert evaluate.folder_name(one) == "isolated_of_a_meshes" != evaluate.folder_name(two)
+
+
+def test_a_row_that_cannot_play_its_scenes_is_named():
+    with pytest.raises(UserError, match="the row PPO, none is scored on pile of box; give it"):
+        evaluate.main(
+            ["transfer.policies=[[PPO, none, ppo, null, null]]", "evaluate.scenarios=pile",
+             "evaluate.object_sets=box", "transfer.worlds=pybullet"]
+        )  # fmt: skip
 
 
 def test_outside_is_outside():
@@ -208,4 +244,9 @@ def test_the_command_from_end_to_end(tmp_path):
     for scenes in ("isolated_of_primitives", "isolated_of_box"):
         assert (run / "outside" / scenes / "rounds.jsonl").exists()
     boxes = [row for row in rows if row["scenes"] == "isolated of box"]
-    assert [row["policy"] for row in boxes] == ["random", "heuristic", *["PPO"] * 4]
+    assert [row["policy"] for row in boxes] == [
+        "random",
+        "heuristic",
+        "PPO (shipped)",
+        *["PPO"] * 4,
+    ]

@@ -26,15 +26,17 @@ from utils.transforms import pose_matrix
 
 __all__ = ["DomainRandomizer", "TextureRandomizer", "World"]
 
-_VERSION = 1  # of a sample
+_VERSION = 2  # of a sample
 _PHYSICS_STREAM, _VISION_STREAM, _ACTION_STREAM = 0, 1, 3
 _EACH_AXIS = ("light_colour", "camera_shift", "camera_turn", "white_balance")  # three values
 
 
 class World(PhysicsWorld, Protocol):
-    """A cell: physics, and the view that its cameras look through (None: as it is)."""
+    """A cell: physics, the view that its cameras look through (None: as it is), and the sample that
+    made it what it is (None: nominal)."""
 
     view: RandomView | None
+    sample: dict[str, Any] | None
 
 
 class DomainRandomizer:
@@ -73,8 +75,12 @@ class DomainRandomizer:
         self._vision = ranges_of(settings.vision) if self._varies_view else {}
         self.adaptive = adaptive_ranges(settings)
         self.at_limits = False
-        self.sample: dict[str, Any] | None = None
         self._built: object = None  # the robot of the build that `_physics` belongs to
+
+    @property
+    def sample(self) -> dict[str, Any] | None:
+        """What was applied to the cell last; None for a nominal one."""
+        return self._world.sample
 
     def randomize(self, seed: int | None = None) -> dict[str, Any]:
         """Draw a world, apply it to the scene as built, and return the sample.
@@ -105,12 +111,12 @@ class DomainRandomizer:
     def restore(self) -> None:
         """Bring the nominal cell back; objects stay where they are. Without a sample, nothing."""
         if self.sample is None or self._built is not self._world.robot:
-            self.sample, self._world.view = None, None  # a new build is nominal
+            self._world.sample, self._world.view = None, None  # a new build is nominal
             return
         self._physics.restore()
         self._paint(self._colours)
         self._world.view = None
-        self.sample = None
+        self._world.sample = None
 
     def act(self, action: np.ndarray) -> np.ndarray:
         """(n,) what becomes of an action (n,) in [-1, 1]: biased, noisy and still in [-1, 1].
@@ -134,7 +140,8 @@ class DomainRandomizer:
     def record_result(self, success: bool) -> None:
         """How the episode ended: automatic randomisation, where enabled, learns from it."""
         if self.adaptive is not None and self.sample is not None and self.sample["bound"]:
-            self.adaptive.record(Bound(*self.sample["bound"][:2]), success)
+            name, side, value = self.sample["bound"]
+            self.adaptive.record_all([(Bound(name, side), value, success)])
 
     # --- Drawing ------------------------------------------------------------------------------
 
@@ -206,7 +213,7 @@ class DomainRandomizer:
 
     def _apply(self, sample: Mapping[str, Any]) -> None:
         world = self._world
-        self.sample, self._steps = dict(sample), 0
+        world.sample, self._steps = dict(sample), 0
         self._each_step_physics = bool(sample["each_step"]["physics"])
         self._physics.apply(self._physics_at(0))
         colours = sample["colours"]

@@ -190,6 +190,8 @@ def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str])
     for number, world in enumerate(worlds):
         scored = [(i, line.scores[world]) for i, line in enumerate(lines) if world in line.scores]
         scored = [(i, score) for i, score in scored if score.trials]
+        if not scored:
+            continue
         rates = [100 * score.rate for _, score in scored]
         errors = [
             [100 * (score.rate - score.ci95[0]) for _, score in scored],
@@ -201,7 +203,7 @@ def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str])
             error_kw={"elinewidth": 1.0, "capsize": 2},
         )  # fmt: skip
     several = len({line.scenes for line in lines}) > 1
-    names = [_name(line, several) for line in lines]
+    names = ["\n".join(_parts(line, several)) for line in lines]
     axes.set(yticks=range(len(lines)), yticklabels=names, xlim=(0, 105), xlabel="success, %")
     axes.set_ylim(len(lines) - 0.5, -0.5)  # the first row on top
     axes.grid(axis="x", alpha=0.3)
@@ -209,30 +211,23 @@ def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str])
 
 
 def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
-    """A colour for each policy, a shape for each kind of scenes; what differs in training alone
-    looks alike."""
+    """A colour for each row, a shape for each kind of scenes."""
     (real, simulation), *_ = PAIRS
     axes.plot([0, 100], [0, 100], color="0.7", linewidth=1)
-    both = [
-        line
-        for line in lines
-        if all(w in line.scores and line.scores[w].trials for w in (simulation, real))
-    ]
-    policies = list(dict.fromkeys(line.who.policy for line in both))
-    kinds = list(dict.fromkeys(line.scenes for line in both))
-    told = set()
-    for line in both:
-        scores = [line.scores[world] for world in (simulation, real)]
+    kinds = list(dict.fromkeys(line.scenes for line in lines))
+    told = False
+    for number, line in enumerate(lines):
+        scores = [line.scores.get(world) for world in (simulation, real)]
+        if not all(score is not None and score.trials for score in scores):
+            continue
         x, y = (100 * score.rate for score in scores)
         spans = [[[100 * (s.rate - s.ci95[0])], [100 * (s.ci95[1] - s.rate)]] for s in scores]
-        label = f"{line.who.policy}, {line.scenes}"
-        shape = _SHAPES[kinds.index(line.scenes) % len(_SHAPES)]
         axes.errorbar(
-            x, y, xerr=spans[0], yerr=spans[1], fmt=shape,
-            color=_colour(policies.index(line.who.policy)), capsize=2, alpha=0.7,
-            label=None if label in told else label,
+            x, y, xerr=spans[0], yerr=spans[1], color=matplotlib.colormaps["tab20"](number % 20),
+            fmt=_SHAPES[kinds.index(line.scenes) % len(_SHAPES)], capsize=2, alpha=0.7,
+            elinewidth=0.8, label=", ".join(_parts(line, len(kinds) > 1)),
         )  # fmt: skip
-        told.add(label)
+        told = True
     titles = [
         f"{one.scenes}: r = {one.pearson_r:.3f}, MMRV = {one.mmrv:.3f}"
         for one in agreements(lines)
@@ -245,12 +240,13 @@ def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
     )  # fmt: skip
     axes.grid(alpha=0.3)
     if told:
-        axes.legend(loc="lower right", fontsize=8, frameon=False)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), fontsize=8, frameon=False)
 
 
-def _name(line: TransferLine, with_scenes: bool) -> str:
+def _parts(line: TransferLine, with_scenes: bool) -> list[str]:
+    """What tells a row from the others."""
     training = [line.who.training] if line.who.training != NOT_TRAINED else []
-    return "\n".join([line.who.policy, *training, *([line.scenes] if with_scenes else [])])
+    return [line.who.policy, *training, *([line.scenes] if with_scenes else [])]
 
 
 def _colour(number: int) -> Any:
