@@ -13,6 +13,7 @@ import torch
 from benchmarks.bench_policy import config_of, run_episodes
 from envs.cell import Cell
 from envs.execution import execute_grasp
+from envs.grasping_env import RobotGraspingEnv
 from envs.hand_commands import HandCommands
 from envs.objects import load_object_set
 from envs.policy_approach import PolicyApproach, nowhere_yet
@@ -50,11 +51,26 @@ def test_policies_lift_what_they_have_never_seen(objects):
     assert sum(reason == "success" for reason, _ in ends) >= 6
 
 
+def test_fresh_episodes_are_at_full_difficulty(box, monkeypatch):
+    """Though half of those of its training began near the box."""
+    config = config_of(box, ["env.max_steps=1", "sim.renderer=tiny"])
+    assert config.env.near_share == 0.5
+    starts, reset = [], RobotGraspingEnv.reset
+
+    def spied(env, **arguments):
+        result = reset(env, **arguments)
+        starts.append((arguments.get("options"), env.start))
+        return result
+
+    monkeypatch.setattr(RobotGraspingEnv, "reset", spied)
+    run_episodes(load_policy(box), config, 4)
+    assert starts[-4:] == [({"start": "home"}, "home")] * 4
+
+
 def test_it_is_not_told_where_the_box_is(box):
     policy = load_policy(box)
     assert {part.key for part in policy.layout.images} == {"rgb", "depth"}
     assert {part.key for part in policy.layout.state} == {"end_effector_position", "gripper"}
-    assert config_of(box).env.near_share == 0, "at full difficulty"
 
 
 def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
