@@ -42,7 +42,7 @@ from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, s
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
-from utils.table_camera import distances
+from utils.table_camera import DEPTHS, FROM_BASE, FROM_CAMERA, distances
 from utils.unlabelled_images import UnlabelledImages
 
 ALONE = Team(0, 1, torch.device("cpu"))
@@ -307,6 +307,14 @@ def test_one_image_of_depths_among_distances_is_refused_by_name(photographs, tmp
         Image.fromarray(flat).save(folder / f"pcd0{number}d.tiff")
     with pytest.raises(UserError, match="adaptation.target.*pcd0103d.tiff seems to hold depths"):
         open_target(target_config(folder))
+
+
+def test_depths_without_noise_are_refused_whichever_fit_is_nearer_to_zero(photographs, monkeypatch):
+    """Measured of depths in the cell: each fit exact but for the camera's steps of depth."""
+    exact = {FROM_BASE: 1e-5, DEPTHS: 3.2e-5, FROM_CAMERA: 0.02}
+    monkeypatch.setattr(target_images, "table_misses", lambda *_: exact)
+    with pytest.raises(UserError, match="seems to hold depths along"):
+        open_target(target_config(photographs))
 
 
 def test_images_are_judged_all_over_a_large_folder(photographs, tmp_path, monkeypatch):
