@@ -17,6 +17,7 @@ from PIL import Image
 from torch import nn
 
 import train_graspnet
+from models import target_images
 from models.backbones import BACKBONES
 from models.graspnet import create_model
 from models.graspnet_adaptation import AdaptingTrainer, Pair
@@ -26,6 +27,7 @@ from models.photographs import K, frame_of
 from models.target_images import (
     STANDS_OUT,
     AdaptationData,
+    check_distances,
     corner_around,
     grasp_information,
     open_target,
@@ -40,7 +42,7 @@ from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, s
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
-from utils.table_camera import distances
+from utils.table_camera import DEPTHS, FROM_BASE, FROM_CAMERA, distances
 from utils.unlabelled_images import UnlabelledImages
 
 ALONE = Team(0, 1, torch.device("cpu"))
@@ -288,13 +290,51 @@ def test_depths_and_distances_from_the_camera_are_not_misread(tmp_path, tilt):
 
     folder = write_cornell(tmp_path / "target", 5, shape=KINECT)
     rewrite_depths(folder, depths)
-    with pytest.raises(UserError, match="adaptation.target .*seem to hold depths along"):
+    with pytest.raises(UserError, match="adaptation.target.*0100d.tiff seems to hold depths along"):
         open_target(target_config(folder))
     rewrite_depths(folder, lambda depth: distances(depth, K))
     sample = open_target(target_config(folder))[0]
     np.testing.assert_allclose(frame_of(sample, 1.0).depth, flat, atol=0.02)
     rewrite_depths(folder, lambda _: depths(_) * np.sqrt(1 + (rays**2).sum(axis=-1)))
-    with pytest.raises(UserError, match="seem to hold distances from the camera"):
+    with pytest.raises(UserError, match="seems to hold distances from the camera"):
+        open_target(target_config(folder))
+
+
+def test_one_image_of_depths_among_distances_is_refused_by_name(photographs, tmp_path):
+    folder = shutil.copytree(photographs, tmp_path / "target")
+    flat = np.full(KINECT, 0.9, np.float32)
+    for number in (103, 104):
+        Image.fromarray(flat).save(folder / f"pcd0{number}d.tiff")
+    with pytest.raises(UserError, match="adaptation.target.*pcd0103d.tiff seems to hold depths"):
+        open_target(target_config(folder))
+
+
+def test_depths_without_noise_are_refused_whichever_fit_is_nearer_to_zero(photographs, monkeypatch):
+    """Measured of depths in the cell: each fit exact but for the camera's steps of depth."""
+    exact = {FROM_BASE: 1e-5, DEPTHS: 3.2e-5, FROM_CAMERA: 0.02}
+    monkeypatch.setattr(target_images, "table_misses", lambda *_: exact)
+    with pytest.raises(UserError, match="seems to hold depths along"):
+        open_target(target_config(photographs))
+
+
+def test_images_are_judged_all_over_a_large_folder(photographs, tmp_path, monkeypatch):
+    """Of 100 twelve, from the first to the last: every ninth."""
+    for number in range(100):
+        for kind in ("r.png", "d.tiff"):
+            (tmp_path / f"{number:02}{kind}").symlink_to(photographs / f"pcd0100{kind}")
+    looked_at = []
+    monkeypatch.setattr(target_images, "_check_distances", lambda _, file: looked_at.append(file))
+    check_distances(UnlabelledImages(tmp_path))
+    assert [int(file.name[:2]) for file in looked_at] == list(range(0, 100, 9))
+
+
+def test_a_base_among_what_is_seen_is_refused(tmp_path):
+    """A table 0.9 m straight below, and distances from a base on it: beside the optical axis, where
+    points above and below the table are as far from it."""
+    flat, base = np.full(KINECT, 0.9), np.array([0.0, 0.7, 0.8])
+    folder = write_cornell(tmp_path / "target", 5, shape=KINECT)
+    rewrite_depths(folder, lambda _: distances(flat, K, base))
+    with pytest.raises(UserError, match="pcd0100d.tiff holds distances from a point.* too near"):
         open_target(target_config(folder))
 
 
@@ -304,7 +344,7 @@ def test_images_without_a_table_are_refused(tmp_path):
     bumps = 1.0 + 0.1 * np.sin(u / 25) * np.sin(v / 25)
     folder = write_cornell(tmp_path / "target", 5, shape=KINECT)
     rewrite_depths(folder, lambda depth: distances(bumps, K))
-    with pytest.raises(UserError, match="adaptation.target .*show no flat table.* at most 3 mm"):
+    with pytest.raises(UserError, match="adaptation.target.*shows no flat table.* at most 3 mm"):
         open_target(target_config(folder))
 
 

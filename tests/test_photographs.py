@@ -20,10 +20,12 @@ from utils.overhead_view import overhead_view
 from utils.real_data import RealSample, fill_depth_holes
 from utils.rectangles import GraspRectangle
 from utils.table_camera import (
+    BEHIND,
     DEPTHS,
     FLAT,
     FROM_BASE,
     FROM_CAMERA,
+    TableCamera,
     distances,
     find_table_camera,
     table_misses,
@@ -33,6 +35,7 @@ from utils.transforms import Grasp, RGBDFrame, deproject, look_at, project
 # Cornell's camera looks down like this: 0.73 m over the table, 37 degrees from straight down.
 T_WC = look_at((0.0, -0.55, 0.73), (0.0, 0.0, 0.0))
 ROBOT = np.array([-0.3, -0.9, 0.1])
+ROBOT_BEFORE = np.array([0.0, 0.8, 0.2])  # in the camera's frame, below its middle and before it
 BOX = np.array([0.06, 0.16, 0.08])  # m along x, y and z, in the middle of the view
 GREY, RED = (200, 200, 200), (180, 30, 30)
 
@@ -82,6 +85,70 @@ def test_distances_are_what_the_table_s_camera_undoes():
     np.testing.assert_allclose(distances(true.depth, K, from_robot), sample.depth, atol=1e-6)
     found = find_table_camera(distances(true.depth, K), K).depth(distances(true.depth, K), K)
     np.testing.assert_allclose(found, true.depth, atol=3e-3)
+
+
+def disc_on_a_table(away: float, tilt: float, towards: float, height: float = 0.06) -> np.ndarray:
+    """(480, 640) depths of a table `away` metres below a camera that is tilted by `tilt` degrees
+    in the image's direction `towards`, and of a disc of 10 cm across, `height` metres above it."""
+    v, u = np.mgrid[:480, :640]
+    rays = deproject(np.stack([u, v], axis=-1), np.ones(u.shape), K, np.eye(4))
+    tilt, towards = np.radians([tilt, towards])
+    side = np.sin(tilt) * np.array([np.cos(towards), np.sin(towards)])
+    normal = np.array([*side, np.cos(tilt)])
+    table, top = away / (rays @ normal), (away - height) / (rays @ normal)
+    middle = np.array([0.0, 0.0, (away - height) / normal[2]])
+    beside = np.linalg.norm(rays * top[..., None] - middle, axis=-1)
+    return np.where(beside < 0.05, top, table)
+
+
+@pytest.mark.parametrize("away", [0.4, 0.5, 0.6, 0.65, 1.2])
+@pytest.mark.parametrize(("tilt", "towards"), [(0, 0), (10, 90), (37, -90), (37, 0), (37, 90)])
+def test_near_cameras_are_found_too(away, tilt, towards):
+    """Of distances as docs/sim_to_real.md makes them, of depths with a millimetre of noise. At
+    0.4 m the disc fills an eighth of the image's middle, and lifts the table by millimetres."""
+    depth = disc_on_a_table(away, tilt, towards)
+    noise = 0.001 * np.random.default_rng(0).standard_normal(depth.shape)
+    image = distances(depth + noise, K)
+    camera = find_table_camera(image, K)
+    assert camera.T_WC[2, 3] == pytest.approx(away, abs=5e-3)
+    assert camera.origin == pytest.approx(BEHIND, abs=0.01)
+    error = np.abs(camera.depth(image, K) - depth)
+    assert np.median(error) < 5e-3 and error.max() < 0.015
+    assert camera.sees(image.shape, K, 0.15)
+
+
+@pytest.mark.parametrize("away", [0.4, 0.5, 0.6])
+def test_an_origin_is_found_above_the_table(away):
+    """One 0.2 m before the camera, whose mirror image explains the table as well."""
+    bare = disc_on_a_table(away, 0, 0, height=0.0)
+    camera = find_table_camera(distances(bare, K, ROBOT_BEFORE), K)
+    assert camera.table == pytest.approx([0, 0, 1 / away], abs=1e-3)
+    assert camera.origin == pytest.approx(ROBOT_BEFORE, abs=1e-3)
+
+
+def test_distances_do_not_tell_depths_before_the_foot_of_the_origin():
+    """By hand: on the optical axis an origin (0, 0.8, 0.2) is nearest 0.2 m from the camera, so a
+    point at 0.15 m is as far from it as one at 0.25 m; one at 0.3 m comes back."""
+    camera = TableCamera(np.array([0.0, 0.0, 2.0]), ROBOT_BEFORE)
+    axis = np.array([[319.5, 239.5]] * 2)
+    assert camera.least_depth(deproject(axis, np.ones(2), K, np.eye(4))) == pytest.approx(0.2)
+    centred = K - [[0, 0, 319.5], [0, 0, 239.5], [0, 0, 0]]  # the only pixel lies on the axis
+    for depth, found in ((0.15, 0.25), (0.3, 0.3)):
+        image = distances(np.full((1, 1), depth), centred, ROBOT_BEFORE)
+        assert camera.depth(image, centred) == pytest.approx(found, abs=1e-6)
+    # 200 pixels below the axis it is nearest at (0.8 y + 0.2) / (1 + y^2) = 0.441 m, y = 200 / 525.
+    assert camera.sees((480, 640), K, height=0.05)
+    assert not camera.sees((480, 640), K, height=0.07)
+
+
+def test_unknown_depths_stay_unknown():
+    depth = disc_on_a_table(0.6, 10, 90)
+    depth[:2, :2] = [[0, np.nan], [-1, np.inf]]
+    image = distances(depth, K)
+    assert (image[:2, :2] == 0).all() and (image.ravel()[2:640] > 0.5).all()
+    found = TableCamera(np.array([0.0, 0.0, 1 / 0.6]), BEHIND).depth(image, K)
+    assert (found[:2, :2] == 0).all()
+    np.testing.assert_allclose(found[2:], depth[2:], atol=1e-6)
 
 
 def test_a_bare_table_tells_what_an_image_holds():

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from utils.table_plane import Plane
+from utils.transforms import known_depth
 
 SIDE = 400  # pixels of the square in the image's middle that the table is looked for in
 STEP = 8  # pixels between those that are looked at
@@ -23,6 +24,9 @@ FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel coun
 # the robot on the camera's side of the table.
 STEEP = np.array([0.0, 0.8, 1.0])
 ROBOT = np.array([0.0, 0.8, 0.2])
+# Beside and behind a camera that sees less than 50 degrees: no ray comes nearer to it than at its
+# start. It is above any table 0.4 m away or more, unless the camera is tilted by 60 degrees.
+BEHIND = np.array([0.0, 0.6, -0.3])
 # What an image of distances in metres may hold.
 FROM_BASE = "distances from a robot's base"
 DEPTHS = "depths along the optical axis"
@@ -50,23 +54,43 @@ class TableCamera:
 
     def depth(self, distance: np.ndarray, K: np.ndarray) -> np.ndarray:
         """(H, W) float32 metres along the optical axis of points at `distance` (H, W) from the
-        origin: where each pixel's ray leaves the sphere of that radius around it."""
+        origin: where each pixel's ray leaves the sphere of that radius around it. 0 where the
+        distance is unknown (see `known_depth`).
+
+        Points nearer than `least_depth` come back mirrored in it.
+        """
         rays = _rays(distance.shape, K)
         along, squared = rays @ self.origin, (rays**2).sum(axis=-1)
         beside = self.origin @ self.origin - distance.astype(float) ** 2
         # A pixel that is off by its noise may have a sphere that its ray only just misses.
         root = np.sqrt(np.maximum(along**2 - squared * beside, 0))
-        return ((along + root) / squared).astype(np.float32)
+        depth = (along + root) / squared
+        return np.where(known_depth(distance), depth, 0).astype(np.float32)
+
+    def least_depth(self, rays: np.ndarray) -> np.ndarray:
+        """(...) metres along the optical axis where rays (..., 3) are nearest to the origin: their
+        points are as far from it before as behind, and the distance tells least there."""
+        return rays @ self.origin / (rays**2).sum(axis=-1)
+
+    def sees(self, shape: tuple[int, int], K: np.ndarray, height: float) -> bool:
+        """Whether whatever lies on the table or up to `height` metres above it is farther than
+        `least_depth` in the middle of an image of `shape`."""
+        rays = _middle_rays(shape, K)
+        over = (1 - height * np.linalg.norm(self.table)) / (rays @ self.table)
+        return bool((over > self.least_depth(rays)).all())
 
 
 def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
     """The camera of an image of distances (H, W) metres, most of whose middle shows a table.
 
-    A robust fit (Cauchy's loss), for which objects and walls hardly count. An origin on either
-    side of the table would explain the image alike; the search starts from the upper one.
+    A robust fit (Cauchy's loss), for which objects and walls hardly count. An origin and its mirror
+    image in the table explain it alike, for every point of the table is as far from either; of the
+    two the one on the camera's side is given, as a robot's base is there.
     """
     found, _ = _fit_distances(*_middle(distance, K))
-    return TableCamera(found[:3], found[3:])
+    table, origin = found[:3], found[3:]
+    behind = max(table @ origin - 1, 0)
+    return TableCamera(table, origin - 2 * behind * table / (table @ table))
 
 
 def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
@@ -88,11 +112,16 @@ def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
     return misses
 
 
-def distances(depth: np.ndarray, K: np.ndarray, origin: np.ndarray = ROBOT) -> np.ndarray:
+def distances(depth: np.ndarray, K: np.ndarray, origin: np.ndarray = BEHIND) -> np.ndarray:
     """(H, W) float32 metres from an origin (3,) in the optical frame, not the camera itself, of
-    what is seen at depths (H, W): the inverse of `TableCamera.depth`."""
-    points = _rays(depth.shape, K) * depth[..., None]
-    return np.linalg.norm(points - origin, axis=-1).astype(np.float32)
+    what is seen at depths (H, W); 0 where the depth is unknown (see `known_depth`).
+
+    The inverse of `TableCamera.depth`, beyond its `least_depth`; so the origin has to be on the
+    camera's side of the table, and is best behind the camera.
+    """
+    known = known_depth(depth)
+    points = _rays(depth.shape, K) * np.where(known, depth, 0)[..., None]
+    return np.where(known, np.linalg.norm(points - origin, axis=-1), 0).astype(np.float32)
 
 
 def _fit_distances(rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
@@ -113,11 +142,17 @@ def _robust(off: Callable[..., np.ndarray], start: np.ndarray, *given) -> tuple[
 
 def _middle(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) rays of pixels in the middle of an image, and what it holds there (n,)."""
-    rows, columns = (
-        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP) for length in image.shape
+    return _middle_rays(image.shape, K), image[_middle_of(image.shape)].ravel().astype(float)
+
+
+def _middle_rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
+    return _rays(shape, K)[_middle_of(shape)].reshape(-1, 3)
+
+
+def _middle_of(shape: tuple[int, ...]) -> tuple[slice, ...]:
+    return tuple(
+        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP) for length in shape
     )
-    rays = _rays(image.shape, K)[rows, columns].reshape(-1, 3)
-    return rays, image[rows, columns].ravel().astype(float)
 
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
