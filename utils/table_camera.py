@@ -26,7 +26,7 @@ STEEP = np.array([0.0, 0.8, 1.0])
 ROBOT = np.array([0.0, 0.8, 0.2])
 # Beside and behind a camera that sees less than 50 degrees: no ray comes nearer to it than at its
 # start. It is above any table 0.4 m away or more, unless the camera is tilted by 60 degrees.
-BEHIND = np.array([0.0, 0.6, -0.3])
+BEHIND = np.array([0.0, 0.6, -0.1])
 # What an image of distances in metres may hold.
 FROM_BASE = "distances from a robot's base"
 DEPTHS = "depths along the optical axis"
