@@ -28,7 +28,7 @@ from models.rectangle_scores import Judged, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.overhead_view import overhead_view
-from utils.real_data import RealSample, open_real_data
+from utils.real_data import RealSample, existing_folder, open_real_data
 from utils.rectangles import GraspRectangle
 from utils.table_camera import find_table_camera
 from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
@@ -48,7 +48,7 @@ BEST = PeakSettings(threshold=-1.0, count=1)
 
 def photographs(root: Path) -> list[RealSample]:
     """Cornell's images in a folder. Raises UserError naming what is wrong with it."""
-    samples = list(open_real_data("cornell", root))
+    samples = list(open_real_data("cornell", existing_folder(root, "transfer.cornell")))
     for sample in samples:
         if sample.depth.shape != SHAPE:
             height, width = sample.depth.shape

@@ -79,7 +79,7 @@ def check_distances(images: UnlabelledImages) -> None:
 
 def _check_distances(image: np.ndarray, file: Path) -> None:
     misses = table_misses(image, K)
-    fits = {reading: f"{1000 * miss:.1f} mm" for reading, miss in misses.items()}
+    fits = {reading: f"{1000 * miss:.2g} mm" for reading, miss in misses.items()}
     likely = min(misses, key=misses.get)
     if misses[likely] > FLAT:
         raise UserError(

@@ -189,7 +189,7 @@ def _read_picture(file: str) -> np.ndarray:
         raise UserError(f"texture {file}: cannot be read ({error.strerror})") from error
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if picture is None:
-        raise UserError(f"texture {file}: is not a picture that OpenCV can read")
+        raise UserError(f"texture {file} is not a picture that OpenCV can read")
     shrink = min(1.0, _LARGEST_PICTURE / max(picture.shape[:2]))
     size = [max(1, round(side * shrink)) for side in picture.shape[1::-1]]
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
