@@ -54,7 +54,8 @@ class DomainRandomizer:
             description by `TextureRandomizer.draw`. shadow: 0 or 1. depth_noise: true or false
         bound: None, or [parameter, "low" or "high", value] that automatic randomisation tries out
 
-    world: of PyBullet; UserError for another. arm, fingers: link numbers of the robot. seed: of what `randomize` draws when it is given none.
+    world: of PyBullet; UserError for another. arm, fingers: link numbers of the robot. seed: of
+    what `randomize` draws when it is given none.
     at_limits: draw from the widest ranges, automatic or not: the task itself, as evaluations ask.
     """
 
@@ -67,7 +68,9 @@ class DomainRandomizer:
         seed: int = 0,
     ):
         if world.client is None:
-            raise UserError("DomainRandomizer changes PyBullet's physics: it needs a cell of PyBullet")
+            raise UserError(
+                "DomainRandomizer changes PyBullet's physics: it needs a cell of PyBullet"
+            )
         self._world, self._settings = world, settings
         self._arm, self._fingers = tuple(arm), tuple(fingers)
         self._seeds = np.random.default_rng(seed)
