@@ -444,7 +444,7 @@ def test_episodes_can_begin_near_an_object(make):
         np.testing.assert_allclose(env.cell.robot.q, before, atol=0.02)
     _, at_home = env.reset(seed=0, options={"start": "home"})
     assert at_home["end_effector_position"][2] > 0.4
-    with pytest.raises(UserError, match="start must be 'home', 'near' or 'look', got 'here'"):
+    with pytest.raises(UserError, match="start must be 'home', 'near', 'look' or .*, got 'here'"):
         env.reset(options={"start": "here"})
 
 
