@@ -22,9 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from envs.approach import Outline
 from envs.cell import PhysicsError
-from envs.grasping_env import RobotGraspingEnv, scripted_action
+from envs.grasping_env import RobotGraspingEnv
 from envs.kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scenes import settle
+from envs.scripted_pick import scripted_action
 from utils.config import ConfigError
 from utils.errors import UserError
 
@@ -146,7 +147,7 @@ def test_public_methods_of_the_tutorial_exist():
 def test_demonstration_runs_without_a_display():
     environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
     result = subprocess.run(
-        [sys.executable, "-m", "envs.grasping_env"],
+        [sys.executable, "-m", "envs.scripted_pick"],
         cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True, timeout=100,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr

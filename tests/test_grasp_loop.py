@@ -21,10 +21,11 @@ from envs.rounds import run_round
 from envs.scenes import make_scene
 from envs.servoing import GuardedArm
 from envs.wrist_camera import WristCamera
+from tests.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.config_types import ScoredScenario
 from utils.tabletop import planar_part, table_plane
-from utils.transforms import Grasp, inverse_pose, top_down_pose
+from utils.transforms import inverse_pose, top_down_pose
 
 CLOSED = ("pbvs", "ibvs", "hybrid")
 
@@ -39,14 +40,6 @@ def cell(config):
 @pytest.fixture(scope="module")
 def scene(config, box_set):
     return make_scene("isolated", box_set, 0, config)
-
-
-def grasp_of_box(cell):
-    """A grasp through the middle of the one box in the cell, along one of its sides."""
-    T = cell.object_pose(0)
-    side = int(np.argmin(np.abs(T[2, :3])))  # an axis of the box that lies level
-    angle = np.arctan2(T[1, side], T[0, side])
-    return Grasp(np.array([*T[:2, 3], 0.03]), angle, 0.07, 1.0)
 
 
 def loop(cell, controller, latency=0.0, camera=None):
@@ -69,15 +62,9 @@ def test_every_controller_grasps_a_box_at_rest(cell, scene, controller):
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["moved", "moving_5cm", "turning_5cm", "latency"])
 def test_the_loop_grasps_what_the_open_loop_misses(cell, scene, scenario, monkeypatch):
-    # Images that are 100 ms late are older than the default watchdog allows.
-    allowed = load_config(None, ["sim.renderer=tiny", "safety.watchdog=0.2"])
-    monkeypatch.setattr(cell, "config", allowed)
     results = {}
     for controller in ("open_loop", "ibvs"):
-        record = run_round(
-            cell, scene, lambda frame: [grasp_of_box(cell)], policy="exact", objects="box",
-            max_failures=1, scenario=scenario, controller=controller,
-        )  # fmt: skip
+        record = round_with_a_box(cell, scene, scenario, controller, monkeypatch)
         results[controller] = record.successes
         assert record.scenario == scenario and record.controller == controller
     assert results == {"open_loop": 0, "ibvs": 1}

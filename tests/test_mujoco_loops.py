@@ -25,9 +25,9 @@ from envs.scenes import make_scene
 from envs.servoing import GuardedArm
 from envs.world import GRAVITY
 from envs.wrist_camera import WristCamera
-from utils.config import load_config
+from tests.box_rounds import grasp_of_box, round_with_a_box
 from utils.tabletop import planar_part
-from utils.transforms import Grasp, top_down_pose
+from utils.transforms import top_down_pose
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -50,14 +50,6 @@ def cell(worlds, scene):
     mujoco = worlds[1]
     mujoco.load(scene)
     return mujoco
-
-
-def grasp_of_box(cell):
-    """A grasp through the middle of the one box in the cell, along one of its sides."""
-    T = cell.object_pose(0)
-    side = int(np.argmin(np.abs(T[2, :3])))  # an axis of the box that lies level
-    angle = np.arctan2(T[1, side], T[0, side])
-    return Grasp(np.array([*T[:2, 3], 0.03]), angle, 0.07, 1.0)
 
 
 def turn_between(before, after):
@@ -161,16 +153,10 @@ def test_both_wrist_cameras_find_the_object_where_it_is(worlds, scene):
 
 @pytest.mark.parametrize("scenario", ["moved", "moving_5cm", "turning_5cm", "latency"])
 def test_the_loop_grasps_what_the_open_loop_misses(cell, scene, scenario, monkeypatch):
-    # Images that are 100 ms late are older than the default watchdog allows.
-    allowed = load_config(None, ["sim.renderer=tiny", "safety.watchdog=0.2"])
-    monkeypatch.setattr(cell, "config", allowed)
-    results = {}
-    for controller in ("open_loop", "ibvs"):
-        record = run_round(
-            cell, scene, lambda frame: [grasp_of_box(cell)], policy="exact", objects="box",
-            max_failures=1, scenario=scenario, controller=controller,
-        )  # fmt: skip
-        results[controller] = record.successes
+    results = {
+        controller: round_with_a_box(cell, scene, scenario, controller, monkeypatch).successes
+        for controller in ("open_loop", "ibvs")
+    }
     assert results == {"open_loop": 0, "ibvs": 1}
 
 
