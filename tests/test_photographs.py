@@ -13,6 +13,7 @@ from models.graspnet_planner import GraspNetPlanner
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
 from models.target_images import DISTINCT
 from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
+from tests.test_real_data import CORNELL
 from tests.test_real_training import write_cornell
 from utils.depth_noise import KinectNoise
 from utils.errors import UserError
@@ -185,6 +186,16 @@ def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
         return min(misses.values()) / base
 
     assert other_readings(depth) < 1.1 < DISTINCT < 3 < other_readings(distances(depth, K))
+
+
+@pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")
+def test_cornell_s_photographs_hold_distances_from_a_base():
+    """What `models.target_images.DISTINCT` and docs/sim_to_real.md say; every eighth."""
+    for sample in photographs.photographs(CORNELL)[::8]:
+        misses = table_misses(sample.depth, K)
+        base = misses.pop(FROM_BASE)
+        assert 0.7e-3 < base < 1.2e-3, sample.name
+        assert min(misses.values()) / base > 16.9, sample.name
 
 
 # --- From above ------------------------------------------------------------------------------
