@@ -25,19 +25,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from envs.base_cell import BaseCell
-from envs.challenges import CHALLENGES
+from envs.cell import BaseCell
+from envs.cell_scenes import make_scene
 from envs.execution import GraspOutcome, check_bin
-from envs.learned_policies import approach_by, check_learned, is_learned
 from envs.objects import ObjectSet, load_object_set, prepare
-from envs.policy_approach import nowhere_yet
+from envs.policy_approach import approach_by, check_learned, is_learned, nowhere_yet
 from envs.rounds import run_round
-from envs.scenes import make_scene
+from envs.scenarios import CHALLENGES
+from envs.simulators import in_world, make_cell
 from envs.studio import Film
-from envs.worlds import in_world, make_cell
 from models.photographs import judge_as_taken, judge_photographs, photographs
 from models.planners import make_planner
-from models.rectangle_pictures import draw_rectangles
+from models.rectangle_examples import draw_rectangles
 from utils.config import (
     OBJECT_SETS,
     Config,
@@ -47,29 +46,26 @@ from utils.config import (
     with_settings,
 )
 from utils.errors import UserError
-from utils.evaluation_plan import (
+from utils.executor import Outcome, Played, play_scenes, worker_count
+from utils.geometry import GripperGeometry, Workspace
+from utils.report import balanced, picture, write_failures, write_report
+from utils.result_records import OPEN_LOOP, contestant
+from utils.results import (
     Task,
     check_controllers,
     check_resume,
+    compare,
     contestants,
     interruption,
-)
-from utils.files import write_atomic, write_json_atomic
-from utils.gallery import balanced, picture, write_failures
-from utils.geometry import GripperGeometry, Workspace
-from utils.report import write_report
-from utils.results import (
-    compare,
     print_comparisons,
+    print_stop_reasons,
     print_table,
+    stop_reasons,
     summarise,
     write_csv,
     write_results,
 )
-from utils.round_records import OPEN_LOOP, contestant
-from utils.runs import check_writable, git_state, new_run_folder
-from utils.scene_workers import Outcome, Played, play_scenes, worker_count
-from utils.stop_reasons import print_stop_reasons, stop_reasons
+from utils.runs import check_writable, git_state, new_run_folder, write_atomic, write_json_atomic
 from utils.transfer import (
     Score,
     TransferLine,

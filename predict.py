@@ -31,13 +31,13 @@ from typing import Any
 import numpy as np
 
 from models.graspnet import check_rgbd
+from models.graspnet_inference import PredictedGrasp, Prediction, predict, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
-from models.prediction import PredictedGrasp, Prediction, predict, training_scale
 from utils.config import run_script
 from utils.errors import UserError
-from utils.files import write_atomic
-from utils.image_files import intrinsics_matrix, read_depth, read_pose, read_rgb
-from utils.prediction_panel import is_prediction_panel, prediction_panel
+from utils.image_overlay import is_prediction_panel, prediction_panel
+from utils.images import intrinsics_matrix, read_depth, read_pose, read_rgb
+from utils.runs import write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
 
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parse_options(argv)
     saved = load_graspnet(options.checkpoint)
     if options.export is not None:
-        from models.graspnet_export import export_onnx  # nothing else needs ONNX
+        from models.graspnet_io import export_onnx  # nothing else needs ONNX
 
         export_onnx(saved, options.export)
         print(f"wrote {options.export}", file=sys.stderr)

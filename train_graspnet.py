@@ -43,32 +43,28 @@ from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.cell import camera_intrinsics
 from envs.data_generation import generate
-from models.grasp_examples import EpochBatches
+from envs.pybullet_cell import camera_intrinsics
 from models.graspnet import GraspNet, create_model
-from models.graspnet_adaptation import AdaptingTrainer, check_alone
+from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
+from models.graspnet_data import TrainingData, simulated_data
+from models.graspnet_examples import EpochBatches
 from models.graspnet_io import load_graspnet, load_initial, save_graspnet
-from models.graspnet_pictures import draw_curves, draw_predictions
-from models.graspnet_scores import check_graspable
+from models.graspnet_scores import check_graspable, draw_curves, draw_predictions
 from models.graspnet_training import Team, Trainer, team
-from models.real_training_data import (
+from models.rectangle_examples import Judged, draw_rectangles
+from models.rectangle_folds import (
     Fold,
     cross_validation_results,
     describe_fold,
     describe_folds,
     real_folds,
 )
-from models.rectangle_pictures import draw_rectangles
-from models.rectangle_scores import Judged
-from models.target_images import open_target, with_target
-from models.training_data import TrainingData, simulated_data
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
-from utils.files import write_atomic, write_json_atomic
 from utils.grasp_data import read_trials
-from utils.label_trials import label_truth
-from utils.runs import check_writable, git_state, new_run_folder
+from utils.grasp_labels import label_truth
+from utils.runs import check_writable, git_state, new_run_folder, write_atomic, write_json_atomic
 
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
 WEIGHTS_HELP = "also write graspnet.pt here, once the training has reached its end"

@@ -38,13 +38,13 @@ import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.films import film_episode
-from envs.vector import VectorEnvs, WorkerError, full_difficulty, make_env, vector_envs
+from envs.studio import film_episode
+from envs.vector_env import VectorEnvs, WorkerError, full_difficulty, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy, policy_for, save_policy
 from models.graspnet_training import Team, choose_device, team
-from models.observations import ObservationLayout
 from models.ppo import KIND
-from models.rollouts import (
+from models.ppo_observations import ObservationLayout
+from models.ppo_rollouts import (
     NETWORK,
     SIMULATION,
     Episode,
@@ -60,9 +60,7 @@ from utils.adaptive_ranges import Bound
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
 from utils.errors import UserError
-from utils.files import write_json_atomic
-from utils.runs import check_writable, git_state, new_run_folder
-from utils.stopwatch import Stopwatch
+from utils.runs import Stopwatch, check_writable, git_state, new_run_folder, write_json_atomic
 
 FREE_TO_CHANGE = (
     "name",

@@ -21,12 +21,12 @@ import pybullet_data
 from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from envs.camera import Intrinsics, render
-from envs.cell import Cell
+from envs.cell_layout import add_table, set_up_physics
+from envs.cell_scenes import Scene, make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set, spawn
-from envs.scenes import Scene, make_scene
-from envs.world import add_table, set_up_physics
+from envs.pybullet_camera import Intrinsics, render
+from envs.pybullet_cell import Cell
 from utils.config import Config, load_config, run_script, with_settings
 
 STEPS = 40  # of an environment, between two readings of the clock

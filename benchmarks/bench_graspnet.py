@@ -19,12 +19,12 @@ import numpy as np
 import torch
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from envs.cell import Cell
+from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.scenes import LAYOUTS, make_scene
-from models.backbones import BACKBONES
-from models.grasp_peaks import PeakSettings, decode_grasps, find_peaks
+from envs.pybullet_cell import Cell
 from models.graspnet import GraspNet, create_model, to_input
+from models.graspnet_backbones import BACKBONES
+from models.graspnet_decoding import PeakSettings, decode_grasps, find_peaks
 from models.graspnet_io import (
     SHIPPED,
     SavedGraspNet,
@@ -32,8 +32,8 @@ from models.graspnet_io import (
     load_graspnet,
     metres_per_pixel,
 )
-from models.graspnet_planner import GraspNetPlanner
 from models.graspnet_scores import score_labels
+from models.planner_graspnet import GraspNetPlanner
 from utils.augmentation import LabelledImage
 from utils.config import load_config, run_script
 from utils.geometry import GripperGeometry, Workspace

@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.cell import Cell
+from envs.cell_scenes import Scene, make_scene
 from envs.data_generation import execute_pairs
 from envs.objects import load_object_set
-from envs.scenes import Scene, make_scene
+from envs.pybullet_cell import Cell
 from utils.config import Config, load_config
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_labels import GraspLabels, dense_labels
-from utils.label_trials import Trial, label_truth
+from utils.grasp_labels import GraspLabels, Trial, dense_labels, label_truth
 from utils.transforms import RGBDFrame
 
 LAYOUTS = ("pile", "packed", "isolated", "pile", "packed")

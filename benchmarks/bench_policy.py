@@ -16,10 +16,10 @@ from tempfile import NamedTemporaryFile
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.vector import full_difficulty, make_env
+from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo import KIND
-from models.rollouts import derived_seeds
+from models.ppo_rollouts import derived_seeds
 from utils.checkpoint import load_checkpoint
 from utils.config import Config, load_config, run_script
 from utils.statistics import wilson_interval

@@ -170,11 +170,11 @@ def whole_updates(config: Config, steps: int) -> int:
 
 
 def train_ours(env: str, seed: int, steps: int) -> Result:
-    from envs.vector import vector_envs
+    from envs.vector_env import vector_envs
+    from models.ppo_rollouts import RolloutCollector, derived_seeds, evaluate_policy
     from models.ranks import ALONE
-    from models.rollouts import RolloutCollector, derived_seeds, evaluate_policy
     from train_rl import make_ppo
-    from utils.stopwatch import Stopwatch
+    from utils.runs import Stopwatch
 
     config = config_of(env, seed)
     count, watch = whole_updates(config, steps), Stopwatch()
@@ -235,7 +235,7 @@ def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
 
 def step_only(env: str, seed: int, steps: int) -> float:
     """Steps a second of the same environments with random actions and nothing learned."""
-    from envs.vector import vector_envs
+    from envs.vector_env import vector_envs
 
     config = config_of(env, seed)
     with vector_envs(config, config.rl.envs) as envs:

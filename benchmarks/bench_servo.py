@@ -15,7 +15,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from utils.servo_scenarios import (
+from utils.servo_reference import (
     CAMERA,
     FOCAL,
     GOAL,

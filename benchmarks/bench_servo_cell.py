@@ -15,16 +15,15 @@ import pybullet
 from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.cell import Cell, wrist_mount
-from envs.kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
-from envs.panda import ARM
-from envs.scenes import Scene
-from envs.servo_target import Board
-from envs.servoing import BoardCamera, CarriedBoard, servo_arm, servo_settings, view_of
+from envs.board import Board
+from envs.board_servo import BoardCamera, CarriedBoard, servo_arm, servo_settings, view_of
+from envs.cell_scenes import Scene
+from envs.pybullet_cell import Cell, wrist_mount
+from envs.pybullet_panda import ARM
+from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
 from utils.config import load_config
 from utils.servo_features import MOUNTINGS
-from utils.servo_history import ServoHistory
-from utils.servo_loop import View, VisualServo
+from utils.servo_loop import ServoHistory, View, VisualServo
 from utils.transforms import inverse_pose, pose_matrix, top_down_pose
 from utils.visual_servo import (
     AdaptiveGain,

@@ -27,7 +27,7 @@ from utils.adaptation import (
     train_domain_adaptation,
 )
 from utils.config import Config, load_config, run_script
-from utils.depth_noise import KinectNoise
+from utils.depth import KinectNoise
 
 PAIRS = ("mnist:uci", "uci:mnist", "mnist:photo")
 TEST_SHARE = 0.2  # of a domain's images, seen by no training

@@ -17,18 +17,18 @@ import numpy as np
 import pybullet
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
+from envs.closed_loop_tracker import WristCamera
 from envs.execution import choose_posture
-from envs.kinematics import UnreachableError, moved
 from envs.objects import load_object_set
-from envs.scenes import make_scene
-from envs.wrist_camera import WristCamera
+from envs.pybullet_cell import Cell
+from envs.robot_kinematics import UnreachableError, moved
 from models.planners import make_planner
 from utils.config import load_config, run_script
+from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
 from utils.object_tracking import ObjectTracker, grasp_frame, make_template
-from utils.servo_errors import TargetLostError
-from utils.tabletop import planar, planar_part
+from utils.table_plane import planar, planar_part
 from utils.transforms import Grasp, inverse_pose, position_quaternion
 
 OBJECT_SETS = ("random_urdfs", "primitives")

@@ -15,17 +15,16 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from envs.beliefs import teach
-from envs.challenges import CHALLENGES
-from envs.disturbances import disturbed
+from envs.camera_calibration import teach
+from envs.cell_scenes import make_scene
+from envs.closed_loop import ClosedLoop
+from envs.closed_loop_tracker import DepthSight
 from envs.execution import execute_grasp
-from envs.grasp_loop import ClosedLoop
-from envs.kinematics import forward_kinematics
 from envs.objects import load_object_set
-from envs.scenes import make_scene
+from envs.robot_kinematics import forward_kinematics
+from envs.scenarios import CHALLENGES, disturbed
+from envs.simulators import make_cell
 from envs.studio import Studio
-from envs.worlds import make_cell
-from envs.wrist_camera import DepthSight
 from models.planners import make_planner
 from utils.config import load_config
 from utils.geometry import GripperGeometry, Workspace

@@ -1,231 +1,256 @@
-"""The robot cell in PyBullet: one physics client with table, bin, Panda, objects and camera.
+"""What is the same in every world's cell: cameras, frames, truth, which objects are in the game.
 
-Labelling, evaluation, demos and the Gymnasium env all run in this one cell. It knows how to
-build and observe the world; what to do in it is for others to say.
+`envs.pybullet_cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, closed loops,
+disturbances, rounds and planners know a cell only as far as it is described here.
 """
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-import pybullet
 
-from envs.base_cell import (
-    ROBOT,
-    TABLE_OR_BACKGROUND,
-    BaseCell,
-    PhysicsError,
-    camera_intrinsics,
-    wrist_mount,
-)
-from envs.camera import DEFAULT_LIGHT, Image, Intrinsics, load_renderer, render
-from envs.objects import spawn
-from envs.panda import Panda, panda_urdf
-from envs.scenes import EMPTY, Scene, settle
-from envs.servo_target import Board
-from envs.world import SOLVER_RESIDUAL, add_bin, add_table, set_up_physics
-from utils.config import Config
+from envs.board import Board
+from envs.cell_layout import on_table
+from envs.cell_scenes import Scene
+from envs.pybullet_camera import Image, Intrinsics
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
+from envs.robot_safety import ArmGate
+from utils.config import CameraConfig, Config
+from utils.depth import KinectNoise
 from utils.errors import UserError
-from utils.random_view import RandomView
-from utils.transforms import position_quaternion
+from utils.geometry import SceneGeometry, SolidObject
+from utils.transforms import RGBDFrame, look_at
 
-__all__ = [
-    "ROBOT", "TABLE_OR_BACKGROUND", "Cell", "PhysicsError", "camera_intrinsics", "wrist_mount",
-]  # fmt: skip
-
-# As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
-_CALM_RESIDUAL = 1e-6
-_CALM_LOOKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
+TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
+# An object farther than this share of the workspace's side from its centre is out of the game.
+_REACH = 0.63
+# Keeps the depth noise of a seed apart from the scene of the same seed.
+_DEPTH_NOISE_STREAM = 1
 
 
-class Cell(BaseCell):
-    """A simulated robot cell.
+class PhysicsError(RuntimeError):
+    """The simulation left the realm of finite numbers."""
 
-    `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_build` is called
-    with the cell when a scene has been built and nothing has moved yet; `view` changes what cameras
-    see. Close it, or use it in a `with` block.
+
+class BaseCell(ABC):
+    """A simulated robot cell, whatever simulates it. Close it, or use it in a `with` block.
+
+    dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
+    has the interface of `envs.pybullet_panda.Panda`. bodies: the simulator's numbers of the objects.
+    remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
+    built. on_step is called after every physics step with the cell (used to film), before_step
+    before it (used to disturb the objects). sample: what was drawn for this scene alone
+    (`utils.domain_randomization`), None for a nominal cell. on_action: what becomes of each action
+    of a policy that moves the hand in turns; None: it is carried out as it is.
     """
 
-    def __init__(self, config: Config, fine: bool = False, gui: bool = False):
-        super().__init__(config)
-        if config.world != "pybullet":
-            raise UserError(
-                f"world={config.world}: only evaluate.py can score policies there; leave it out, "
-                "or set world=pybullet"
-            )
-        self.fine = fine
-        self.on_build: Callable[[Cell], None] | None = None
-        self.view: RandomView | None = None
-        self._gui = gui
-        self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        self.renderer = load_renderer(self.client, config.sim.renderer)
-        self._urdf = panda_urdf(config.cache_folder, fine)
+    client: int | None = None
 
+    def __init__(self, config: Config):
+        self.config = config
+        self.dt = 1.0 / config.sim.frequency
+        self.home = np.array(config.robot.home)
+        if (self.home < JOINT_LOWER).any() or (self.home > JOINT_UPPER).any():
+            raise UserError(
+                f"robot.home {list(config.robot.home)} is outside the Panda's joint limits, "
+                f"{JOINT_LOWER.tolist()} to {JOINT_UPPER.tolist()} rad"
+            )
+        tip, lower, upper = tip_position(config.robot.home), *_box(config)
+        if not all(low <= place <= high for place, low, high in zip(tip, lower, upper)):
+            raise UserError(
+                f"robot.home has the fingertips at {[round(at, 3) for at in tip]} m, outside the "
+                f"box from safety.box_lower {lower} to safety.box_upper {upper}: the arm could not "
+                "come back there; widen the box"
+            )
+        config.make_cache_folder()
+        self.scene: Scene | None = None
+        self.remaining: set[int] = set()
+        self.steps = self.frames = 0
+        self.on_step: Callable[[BaseCell], None] | None = None
+        self.before_step: Callable[[BaseCell], None] | None = None
+        self.sample: dict[str, Any] | None = None
+        self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def _new_gate(self) -> ArmGate:
+        config = self.config
+        return ArmGate(config.safety, config.robot, self.dt, config.grasp.floor)
+
+    @abstractmethod
     def load(self, scene: Scene) -> None:
         """Build the scene and let its objects come to rest."""
-        self.build(scene)
-        settle(self.client, self.bodies, self.config)
 
+    @abstractmethod
     def build(self, scene: Scene) -> None:
-        """Rebuild the world from nothing and put the scene's objects at their poses.
+        """Rebuild the world from nothing and put the scene's objects at their poses."""
 
-        Rebuilding is what makes a round independent of the ones before it: resetting states alone
-        leaves the solver's memory behind (bullet3 #2442). It takes about 8 ms and leaks nothing.
-        """
-        self.scene = scene
-        set_up_physics(self.client, self.config.sim)
-        self.table = add_table(self.client)
-        self.bin = add_bin(self.client)
-        grip_force = self.config.robot.grip_force
-        self.robot = Panda(self.client, self.dt, self._urdf, grip_force, self._new_gate())
-        self.robot.place(self.home)
-        self.bodies = [
-            spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)
-            for p in scene.placements
-        ]
-        self._index_of_body = {body: i for i, body in enumerate(self.bodies)}
-        self.remaining = set(range(len(self.bodies)))
-        self.steps = 0
-        self.frames = 0
-        if self.on_build is not None:
-            self.on_build(self)
-
+    @abstractmethod
     def show_board(self, board: Board, T_WO: np.ndarray) -> None:
-        self.build(EMPTY)
-        board.add(self.client, T_WO)
+        """Rebuild the world with nothing in it but what every scene has and a board that stays at
+        T_WO (4, 4)."""
 
+    @abstractmethod
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
-        while count > 0:
-            part = self.robot.receive(count)
-            self._advance(part)
-            count -= part
-
-    def _advance(self, count: int) -> None:
-        client, on_step, before_step = self.client, self.on_step, self.before_step
-        watched = on_step is not None or before_step is not None or self._gui
-        if not watched and _divides(self.dt, count):
-            # The same steps in one call. The time step is set only for that call, because motor
-            # commands and contact forces are converted by it.
-            pybullet.setPhysicsEngineParameter(
-                fixedTimeStep=count * self.dt, numSubSteps=count, physicsClientId=client
-            )
-            pybullet.stepSimulation(physicsClientId=client)
-            pybullet.setPhysicsEngineParameter(
-                fixedTimeStep=self.dt, numSubSteps=0, physicsClientId=client
-            )
-            self.steps += count
-            return
-        for _ in range(count):
-            if before_step is not None:
-                before_step(self)
-            pybullet.stepSimulation(physicsClientId=client)
-            self.steps += 1
-            if on_step is not None:
-                on_step(self)
 
     def calm(self) -> bool:
-        """Spare the solver until the robot touches something; whether the objects are at rest,
-        without which nothing is done. `wake` has to be called at the first touch.
+        """Spare the simulator until the robot touches something, if it knows how; whether it does.
+        `wake` has to be called at the first touch."""
+        return False
 
-        The objects sleep, which is to lie still at no cost until something hits them; and the
-        solver stops a little earlier, which moves a free arm's joints by less than 0.5 mrad.
-        """
-        if not settle(self.client, self.bodies, self.config, looks=_CALM_LOOKS):
-            return False
-        sleep = pybullet.ACTIVATION_STATE_ENABLE_SLEEPING | pybullet.ACTIVATION_STATE_SLEEP
-        self._set_activation(sleep, _CALM_RESIDUAL)
-        return True
+    def wake(self) -> None:  # noqa: B027 - there is nothing to undo where nothing was spared
+        """Undo `calm`."""
 
-    def wake(self) -> None:
-        """Undo `calm`: an object at rest in the hand must not fall asleep and hang in the air."""
-        awake = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING | pybullet.ACTIVATION_STATE_WAKE_UP
-        self._set_activation(awake, SOLVER_RESIDUAL)
-
-    def _set_activation(self, state: int, residual: float) -> None:
-        for body in self.bodies:
-            pybullet.changeDynamics(body, -1, activationState=state, physicsClientId=self.client)
-        pybullet.setPhysicsEngineParameter(
-            solverResidualThreshold=residual, physicsClientId=self.client
-        )
-
+    @abstractmethod
     def object_pose(self, index: int) -> np.ndarray:
-        """(4, 4) pose in W of an object's body frame (its origin is the centre of mass). Raises
-        PhysicsError when it is not finite."""
-        position, quaternion = self._position_and_quaternion(index)
-        a, b, c, d, e, f, g, h, i = pybullet.getMatrixFromQuaternion(quaternion)
-        x, y, z = position
-        # A tenth of the time that SciPy takes: the Gymnasium env asks at every step.
-        return np.array([(a, b, c, x), (d, e, f, y), (g, h, i, z), (0.0, 0.0, 0.0, 1.0)])
+        """(4, 4) pose in W of an object's body frame (its origin is the centre of mass)."""
 
+    @abstractmethod
     def object_position(self, index: int) -> np.ndarray:
         """(3,) centre of mass in W. Raises PhysicsError when it is not finite."""
-        return np.array(self._position_and_quaternion(index)[0])
 
-    def _position_and_quaternion(self, index: int) -> tuple[tuple, tuple]:
-        position, quaternion = pybullet.getBasePositionAndOrientation(
-            self.bodies[index], physicsClientId=self.client
-        )
-        if not all(map(math.isfinite, position)):
-            raise PhysicsError(f"object {index} has a non-finite position: {position}")
-        return position, quaternion
-
+    @abstractmethod
     def speed(self, index: int) -> float:
-        velocity, _ = pybullet.getBaseVelocity(self.bodies[index], physicsClientId=self.client)
-        return math.hypot(*velocity)
+        """m/s of an object's centre of mass."""
 
+    @abstractmethod
     def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
-        body, client = self.bodies[index], self.client
-        position, quaternion = position_quaternion(T_WO)
-        pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
-        pybullet.resetBaseVelocity(body, velocity, [0, 0, turn_rate], physicsClientId=client)
+        """Put an object's body frame at T_WO (4, 4), on its way at `velocity` (3,) m/s and turning
+        at `turn_rate` rad/s about +z of W; physics has it from there."""
 
+    @abstractmethod
     def touches_table(self, index: int) -> bool:
-        contacts = pybullet.getContactPoints(
-            self.bodies[index], self.table, physicsClientId=self.client
-        )
-        return bool(contacts)
+        """Whether an object and the table are in contact."""
 
+    def held_object(self) -> int | None:
+        """The object that both fingers grip, or None."""
+        return next((i for i in sorted(self.remaining) if self.robot.holds(self.bodies[i])), None)
+
+    def is_lifted(self, index: int, height: float) -> bool:
+        """Whether an object is gripped, off the table, and its centre of mass above `height` m."""
+        return bool(
+            self.object_position(index)[2] > height
+            and self.robot.holds(self.bodies[index])
+            and not self.touches_table(index)
+        )
+
+    @abstractmethod
     def retire(self, index: int) -> None:
         """Take an object out of the game: it stays visible where it is but collides no more."""
-        body = self.bodies[index]
-        self.remaining.discard(index)
-        # A body without mass keeps its velocity and would drift away.
-        pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=self.client)
-        pybullet.changeDynamics(body, -1, mass=0, physicsClientId=self.client)
-        pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self.client)
 
+    @abstractmethod
     def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
-        """What `look` sees, without a frame around it. With a `view`, the camera is really where
-        that has it, and what is reported of it stays as it is here: it was calibrated so."""
-        view = self.view
-        if view is None:
-            return render(self.client, intrinsics, T_WC, self.renderer, light)
-        view.begin_frame()
-        intrinsics = replace(intrinsics, fov_deg=intrinsics.fov_deg * view.fov_scale)
-        T_WC = T_WC @ view.T_CC
-        light = DEFAULT_LIGHT | (light or {})
-        image = render(self.client, intrinsics, T_WC, self.renderer, view.lit(light))
-        rgb, depth = view.develop(image.rgb, image.depth, image.bodies, intrinsics.K, T_WC)
-        return replace(image, rgb=rgb, depth=depth)
+        """What `look` sees, without a frame around it."""
 
-    def _segmentation(self, image: Image) -> np.ndarray:
-        segmentation = np.full(image.bodies.shape, TABLE_OR_BACKGROUND, dtype=np.int32)
-        segmentation[image.bodies == self.robot.body] = ROBOT
-        for body, index in self._index_of_body.items():
-            segmentation[image.bodies == body] = index
-        return segmentation
-
+    @abstractmethod
     def close(self) -> None:
-        if self.client >= 0:
-            pybullet.disconnect(physicsClientId=self.client)
-            self.client = -1
+        """Free what the simulator holds; may be called again."""
+
+    @abstractmethod
+    def _segmentation(self, image: Image) -> np.ndarray:
+        """(H, W) int32 numbers of objects, TABLE_OR_BACKGROUND or ROBOT."""
+
+    @property
+    def seconds(self) -> float:
+        """Simulated seconds since the scene was loaded."""
+        return self.steps * self.dt
+
+    def check_physics(self) -> None:
+        """Raise PhysicsError if the robot or an object has left the realm of finite numbers."""
+        if not np.isfinite(self.robot.q).all():
+            raise PhysicsError("the robot's joint positions are not finite")
+        for index in self.remaining:
+            self.object_position(index)
+
+    def retire_lost_objects(self) -> list[int]:
+        """Retire the objects that fell off the table or left the camera's reach; their numbers."""
+        lost = [i for i in sorted(self.remaining) if not self._within_reach(i)]
+        for index in lost:
+            self.retire(index)
+        return lost
+
+    def _within_reach(self, index: int) -> bool:
+        # The camera sees a margin around the workspace, so an object that rolled a little way out
+        # is still in the game; one behind the robot or off the table is not.
+        position = self.object_position(index)
+        margin = abs(position[:2] - self.config.workspace.center).max()
+        return on_table(position) and margin <= _REACH * self.config.workspace.size
+
+    def camera_pose(self, mount: str | None = None) -> np.ndarray:
+        """(4, 4) T_WC of the overhead or the wrist camera."""
+        camera = self.config.camera
+        if (mount or camera.mount) == "overhead":
+            return look_at(camera.position, camera.target, camera.up)
+        return forward_kinematics(self.robot.q) @ wrist_mount(camera)
+
+    def frame(self, with_truth: bool = False) -> RGBDFrame:
+        """What the configured camera sees now; `with_truth` adds the true geometry.
+
+        `camera.depth_noise` changes the depth alone. It is a function of the scene's seed and the
+        number of frames since it was loaded, so that every policy meets the same.
+        """
+        camera = self.config.camera
+        frame = self.look(camera_intrinsics(camera), self.camera_pose(), with_truth)
+        if camera.depth_noise == "kinect":
+            rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
+            noise = KinectNoise(image_focal=float(frame.K[0, 0]))
+            frame = replace(frame, depth=noise(frame.depth, rng))
+        self.frames += 1
+        return frame
+
+    def look(
+        self,
+        intrinsics: Intrinsics,
+        T_WC: np.ndarray,
+        with_truth: bool = False,
+        light: dict | None = None,
+    ) -> RGBDFrame:
+        """What a camera at T_WC (4, 4) sees now, without noise; `light` as in
+        `envs.pybullet_camera.render`."""
+        image = self.image(intrinsics, T_WC, light)
+        truth = self.truth() if with_truth else None
+        return RGBDFrame(
+            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
+        )
+
+    def truth(self) -> SceneGeometry:
+        """The true geometry of the objects still in the game."""
+        solids = []
+        for index in sorted(self.remaining):
+            model, T = self.scene.placements[index].model, self.object_pose(index)
+            solids.append(
+                SolidObject(
+                    tuple(solid.transformed(T) for solid in model.geometry()),
+                    T[:3, 3],
+                    model.friction,
+                )
+            )
+        return SceneGeometry(tuple(solids))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
 
 
-def _divides(dt: float, count: int) -> bool:
-    """Whether Bullet, told to cut `count * dt` seconds into `count` steps, makes just that many of
-    just `dt`: where rounding is against it, it makes one fewer."""
-    return count > 1 and count * dt / count == dt and int(count * dt / dt) == count
+def camera_intrinsics(camera: CameraConfig) -> Intrinsics:
+    """The configured camera's intrinsics; the wrist camera has a field of view of its own."""
+    fov = camera.fov_deg if camera.mount == "overhead" else camera.wrist_fov_deg
+    return Intrinsics(camera.width, camera.height, fov, camera.near, camera.far)
+
+
+def wrist_mount(camera: CameraConfig) -> np.ndarray:
+    """(4, 4) T_EC: the wrist camera beside the hand, looking along the approach."""
+    T = np.eye(4)
+    # Image right is E's +y, the closing line; at home image up points away from the robot.
+    T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    T[:3, 3] = camera.wrist_position
+    return T
+
+
+def _box(config: Config) -> tuple[list[float], list[float]]:
+    return list(config.safety.box_lower), list(config.safety.box_upper)

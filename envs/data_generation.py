@@ -22,19 +22,18 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from envs.appearance import Appearance, draw_camera
-from envs.cell import Cell, PhysicsError, camera_intrinsics
+from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
-from envs.scenes import LAYOUTS, Scene, SceneError, make_scene
+from envs.pybullet_appearance import Appearance, draw_camera
+from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics
 from utils.config import Config, dump_config, with_settings
 from utils.errors import UserError
-from utils.files import write_atomic
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
-from utils.grasp_labels import LabelSettings, dense_labels
-from utils.label_trials import Trial, draw_pairs
+from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
 from utils.random_ranges import changed, draw
+from utils.runs import write_atomic
 
 SPLITS = ("train", "validation")
 HELD_OUT = 10  # every tenth training object is kept for validation

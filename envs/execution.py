@@ -13,16 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.base_cell import BaseCell
-from envs.kinematics import (
+from envs.cell import BaseCell
+from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
+from envs.pybullet_panda import MAX_OPENING
+from envs.robot_kinematics import (
     Trajectory,
     UnreachableError,
     forward_kinematics,
     inverse_kinematics,
 )
-from envs.panda import MAX_OPENING
-from envs.safety import ArmStoppedError, reaching_down
-from envs.world import BIN_CENTRE, BIN_HEIGHT
+from envs.robot_safety import ArmStoppedError, reaching_down
 from utils.config import Config
 from utils.errors import UserError
 from utils.transforms import Grasp, top_down_pose

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from utils.descents import LabelSettings, judge, undersides
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace
+from utils.grasp_quality import LabelSettings, judge, undersides
 from utils.height_map import height_map_from_scene
 
 ANGLES = 12  # closing lines that are tried, over half a turn

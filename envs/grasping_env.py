@@ -18,12 +18,16 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
-from envs import hand_starts
-from envs.approach import Outline
-from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
+from envs import env_actions
+from envs.cell_layout import on_table
+from envs.cell_scenes import make_scene
+from envs.env_actions import HandCommands
+from envs.env_rewards import Outline
 from envs.grasp_goals import GraspGoals
-from envs.hand_commands import HandCommands
-from envs.kinematics import (
+from envs.objects import ObjectSet, load_object_set
+from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
+from envs.pybullet_panda import MAX_OPENING
+from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     JOINT_VELOCITY,
@@ -31,11 +35,7 @@ from envs.kinematics import (
     forward_kinematics,
     inverse_kinematics,
 )
-from envs.objects import ObjectSet, load_object_set
-from envs.panda import MAX_OPENING
-from envs.scenes import make_scene
 from envs.studio import Studio
-from envs.world import on_table
 from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
@@ -78,7 +78,7 @@ class RobotGraspingEnv(gymnasium.Env):
         Phi = (1 + h) / 2                                 while both fingers grip the object
 
     where w is the way in metres that the hand has to go: with `goal` "object" to be around the
-    nearest object, see `envs.approach`; with "grasp" to the nearest grasp that the only object
+    nearest object, see `envs.env_rewards`; with "grasp" to the nearest grasp that the only object
     offers, see `envs.grasp_goals`; and h in [0, 1] is how far the object has risen from where it
     rested at reset towards `lift_height`. The two tanh pay for coming near from afar, and for the
     last centimetre.
@@ -95,7 +95,7 @@ class RobotGraspingEnv(gymnasium.Env):
     refused), `scene_seed`; and what no robot is told: `grasped`, `object_position` (3,), and of the
     same nearest object `object_offset` (6,), from E to its centre along E's axes, in metres and as
     tanh(metres / 0.03), which tells the last centimetres finely, and `object_outline` (9,), see
-    `envs.approach`; with `goal` "grasp" also `grasp_goal` (11,), see `envs.grasp_goals`.
+    `envs.env_rewards`; with `goal` "grasp" also `grasp_goal` (11,), see `envs.grasp_goals`.
 
     Parameters: `render_mode`: None, "human" (a window) or "rgb_array". `config`: a Config, a YAML
     file, or None for the defaults. Any key of the config's `env` section can be given by name:
@@ -246,13 +246,13 @@ class RobotGraspingEnv(gymnasium.Env):
         T_WO = self.cell.object_pose(index)
         top = self._outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
         if start == "near":
-            T = hand_starts.near(T_home, T_WO[:2, 3], top, self.np_random)
+            T = env_actions.near(T_home, T_WO[:2, 3], top, self.np_random)
             opening = command = MAX_OPENING
         else:
             grasp = None
             if self._goals is not None:
                 grasp = self._goals.grasp(self.np_random.integers(len(self._goals)), T_WO)
-            T, opening, command = hand_starts.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
+            T, opening, command = env_actions.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
             T[:3, 3] = np.clip(T[:3, 3], self._hand.lowest, self._hand.highest)
         try:
             return inverse_kinematics(T, self.cell.home, self.cell.home), opening, command

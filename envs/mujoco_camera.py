@@ -1,6 +1,6 @@
 """What RGB-D cameras see of a MuJoCo world, drawn without a window by MuJoCo's OpenGL renderer.
 
-The same camera model, depth and light settings as `envs.camera` has for PyBullet. Knows nothing of
+The same camera model, depth and light settings as `envs.pybullet_camera` has for PyBullet. Knows nothing of
 robots, objects or tasks.
 """
 
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.camera import DEFAULT_LIGHT, Image, Intrinsics
 from envs.mujoco_panda import load_mujoco
+from envs.pybullet_camera import DEFAULT_LIGHT, Image, Intrinsics
 from utils.errors import UserError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class MujocoCamera:
     def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
         """What a camera at T_WC (4, 4) sees; its `bodies` are MuJoCo's numbers, -1 for none.
 
-        light: changes of `envs.camera.DEFAULT_LIGHT`, in its words.
+        light: changes of `envs.pybullet_camera.DEFAULT_LIGHT`, in its words.
         """
         mujoco, model, data = self._mujoco, self._model, self._data
         near, far = intrinsics.near, intrinsics.far

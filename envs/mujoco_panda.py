@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pybullet_data
 
-from envs.guarded_arm import GuardedArm
-from envs.kinematics import (
+from envs.pybullet_panda import FINGER_SPEED, GRIP_COSINE, MAX_OPENING
+from envs.robot import GuardedArm
+from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
     JOINT_UPPER,
     JOINT_VELOCITY,
     forward_kinematics,
 )
-from envs.panda import FINGER_SPEED, GRIP_COSINE, MAX_OPENING
-from envs.safety import ArmGate
+from envs.robot_safety import ArmGate
 from utils.errors import UserError
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def _urdf() -> str:
 
 
 class MujocoPanda(GuardedArm):
-    """The Panda in MuJoCo with the commands of `envs.panda.Panda`; model and data are MuJoCo's.
+    """The Panda in MuJoCo with the commands of `envs.pybullet_panda.Panda`; model and data are MuJoCo's.
 
     gate: what every command to the arm passes. dt: s, a control period, in which MuJoCo takes
     `substeps` steps of its own. grip_force: N a finger. Raises UserError without MuJoCo.
@@ -288,7 +288,7 @@ class MujocoPanda(GuardedArm):
     def grip_forces(self, body: int) -> tuple[float, float]:
         """Newtons with which the left and the right finger press a body towards each other.
 
-        A contact counts where `envs.panda.Panda.grip_forces` counts it.
+        A contact counts where `envs.pybullet_panda.Panda.grip_forces` counts it.
         """
         closing, inwards = self.tip_pose()[:3, 1], []
         # The left finger is on the side of E's +y axis, so its contacts push the body along -y.

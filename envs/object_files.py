@@ -15,7 +15,7 @@ import trimesh
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from envs.meshes import ObjectError, checked_mesh, load_mesh, write_mesh_obj
+from envs.object_meshes import ObjectError, checked_mesh, load_mesh, write_mesh_obj
 
 SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
 DEFAULT_FRICTION = 0.7  # of a file that states none

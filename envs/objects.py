@@ -23,11 +23,11 @@ import pybullet_data
 import trimesh
 from tqdm import tqdm
 
-from envs.bullet_shapes import collision_shape, visual_shape
-from envs.meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_files import FineVisual, fine_visual, object_files, read_object
-from envs.panda import MAX_OPENING
-from envs.primitives import NativeShape, make_primitive, random_color
+from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
+from envs.object_primitives import NativeShape, make_primitive, random_color
+from envs.pybullet_bodies import collision_shape, visual_shape
+from envs.pybullet_panda import MAX_OPENING
 from utils.config_types import OBJECT_SETS
 from utils.geometry import ConvexSolid
 
@@ -234,7 +234,7 @@ class BoxSet(ObjectSet):
 
 
 class PrimitiveSet(ObjectSet):
-    """Procedural solids of eleven families, see `envs.primitives`: 900 to train, 100 to test."""
+    """Procedural solids of eleven families, see `envs.object_primitives`: 900 to train, 100 to test."""
 
     def __init__(self, split: str, scale: float, cache_dir: Path) -> None:
         super().__init__("primitives")

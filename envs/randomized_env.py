@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
-from envs.panda import ARM, FINGERS
+from envs.pybullet_panda import ARM, FINGERS
 from utils.adaptive_ranges import WIDEST
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError

@@ -14,17 +14,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from envs.base_cell import BaseCell, PhysicsError
-from envs.beliefs import CameraBeliefs, teach
-from envs.challenges import CHALLENGES
-from envs.disturbances import disturbed
+from envs.camera_calibration import CameraBeliefs, teach
+from envs.cell import BaseCell, PhysicsError
+from envs.cell_scenes import Scene
+from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
-from envs.grasp_loop import ClosedLoop
-from envs.kinematics import forward_kinematics
 from envs.policy_approach import PolicyApproach
-from envs.scenes import Scene
-from utils.round_records import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
-from utils.servo_errors import TargetLostError
+from envs.robot_kinematics import forward_kinematics
+from envs.scenarios import CHALLENGES, disturbed
+from utils.errors import TargetLostError
+from utils.result_records import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
-from envs.kinematics import forward_kinematics
+from envs.robot_kinematics import forward_kinematics
 
 
 def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:

@@ -8,6 +8,8 @@ and what the cell's camera sees of it:
 
 `--rgbd` makes a folder of color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py
 takes them, and scene.png, which is for people.
+
+Films of episodes, for any Gymnasium environment that renders "rgb_array".
 """
 
 from __future__ import annotations
@@ -15,19 +17,21 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import imageio.v2 as imageio
 import numpy as np
 import pybullet
 
-from envs.base_cell import BaseCell
-from envs.camera import Intrinsics, render
-from envs.cell import Cell
+from envs.cell import BaseCell
+from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.panda import ARM, FINGERS
-from envs.scenes import LAYOUTS, make_scene
+from envs.pybullet_camera import Intrinsics, render
+from envs.pybullet_cell import Cell
+from envs.pybullet_panda import ARM, FINGERS
 from utils.config import parse_args, run_script
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at
@@ -147,3 +151,28 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 if __name__ == "__main__":
     run_script(main)
+
+
+_HOLD = 6  # pictures for which the last one stays
+
+
+def film_episode(
+    env: gymnasium.Env, act: Callable[[Any], np.ndarray], seed: int, path: Path,
+    options: dict[str, Any] | None = None,
+) -> str:  # fmt: skip
+    """Play an episode, write it to an MP4 or GIF in real time; how it ended, in a word. options: of
+    its reset."""
+    observation, info = env.reset(seed=seed, options=options)
+    pictures, ended, terminated = [env.render()], False, False
+    while not ended:
+        observation, _, terminated, truncated, info = env.step(act(observation))
+        pictures.append(env.render())
+        ended = terminated or truncated
+    pictures += [pictures[-1]] * _HOLD
+    rate = env.metadata.get("render_fps", 30)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".gif":
+        imageio.mimwrite(path, pictures, duration=1000 / rate, loop=0)
+    else:
+        imageio.mimwrite(path, pictures, fps=rate, quality=6)
+    return str(info.get("reason") or ("terminated" if terminated else "truncated"))

@@ -17,9 +17,8 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from models.normalisers import ObservationNormaliser
-from models.observations import ObservationLayout, Observations
 from models.ppo import KIND, GraspPPO
+from models.ppo_observations import ObservationLayout, ObservationNormaliser, Observations
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import RLConfig
 from utils.errors import UserError

@@ -1,7 +1,7 @@
 """GraspNet: from an RGB-D image to ranked grasps (the tutorial's chapter 3).
 
 In order: an image becomes the network's input; the network; labels become training targets and
-the loss. `models.grasp_peaks` makes grasps of the network's maps. Angles on the image are those of
+the loss. `models.graspnet_decoding` makes grasps of the network's maps. Angles on the image are those of
 the closing line from +u (right) towards +v (down), modulo pi; bin k of K is centred at k * 180 / K
 degrees. Widths are metres. This module knows no simulator.
 """
@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from models.backbones import BACKBONES
-from models.grasp_peaks import decode_grasps
-from utils.depth_holes import fill_holes
+from models.graspnet_backbones import BACKBONES
+from models.graspnet_decoding import decode_grasps
+from utils.depth import fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.transforms import known_depth
 
@@ -89,7 +89,7 @@ class GraspNet(nn.Module):
 
     input_channels: 4 for `to_input`. num_angle_bins: K bins over [0, pi). max_width: metres, the
     largest width that can be told; 0.15 in the tutorial, 0.08 fits the Panda hand. backbone: one
-    of `models.backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder. centre_head:
+    of `models.graspnet_backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder. centre_head:
     a fourth head tells what leads from each pixel to the centre of mass of the object seen there.
     `model_args` holds these five, so that `GraspNet(**model_args)` is the same architecture.
     """

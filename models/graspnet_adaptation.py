@@ -3,31 +3,53 @@
 A domain classifier tells from the features which domain an image is of, and the backbone is
 trained against it by way of a gradient reversal (`utils.adaptation`), while the heads learn from
 the labelled images alone. Knows neither where the images come from nor how a checkpoint is chosen.
+
+Unlabelled photographs as what GraspNet is adapted to: examples, and the choice of a checkpoint.
+
+No label of theirs is read anywhere. Every example is a pure function of (seed, epoch, index), as in
+`models.graspnet_examples`, so that a run can be resumed exactly.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
+from torch.utils.data import Dataset
 
-from models.grasp_examples import Example
-from models.graspnet import GraspNet
+from models.graspnet import DEPTH_UNIT, GraspNet, to_input
+from models.graspnet_data import TrainingData
+from models.graspnet_examples import Example, LabelledImages
+from models.graspnet_scores import predict
 from models.graspnet_training import Team, Trainer
+from models.photographs import K, frame_of, from_above
+from models.rectangle_examples import RectangleImages, View
+from models.rectangle_folds import IN_MEMORY, Changed, Chosen
 from utils.adaptation import (
     SOURCE,
     TARGET,
+    Check,
     DomainAdaptationNetwork,
+    choose_check,
     domain_loss,
+    mutual_information,
     ordinary_norms,
     reversal_weight,
+    select_domain,
 )
+from utils.augmentation import Augmentation, ColourJitter
 from utils.checkpoint import load_weights
-from utils.config import AdaptationConfig, TrainConfig
+from utils.config import AdaptationConfig, Config, TrainConfig
 from utils.errors import UserError
+from utils.real_data import KEY, RealSample, UnlabelledImages
+from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 
 STATE = "adaptation"  # the entry of a checkpoint's `extra` from which a training goes on
 
@@ -145,3 +167,205 @@ class AdaptingTrainer(Trainer):
         saved = checkpoint["extra"][STATE]
         load_weights(self.model, saved, path)
         self.trained.domain_classifier.load_state_dict(saved["classifier"])
+
+
+# Of a photograph, what simulated training images are changed by, too: no change tells the domain.
+AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
+STANDS_OUT = (0.01, 0.15)  # m above the table: what a crop is laid around, as on simulated images
+MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
+CHECKED = 12  # images of a folder, spread over it, each of which has to hold what it says
+# How many times worse any other reading of an image has to explain the table for its numbers to be
+# distances from a base. For each of Cornell's 80 photographs in folder 01 that is 17 to 22 (0.8 to
+# 1.2 mm as distances, 16 to 22 mm as depths). For depths rendered in the cell, of cameras 0 to 37
+# degrees from straight down, with a Kinect's noise, it is below 1.1, for distances made of these
+# above 3. Tests hold both, and Cornell's.
+DISTINCT = 2.0
+# m: what fits better is taken to fit as well as this, for between two fits that are exact but for
+# rounding and steps of depth the ratio says nothing: 0.03 mm and 0.01 mm, for depths in the cell.
+EXACT = 0.0005
+INFORMATION_STEP = 4  # pixels between those whose predictions are asked; neighbours say the same
+
+
+def open_target(config: Config) -> Sequence[RealSample] | None:
+    """The images of `adaptation.target`, or None where nothing is adapted.
+
+    Raises UserError for data that cannot be adapted from, and for a folder that cannot be used or
+    whose images hold something else than distances from a robot's base.
+    """
+    folder = config.adaptation.target
+    if folder is None:
+        return None
+    if config.data.kind != "simulated":
+        raise UserError(
+            f"{KEY}={folder}: data.kind is {config.data.kind}, but adaptation is from simulated "
+            "images; use data.kind=simulated, or leave adaptation.target out"
+        )
+    images = UnlabelledImages(folder)
+    check_distances(images)
+    return images
+
+
+def check_distances(images: UnlabelledImages) -> None:
+    """Raise UserError naming the first of `CHECKED` images, spread over the folder, that would be
+    misread: each has to show a table that distances from a robot's base explain, far better than
+    depths or distances from the camera do, with the base where distances tell depths."""
+    chosen = np.linspace(0, len(images) - 1, min(len(images), CHECKED)).round().astype(int)
+    for record in (images.records[i] for i in chosen):
+        _check_distances(images.read(record).depth, record.files["d.tiff"])
+
+
+def _check_distances(image: np.ndarray, file: Path) -> None:
+    misses = table_misses(image, K)
+    fits = {reading: f"{1000 * miss:.2g} mm" for reading, miss in misses.items()}
+    likely = min(misses, key=misses.get)
+    if misses[likely] > FLAT:
+        raise UserError(
+            f"{KEY}: {file} shows no flat table: the typical pixel is {fits[likely]} off the best "
+            f"one, at most {1000 * FLAT:g} mm are allowed; give images whose middle shows mostly "
+            "table"
+        )
+    needed = misses.pop(FROM_BASE)
+    likely = min(misses, key=misses.get)
+    if misses[likely] < DISTINCT * max(needed, EXACT):
+        raise UserError(
+            f"{KEY}: {file} seems to hold {likely} (a flat table fits to {fits[likely]}), expected "
+            f"{FROM_BASE} (it fits to {fits[FROM_BASE]}); make these of them by "
+            "utils.table_plane.distances, as docs/sim_to_real.md shows"
+        )
+    if not find_table_camera(image, K).sees(image.shape, K, STANDS_OUT[1]):
+        raise UserError(
+            f"{KEY}: {file} holds distances from a point that is too near to what is seen: some "
+            f"rays of the camera are nearest to it less than {STANDS_OUT[1]:g} m above the table, "
+            "or below, where distances do not tell depths; make them of the depths by "
+            "utils.table_plane.distances, as docs/sim_to_real.md shows"
+        )
+
+
+def seen_from_above(sample: RealSample, metres_per_pixel: float) -> RealSample:
+    """A photograph as a network sees it that learns at so many metres per pixel."""
+    view = from_above(frame_of(sample), metres_per_pixel)
+    return replace(sample, rgb=view.rgb, depth=view.depth)
+
+
+def split_target(
+    samples: Sequence[RealSample], share: float, seed: int
+) -> tuple[list[int], list[int]]:
+    """Numbers of the images to learn from, and of those held out to choose a checkpoint."""
+    order = np.random.default_rng(seed).permutation(len(samples)).tolist()
+    count = min(max(round(share * len(order)), 1), len(order) - 1)
+    return sorted(order[count:]), sorted(order[:count])
+
+
+class TargetPairs(Dataset):
+    """Labelled examples, each with a crop of a random photograph, changed at random.
+
+    source: a data set of `Example`s by (epoch, index). view: how the photographs are seen, at the
+    source's scale. Crops are as large as the source's, around something that stands on the table.
+    """
+
+    def __init__(
+        self, source: Dataset, samples: Sequence[RealSample], view: View, seed: int
+    ):  # fmt: skip
+        self.source, self.samples, self.view, self.seed = source, samples, view, seed
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, place: tuple[int, int]) -> Pair:
+        source = self.source[place]
+        rng = np.random.default_rng([self.seed, *place, TARGET])
+        sample = self.samples[rng.integers(len(self.samples))]
+        shape = (self.view.size, self.view.size)
+        rgb, depth, _ = self.view.warp(sample, AUGMENTATION.draw(rng, shape).matrix(shape))
+        rgb = AUGMENTATION.colour(torch.from_numpy(np.moveaxis(rgb, -1, 0).copy()), rng)
+        x = to_input(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), depth)
+        height, width = source.image.shape[1:]
+        row, column = corner_around(x, (height, width), rng)
+        return Pair(source, x[:, row : row + height, column : column + width].contiguous())
+
+
+def corner_around(
+    x: torch.Tensor, size: tuple[int, int], rng: np.random.Generator
+) -> tuple[int, int]:
+    """Row and column at which a crop of `size` starts: around a random pixel of an input x (4, H,
+    W) that is in its `MIDDLE` and `STANDS_OUT` metres above the table; anywhere if none is."""
+    height = -DEPTH_UNIT * x[3].numpy()
+    size, shape = np.array(size), np.array(height.shape)
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    out = np.hypot(rows - shape[0] / 2, columns - shape[1] / 2)
+    low, high = STANDS_OUT
+    pixels = np.argwhere((height > low) & (height < high) & (out < MIDDLE * shape.min()))
+    middle = pixels[rng.integers(len(pixels))] if len(pixels) else rng.integers(shape)
+    corner = middle - size // 2 + rng.integers(-(size // 4), size // 4 + 1)
+    row, column = np.clip(corner, 0, np.maximum(shape - size, 0))
+    return int(row), int(column)
+
+
+# --- Choosing without labels -----------------------------------------------------------------
+
+
+def grasp_information(model: GraspNet, images: LabelledImages) -> float:
+    """Nats that a place in an image tells of what the network says there: nothing to grasp, or a
+    grasp in one of its K bins. 0 .. log(1 + K), see `utils.adaptation.mutual_information`. Of the
+    square `MIDDLE` around the centre; labels are not looked at. The model ends in evaluation mode.
+    """
+    model.eval()
+    said = []
+    for index in range(len(images)):
+        quality, angle, _ = predict(model, images[index])
+        rows, columns = (
+            slice(round((0.5 - MIDDLE) * n), round((0.5 + MIDDLE) * n), INFORMATION_STEP)
+            for n in quality.shape[2:]
+        )
+        quality, angle = (maps[..., rows, columns].double() for maps in (quality, angle))
+        said.append(torch.cat([1 - quality, quality * angle.softmax(dim=1)], dim=1))
+    p = torch.cat(said).clamp_min(torch.finfo(torch.double).tiny)
+    return mutual_information(p.log())
+
+
+@dataclass(frozen=True)
+class AdaptationData(TrainingData):
+    """TrainingData whose `train` gives `Pair`s and whose `score` has an entry `information`.
+
+    target: the photographs that are held out.
+    """
+
+    target: LabelledImages
+
+    keeps_every_epoch = True  # a later epoch can make an earlier one the choice
+
+    def chosen(self, history: Sequence[dict[str, float]]) -> dict[str, float]:
+        """The row of the most information on the target, among those that do nearly as well as the
+        best on labelled images: `utils.adaptation.choose_check`."""
+        checks = [
+            Check(row["epoch"], row[self.chosen_by], row["information"], row["domain_accuracy"])
+            for row in history
+        ]
+        return history[checks.index(choose_check(checks))]
+
+    def pictured(self) -> dict[str, LabelledImages]:
+        return super().pictured() | {"target": self.target}
+
+
+def with_target(
+    config: Config, data: TrainingData, samples: Sequence[RealSample]
+) -> AdaptationData:
+    """Simulated data, paired with photographs of `open_target`."""
+    learnt, held_out = split_target(samples, config.adaptation.held_out, config.seed)
+    see = partial(seen_from_above, metres_per_pixel=data.metres_per_pixel)
+    samples = Changed(samples, see)
+    side = samples[0].depth.shape[0]
+    view = View(side, side, data.metres_per_pixel)
+    if len(samples) <= IN_MEMORY:
+        samples = list(samples)
+    target = RectangleImages(Chosen(samples, held_out), view)
+
+    def score(model: GraspNet) -> dict[str, float]:
+        select_domain(model, SOURCE)
+        scores = data.score(model)
+        select_domain(model, TARGET)
+        return scores | {"information": grasp_information(model, target)}
+
+    same = {field.name: getattr(data, field.name) for field in fields(TrainingData)}
+    pairs = TargetPairs(data.train, Chosen(samples, learnt), view, config.seed)
+    return AdaptationData(**same | {"train": pairs, "score": score}, target=target)

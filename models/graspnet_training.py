@@ -16,8 +16,8 @@ import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from models.grasp_examples import Example
 from models.graspnet import GraspLoss, GraspNet
+from models.graspnet_examples import Example
 from models.graspnet_io import KIND, PIXEL_SIZE
 from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
 from utils.config import Config, TrainConfig

@@ -1,7 +1,7 @@
 """How planners and networks that were made in simulation alone do on Cornell's photographs.
 
 No label teaches anything, and nothing is fitted to one. A photograph becomes a frame: its distances
-become depths, the table tells where the camera is (`utils.table_camera`). The labels are for a hand
+become depths, the table tells where the camera is (`utils.table_plane`). The labels are for a hand
 that can hold a cereal box, which the Panda's cannot. A hand of the same shape that is k times as
 large does in its world what the Panda's does in one that is k times as small; so frames are shrunk,
 and everything else is as in the cell. The plates of a rectangle are half as long as its opening, as
@@ -17,20 +17,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from models.grasp_peaks import PeakSettings, find_peaks, surface_depth, surface_grasps
 from models.graspnet import to_input
+from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
-from models.graspnet_planner import GraspNetPlanner
+from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner
-from models.real_training_data import VIEWS
-from models.rectangle_examples import View
-from models.rectangle_scores import Judged, best_rectangle, judged
+from models.rectangle_examples import Judged, View, best_rectangle, judged
+from models.rectangle_folds import VIEWS
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
-from utils.overhead_view import overhead_view
+from utils.images import overhead_view
 from utils.real_data import RealSample, existing_folder, open_real_data
 from utils.rectangles import GraspRectangle
-from utils.table_camera import find_table_camera
+from utils.table_plane import find_table_camera
 from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
 
 # A first Kinect's colour camera as its driver describes it where it was not calibrated.

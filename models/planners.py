@@ -3,8 +3,8 @@
 A planner is a callable `plan(frame) -> list[Grasp]`, best first; an empty list means that there is
 nothing to grasp. `random` and `heuristic` see only the depth image, `graspnet` also the colours,
 `oracle` the true geometry.
-Heuristic and oracle share one search over a height map (`models.antipodal`); the oracle judges the
-best ones by exact contacts (`models.exact_contacts`), also with the pose perturbed. This module
+Heuristic and oracle share one search over a height map (`models.planner_antipodal`); the oracle judges the
+best ones by exact contacts (`models.planner_contacts`), also with the pose perturbed. This module
 knows no simulator.
 """
 
@@ -16,9 +16,9 @@ from typing import Protocol
 
 import numpy as np
 
-from models.antipodal import SearchSettings, search
-from models.exact_contacts import buried_share, exact_quality
-from models.graspnet_planner import GraspNetPlanner
+from models.planner_antipodal import SearchSettings, search
+from models.planner_contacts import buried_share, exact_quality
+from models.planner_graspnet import GraspNetPlanner
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene

@@ -17,11 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from models.normalisers import RewardScaler
-from models.observations import ObservationLayout, Observations
+from models.ppo_observations import ObservationLayout, Observations, RewardScaler
+from models.ppo_rollouts import NotFinite, Rollout, StepMemory, joined
 from models.ranks import ALONE, average, gather, share_weights
-from models.rollouts import NotFinite, Rollout, joined
-from models.step_memory import StepMemory
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import Config, RLConfig
 from utils.errors import UserError

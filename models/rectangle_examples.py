@@ -2,25 +2,38 @@
 
 Rectangles are moved with the image and drawn as dense targets last, so turned labels are exact and
 an example costs as much as its crop. Every example is a pure function of (seed, epoch, index), as
-in `models.grasp_examples`. This module knows no file format and no network's weights.
+in `models.graspnet_examples`. This module knows no file format and no network's weights.
+
+The rectangle metric of a network's best grasp on real images, as on Cornell and Jacquard.
+
+The network tells centre, angle and width of a grasp; the length of the plates, which the metric's
+rectangle has besides, is the median one of the labels that the network was trained on.
+
+Pictures of a network's best grasps on real images beside the labelled rectangles.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 from torch.utils.data import Dataset
 
-from models.grasp_examples import Example
-from models.graspnet import GraspTargets, targets_from_labels, to_input
+from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_input
+from models.graspnet_decoding import PeakSettings, find_peaks
+from models.graspnet_examples import Example
 from utils.augmentation import Augmentation, LabelledImage
 from utils.real_data import RealSample
-from utils.rectangles import GraspRectangle, rasterise
+from utils.rectangles import GraspRectangle, intersection_over_union, rasterise, rectangle_match
+from utils.runs import write_atomic
+from utils.transforms import angle_difference
 
 FLAT = 0.005  # of the table's distance: noise, below which a pixel belongs to the table
 TABLE_STEP = 8  # pixels between those that the table is found from
@@ -181,3 +194,128 @@ class RectangleExamples(Dataset):
             quality[None], metres[None], graspable_from=self.graspable_from
         )
         return GraspTargets(*(target[0] for target in targets))
+
+
+BEST = PeakSettings(threshold=-1.0, count=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A network's best grasp on one image. rectangle: in pixels of the data set's image. iou,
+    angle_error: of the label with the largest IoU, the error in radians; correct: by the metric."""
+
+    name: str
+    object_id: str
+    rectangle: GraspRectangle
+    quality: float
+    correct: bool
+    iou: float
+    angle_error: float
+
+    def as_dict(self) -> dict:
+        """Plain numbers for a JSON file; angles in degrees."""
+        return {
+            "name": self.name,
+            "object": self.object_id,
+            "correct": self.correct,
+            "quality": round(self.quality, 4),
+            "u": round(float(self.rectangle.centre[0]), 2),
+            "v": round(float(self.rectangle.centre[1]), 2),
+            "angle_deg": round(float(np.degrees(self.rectangle.angle)), 2),
+            "width_px": round(self.rectangle.width, 2),
+            "height_px": round(self.rectangle.height, 2),
+            "iou": round(self.iou, 4),
+            "angle_error_deg": round(float(np.degrees(self.angle_error)), 2),
+        }
+
+
+def median_plate_length(samples: Sequence[RealSample]) -> float:
+    """Pixels, of all labels of some images."""
+    return float(np.median([r.height for sample in samples for r in sample.positives]))
+
+
+@torch.inference_mode()
+def best_rectangle(
+    model: GraspNet, sample: RealSample, view: View, plate_length: float
+) -> tuple[GraspRectangle, float]:
+    """The network's best grasp on an image, in that image's pixels, and its quality.
+
+    plate_length: pixels of the image, what the rectangle measures across the closing line. The
+    model has to be in evaluation mode.
+    """
+    rgb, depth, _ = view.warp(sample)
+    device = next(model.parameters()).device
+    x = to_input(rgb, depth)[None].to(device, memory_format=torch.channels_last)
+    found = find_peaks(*model(x), BEST)
+    zoom = view.size / view.side
+    opening = max(float(found.width[0]) / view.metres_per_pixel, 1e-3)
+    there = GraspRectangle(found.pixel[0], float(found.angle[0]), opening, plate_length * zoom)
+    back = np.linalg.inv(view.matrix(sample.depth.shape))
+    return there.transformed(back), float(found.quality[0])
+
+
+def judge(
+    model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float
+) -> list[Judged]:
+    """The rectangle metric of the best grasp on every image; the model ends in evaluation mode."""
+    model.eval()
+    return [
+        judged(sample, *best_rectangle(model, sample, view, plate_length)) for sample in samples
+    ]
+
+
+def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Judged:
+    """The rectangle metric of a grasp on an image, in that image's pixels."""
+    overlaps = [intersection_over_union(rectangle, label) for label in sample.positives]
+    nearest = int(np.argmax(overlaps))
+    error = angle_difference(rectangle.angle, sample.positives[nearest].angle)
+    return Judged(
+        sample.name, sample.object_id, rectangle, quality,
+        rectangle_match(rectangle, sample.positives), overlaps[nearest], float(error),
+    )  # fmt: skip
+
+
+COLUMNS = 5
+SHOWN = 60  # most pictures; of more images, some evenly spread ones
+MARGIN = 40  # pixels around all rectangles
+
+
+def draw_rectangles(
+    path: Path, samples: Sequence[RealSample], judged: Sequence[Judged], shown: int = SHOWN
+) -> None:
+    """A grid of images: labels green, the prediction blue where correct, else red; the thick sides
+    are the plates."""
+    chosen = np.unique(np.linspace(0, len(judged) - 1, min(shown, len(judged))).astype(int))
+    rows = -(-len(chosen) // COLUMNS)
+    figure, axes = plt.subplots(
+        rows, COLUMNS, figsize=(2.6 * COLUMNS, 2.8 * rows), squeeze=False, layout="constrained"
+    )
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, index in zip(axes.flat, chosen):
+        sample, one = samples[int(index)], judged[int(index)]
+        axis.imshow(sample.rgb)
+        for label in sample.positives:
+            _outline(axis, label, "limegreen", 0.8)
+        _outline(axis, one.rectangle, "blue" if one.correct else "red", 1.6)
+        corners = np.concatenate([r.corners() for r in (*sample.positives, one.rectangle)])
+        (left, top), (right, bottom) = corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN
+        axis.set_xlim(max(left, 0), min(right, sample.rgb.shape[1]))
+        axis.set_ylim(min(bottom, sample.rgb.shape[0]), max(top, 0))
+        axis.set_title(
+            f"{'' if one.correct else 'WRONG '}{one.name} IoU {one.iou:.2f}, "
+            f"{np.degrees(one.angle_error):.0f}°",
+            fontsize=7,
+        )
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    write_atomic(path, buffer.getvalue())
+
+
+def _outline(axis: plt.Axes, rectangle: GraspRectangle, colour: str, width: float) -> None:
+    corners = rectangle.corners()
+    u, v = corners[[0, 1, 2, 3, 0]].T
+    axis.plot(u, v, color=colour, linewidth=width)
+    for plate in (corners[1:3], corners[[3, 0]]):
+        axis.plot(*plate.T, color=colour, linewidth=2.5 * width)

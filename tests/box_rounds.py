@@ -6,7 +6,7 @@ import numpy as np
 
 from envs.rounds import run_round
 from utils.config import load_config
-from utils.round_records import RoundRecord
+from utils.result_records import RoundRecord
 from utils.transforms import Grasp
 
 

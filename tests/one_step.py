@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from models.grasp_examples import Example
 from models.graspnet import create_model, targets_from_labels
+from models.graspnet_examples import Example
 from models.graspnet_training import Team, Trainer, team
 from utils.config import load_config
 

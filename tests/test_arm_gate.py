@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.grasping_env import RobotGraspingEnv
-from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
-from envs.safety import ArmGate, ArmStoppedError
-from envs.scenes import make_scene
+from envs.pybullet_cell import Cell
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
+from envs.robot_safety import ArmGate, ArmStoppedError
 from utils.config import load_config
 from utils.errors import UserError
 from utils.transforms import Grasp

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from benchmarks import bench_graspnet
-from models.backbones import BACKBONES
 from models.graspnet import create_model
+from models.graspnet_backbones import BACKBONES
 from models.graspnet_io import save_graspnet
 from utils.transforms import RGBDFrame, look_at
 

@@ -4,8 +4,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.camera import Intrinsics, load_renderer, render
-from envs.world import static_box
+from envs.cell_layout import static_box
+from envs.pybullet_camera import Intrinsics, load_renderer, render
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at, project
 
@@ -77,7 +77,7 @@ def test_shadow_does_not_stick(client):
 
 def test_renderer_choice(client, monkeypatch):
     assert load_renderer(client, "tiny") == pybullet.ER_TINY_RENDERER
-    monkeypatch.setattr("envs.camera._has_gpu", lambda: False)
+    monkeypatch.setattr("envs.pybullet_camera._has_gpu", lambda: False)
     assert load_renderer(client, "auto") == pybullet.ER_TINY_RENDERER
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserError, match="sim.renderer=egl"):

@@ -4,14 +4,14 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Cell, PhysicsError
+from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
+from envs.cell_scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.execution import choose_posture, execute_grasp
-from envs.kinematics import forward_kinematics, inverse_kinematics
 from envs.objects import load_object_set
-from envs.panda import FINGERS
+from envs.pybullet_cell import ROBOT, TABLE_OR_BACKGROUND, Cell, PhysicsError
+from envs.pybullet_panda import FINGERS
+from envs.robot_kinematics import forward_kinematics, inverse_kinematics
 from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
-from envs.scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
-from envs.world import BIN_CENTRE, BIN_HALF_SIZE
 from utils.config import with_settings
 from utils.transforms import Grasp, top_down_pose
 

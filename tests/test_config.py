@@ -12,12 +12,13 @@ from utils.config import (
     ConfigError,
     changed_keys,
     dump_config,
+    known_keys,
     load_config,
     parse_args,
     run_script,
+    schema_at,
     with_settings,
 )
-from utils.config_errors import known_keys, schema_at
 from utils.errors import UserError, unknown_choice
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.test_geometry import boxes_frame
-from utils.depth_holes import depth_of_plane, near_side, table_in_holes
+from utils.depth import depth_of_plane, near_side, table_in_holes
 from utils.transforms import RGBDFrame
 
 TABLE, THING = (158, 152, 142), (30, 160, 60)

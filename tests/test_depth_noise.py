@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.scenes import make_scene
+from envs.pybullet_cell import Cell
 from utils.augmentation import Augmentation, LabelledImage
 from utils.config import ConfigError, load_config, with_settings
-from utils.depth_noise import KinectNoise, dot_pattern
+from utils.depth import KinectNoise, dot_pattern
 
 FB = 480 * 0.075  # pixels x metres: disparity x depth
 

@@ -9,18 +9,18 @@ import pybullet
 import pytest
 
 import envs  # noqa: F401 - registers the environments
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.panda import ARM, FINGERS
+from envs.pybullet_cell import Cell
+from envs.pybullet_panda import ARM, FINGERS
 from envs.rounds import run_round
-from envs.scenes import make_scene
-from envs.vector import vector_envs
-from envs.worlds import make_cell
+from envs.simulators import make_cell
+from envs.vector_env import vector_envs
 from utils.config import load_config
-from utils.config_ranges import PhysicsRangesConfig, Range, VisionRangesConfig
+from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
-from utils.round_records import append_round, read_rounds
+from utils.result_records import append_round, read_rounds
 
 PHYSICS, VISION = PhysicsRangesConfig.model_fields, VisionRangesConfig.model_fields
 EXTREME = [

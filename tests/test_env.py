@@ -20,11 +20,11 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
-from envs.approach import Outline
-from envs.cell import PhysicsError
+from envs.cell_scenes import settle
+from envs.env_rewards import Outline
 from envs.grasping_env import RobotGraspingEnv
-from envs.kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
-from envs.scenes import settle
+from envs.pybullet_cell import PhysicsError
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scripted_pick import scripted_action
 from utils.config import ConfigError
 from utils.errors import UserError

@@ -14,14 +14,14 @@ import pytest
 import trimesh
 
 import evaluate
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
+from envs.pybullet_cell import Cell
 from envs.rounds import run_round
-from envs.scenes import make_scene
 from models.planners import make_planner
 from utils.config import run_script as end_like_a_script
-from utils.evaluation_plan import tasks
 from utils.geometry import GripperGeometry, Workspace
-from utils.round_records import append_round, read_rounds
+from utils.result_records import append_round, read_rounds
+from utils.results import tasks
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box"]

@@ -18,9 +18,7 @@ import pytest
 import torch
 
 from envs import data_generation
-from envs.appearance import Appearance, Texture, draw_camera
-from envs.camera import Intrinsics
-from envs.cell import Cell, PhysicsError, camera_intrinsics
+from envs.cell_scenes import SceneError
 from envs.data_generation import (
     SPLITS,
     data_folder,
@@ -33,13 +31,14 @@ from envs.data_generation import (
     with_other_physics,
 )
 from envs.objects import ObjectError
-from envs.scenes import SceneError
+from envs.pybullet_appearance import Appearance, Texture, draw_camera
+from envs.pybullet_camera import Intrinsics
+from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, SceneGeometry, SolidObject
 from utils.grasp_data import LabelledFrame, SimulatedDataset, read_trials, shard_path, write_shard
-from utils.grasp_labels import GraspLabels, LabelSettings
-from utils.label_trials import Trial, draw_pairs, label_truth
+from utils.grasp_labels import GraspLabels, LabelSettings, Trial, draw_pairs, label_truth
 from utils.transforms import RGBDFrame, look_at, project
 
 SHAPE = (5, 7)

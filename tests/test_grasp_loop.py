@@ -9,22 +9,21 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs import sighted_object
-from envs.beliefs import level, off, teach, true_beliefs, wrong_beliefs
-from envs.cell import Cell, wrist_mount
-from envs.challenges import CHALLENGES, crossing
-from envs.disturbances import Conveyor, Displacement, disturbed
+from envs import closed_loop_tracker
+from envs.board_servo import GuardedArm
+from envs.camera_calibration import level, off, teach, true_beliefs, wrong_beliefs
+from envs.cell_scenes import make_scene
+from envs.closed_loop import ClosedLoop, GuidedDescent
+from envs.closed_loop_tracker import WristCamera
 from envs.execution import GraspFailure, execute_grasp
-from envs.grasp_loop import ClosedLoop, GuidedDescent
-from envs.kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
+from envs.pybullet_cell import Cell, wrist_mount
+from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
-from envs.scenes import make_scene
-from envs.servoing import GuardedArm
-from envs.wrist_camera import WristCamera
+from envs.scenarios import CHALLENGES, Conveyor, Displacement, crossing, disturbed
 from tests.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.config_types import ScoredScenario
-from utils.tabletop import planar_part, table_plane
+from utils.table_plane import planar_part, table_plane
 from utils.transforms import inverse_pose, top_down_pose
 
 CLOSED = ("pbvs", "ibvs", "hybrid")
@@ -164,7 +163,7 @@ def test_a_vanished_object_stops_the_arm(cell, scene):
 
 def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
     cell.load(scene)
-    make = sighted_object.make_template
+    make = closed_loop_tracker.make_template
 
     def far_points(frame, grasp):
         template = make(frame, grasp)
@@ -172,7 +171,7 @@ def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
         points[2:] += [0.5, 0, 0]  # all but two leave the image
         return replace(template, points=points)
 
-    monkeypatch.setattr(sighted_object, "make_template", far_points)
+    monkeypatch.setattr(closed_loop_tracker, "make_template", far_points)
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs"))
     assert outcome.reason == "lost"
     assert "2 of those on the object are in the image, needed are at least 3" in outcome.detail

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from models.backbones import BACKBONES, GGCNNBackbone, GRConvNetBackbone
-from models.grasp_peaks import PeakSettings, decode_grasps, find_peaks, surface_depth
 from models.graspnet import (
     GraspLoss,
     GraspNet,
@@ -15,8 +13,10 @@ from models.graspnet import (
     targets_from_labels,
     to_input,
 )
+from models.graspnet_backbones import BACKBONES, GGCNNBackbone, GRConvNetBackbone
+from models.graspnet_decoding import PeakSettings, decode_grasps, find_peaks, surface_depth
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
-from utils.depth_holes import fill_holes
+from utils.depth import fill_holes
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import LabelSettings

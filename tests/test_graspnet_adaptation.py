@@ -17,16 +17,13 @@ from PIL import Image
 from torch import nn
 
 import train_graspnet
-from models import target_images
-from models.backbones import BACKBONES
+from models import graspnet_adaptation
 from models.graspnet import create_model
-from models.graspnet_adaptation import AdaptingTrainer, Pair
-from models.graspnet_io import KIND, load_graspnet
-from models.graspnet_training import Team
-from models.photographs import K, frame_of
-from models.target_images import (
+from models.graspnet_adaptation import (
     STANDS_OUT,
     AdaptationData,
+    AdaptingTrainer,
+    Pair,
     check_distances,
     corner_around,
     grasp_information,
@@ -34,7 +31,11 @@ from models.target_images import (
     split_target,
     with_target,
 )
-from models.training_data import TrainingData
+from models.graspnet_backbones import BACKBONES
+from models.graspnet_data import TrainingData
+from models.graspnet_io import KIND, load_graspnet
+from models.graspnet_training import Team
+from models.photographs import K, frame_of
 from tests.one_step import BATCH, joint_batch
 from tests.test_real_training import write_cornell
 from tests.test_train_graspnet import SMALL, labelled, same
@@ -42,8 +43,8 @@ from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, s
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
-from utils.table_camera import DEPTHS, FROM_BASE, FROM_CAMERA, distances
-from utils.unlabelled_images import UnlabelledImages
+from utils.real_data import UnlabelledImages
+from utils.table_plane import DEPTHS, FROM_BASE, FROM_CAMERA, distances
 
 ALONE = Team(0, 1, torch.device("cpu"))
 NO_GRASPS = [f"train.{part}_weight=0" for part in ("quality", "angle", "width", "centre")]
@@ -312,7 +313,7 @@ def test_one_image_of_depths_among_distances_is_refused_by_name(photographs, tmp
 def test_depths_without_noise_are_refused_whichever_fit_is_nearer_to_zero(photographs, monkeypatch):
     """Measured of depths in the cell: each fit exact but for the camera's steps of depth."""
     exact = {FROM_BASE: 1e-5, DEPTHS: 3.2e-5, FROM_CAMERA: 0.02}
-    monkeypatch.setattr(target_images, "table_misses", lambda *_: exact)
+    monkeypatch.setattr(graspnet_adaptation, "table_misses", lambda *_: exact)
     with pytest.raises(UserError, match="seems to hold depths along"):
         open_target(target_config(photographs))
 
@@ -323,7 +324,9 @@ def test_images_are_judged_all_over_a_large_folder(photographs, tmp_path, monkey
         for kind in ("r.png", "d.tiff"):
             (tmp_path / f"{number:02}{kind}").symlink_to(photographs / f"pcd0100{kind}")
     looked_at = []
-    monkeypatch.setattr(target_images, "_check_distances", lambda _, file: looked_at.append(file))
+    monkeypatch.setattr(
+        graspnet_adaptation, "_check_distances", lambda _, file: looked_at.append(file)
+    )
     check_distances(UnlabelledImages(tmp_path))
     assert [int(file.name[:2]) for file in looked_at] == list(range(0, 100, 9))
 

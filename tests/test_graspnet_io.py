@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.backbones import BACKBONES
 from models.graspnet import GraspNet
+from models.graspnet_backbones import BACKBONES
 from models.graspnet_io import (
     KIND,
     for_inference,

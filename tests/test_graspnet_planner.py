@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from models.graspnet_io import SavedGraspNet
-from models.graspnet_planner import GraspNetPlanner, quality_between
+from models.planner_graspnet import GraspNetPlanner, quality_between
 from tests.test_geometry import boxes_frame
 from tests.test_instances import TOUCHING, true_offset
 from utils.geometry import GripperGeometry, Workspace

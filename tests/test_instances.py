@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.instances import labelled_by_centres, vote_centres
+from models.planner_graspnet import labelled_by_centres, vote_centres
 from tests.test_geometry import boxes_frame
 from utils.geometry import Workspace
 from utils.height_map import height_map_from_frame
-from utils.pixel_scaling import PixelScaling
+from utils.images import PixelScaling
 from utils.transforms import RGBDFrame, project
 
 CELL = 0.002  # m

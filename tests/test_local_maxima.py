@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from utils.local_maxima import local_maxima
+from utils.height_map import local_maxima
 
 IMAGES = arrays.arrays(
     np.float32,

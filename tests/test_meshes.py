@@ -6,8 +6,8 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from envs import meshes
-from envs.meshes import ObjectError, decompose, load_mesh, mass_properties, simplify_hull
+from envs import object_meshes
+from envs.object_meshes import ObjectError, decompose, load_mesh, mass_properties, simplify_hull
 
 
 @pytest.fixture
@@ -45,7 +45,9 @@ def test_overlapping_pieces_weigh_once(tmp_path):
 def test_pieces_that_share_an_edge_are_still_two_solids(tmp_path):
     second = trimesh.creation.box()
     second.apply_translation((1.0, 1.0, 0.0))
-    mesh = meshes.checked_mesh(trimesh.util.concatenate([trimesh.creation.box(), second]), "edge")
+    mesh = object_meshes.checked_mesh(
+        trimesh.util.concatenate([trimesh.creation.box(), second]), "edge"
+    )
     assert not mesh.is_watertight
     parts = decompose(mesh, tmp_path)
     assert len(parts) == 2
@@ -62,8 +64,8 @@ def test_mass_properties_of_an_open_mesh_come_from_its_parts(tmp_path):
 
 def test_a_concave_surface_is_cut_and_stays_concave(tmp_path, l_shape):
     parts = decompose(l_shape, tmp_path)
-    assert 2 <= len(parts) <= meshes.MAX_PARTS
-    assert max(map(len, parts)) <= meshes.MAX_VERTICES
+    assert 2 <= len(parts) <= object_meshes.MAX_PARTS
+    assert max(map(len, parts)) <= object_meshes.MAX_VERTICES
     surface = trimesh.sample.sample_surface(l_shape, 500, seed=0)[0]
     centre = l_shape.bounds.mean(axis=0)
     within = centre + 0.97 * (surface - centre)
@@ -95,10 +97,10 @@ def test_a_corrupt_cache_file_is_named(tmp_path):
 
 
 def test_a_corrupt_hull_file_is_named(tmp_path):
-    file = meshes.write_parts_obj([trimesh.creation.box().vertices], tmp_path)
+    file = object_meshes.write_parts_obj([trimesh.creation.box().vertices], tmp_path)
     file.write_text("o nothing\n")
     with pytest.raises(ObjectError, match="delete it and run again"):
-        meshes.write_parts_obj([trimesh.creation.box().vertices], tmp_path)
+        object_meshes.write_parts_obj([trimesh.creation.box().vertices], tmp_path)
 
 
 def test_writing_leaves_no_temporary_file(tmp_path):

@@ -8,14 +8,14 @@ from scipy import ndimage
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
-from envs.base_cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
-from envs.camera import Intrinsics
-from envs.cell import Cell
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
+from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.scenes import make_scene
-from envs.worlds import make_cell
+from envs.pybullet_camera import Intrinsics
+from envs.pybullet_cell import Cell
+from envs.simulators import make_cell
 from models.planners import make_planner
 from utils.config import load_config
 from utils.errors import UserError

@@ -12,21 +12,20 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 import evaluate
-from envs.beliefs import teach, true_beliefs
-from envs.cell import Cell, wrist_mount
-from envs.challenges import CHALLENGES
-from envs.disturbances import Conveyor, disturbed
+from envs.board_servo import GuardedArm
+from envs.camera_calibration import teach, true_beliefs
+from envs.cell_layout import GRAVITY
+from envs.cell_scenes import make_scene
+from envs.closed_loop import ClosedLoop, GuidedDescent
+from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
-from envs.grasp_loop import ClosedLoop, GuidedDescent
-from envs.kinematics import inverse_kinematics
 from envs.mujoco_cell import MujocoCell
+from envs.pybullet_cell import Cell, wrist_mount
+from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
-from envs.scenes import make_scene
-from envs.servoing import GuardedArm
-from envs.world import GRAVITY
-from envs.wrist_camera import WristCamera
+from envs.scenarios import CHALLENGES, Conveyor, disturbed
 from tests.box_rounds import grasp_of_box, round_with_a_box
-from utils.tabletop import planar_part
+from utils.table_plane import planar_part
 from utils.transforms import top_down_pose
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
-from envs.kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.mujoco_panda import FINGER_JOINTS, GRASP_TARGET, HAND, INERTIALS, MujocoPanda
-from envs.safety import ArmGate
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
+from envs.robot_safety import ArmGate
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 

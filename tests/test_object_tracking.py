@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.camera import Intrinsics
-from utils.object_motion import PlanarMotion
-from utils.object_tracking import ObjectTracker, grasp_frame, make_template
-from utils.servo_errors import TargetLostError
-from utils.tabletop import planar, planar_part, table_plane
+from envs.pybullet_camera import Intrinsics
+from utils.errors import TargetLostError
+from utils.object_tracking import ObjectTracker, PlanarMotion, grasp_frame, make_template
+from utils.table_plane import planar, planar_part, table_plane
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, look_at, project
 
 OVERHEAD = Intrinsics(224, 224, 28.0)

@@ -9,6 +9,7 @@ import pybullet_data
 import pytest
 import trimesh
 
+from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import (
     BROKEN_RANDOM_URDFS,
     ObjectError,
@@ -17,8 +18,7 @@ from envs.objects import (
     prepare,
     spawn,
 )
-from envs.panda import MAX_OPENING
-from envs.primitives import FAMILIES, make_primitive
+from envs.pybullet_panda import MAX_OPENING
 
 DATA = Path(pybullet_data.getDataPath())
 IDENTITY = (0, 0, 0, 1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from utils.overlay import TITLE_HEIGHT, contact_sheet
+from utils.image_overlay import TITLE_HEIGHT, contact_sheet
 
 
 def test_a_contact_sheet_holds_every_image_below_its_caption() -> None:

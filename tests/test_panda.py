@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from envs.kinematics import (
+from envs.cell_layout import set_up_physics
+from envs.pybullet_panda import ARM, FINGERS, MAX_OPENING, Panda, panda_urdf
+from envs.robot_kinematics import (
     JOINT_ACCELERATION,
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -25,9 +27,7 @@ from envs.kinematics import (
     rotation_vector,
     time_path,
 )
-from envs.panda import ARM, FINGERS, MAX_OPENING, Panda, panda_urdf
-from envs.safety import ArmGate
-from envs.world import set_up_physics
+from envs.robot_safety import ArmGate
 from utils.transforms import top_down_pose
 
 HOME = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])

@@ -3,24 +3,24 @@
 import numpy as np
 import pytest
 
-from envs.camera import Intrinsics
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.scenes import make_scene
+from envs.pybullet_camera import Intrinsics
+from envs.pybullet_cell import Cell
 from models import photographs
+from models.graspnet_adaptation import DISTINCT
 from models.graspnet_io import SavedGraspNet
-from models.graspnet_planner import GraspNetPlanner
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
-from models.target_images import DISTINCT
+from models.planner_graspnet import GraspNetPlanner
 from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
 from tests.test_real_data import CORNELL
 from tests.test_real_training import write_cornell
-from utils.depth_noise import KinectNoise
+from utils.depth import KinectNoise
 from utils.errors import UserError
-from utils.overhead_view import overhead_view
+from utils.images import overhead_view
 from utils.real_data import RealSample, fill_depth_holes
 from utils.rectangles import GraspRectangle
-from utils.table_camera import (
+from utils.table_plane import (
     BEHIND,
     DEPTHS,
     FLAT,
@@ -169,7 +169,7 @@ def test_a_bare_table_tells_what_an_image_holds():
 @pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0, 15, 37])
 def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
-    """With a Kinect's noise: what `models.target_images.DISTINCT` lies between."""
+    """With a Kinect's noise: what `models.graspnet_adaptation.DISTINCT` lies between."""
     vertical = float(np.degrees(2 * np.arctan(240 / 525)))
     angle, middle = np.radians(tilt), np.array([0.5, 0.0, 0.0])
     eye = middle + 0.75 * np.array([-np.sin(angle), 0.0, np.cos(angle)])
@@ -190,7 +190,7 @@ def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
 
 @pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")
 def test_cornell_s_photographs_hold_distances_from_a_base():
-    """What `models.target_images.DISTINCT` and docs/sim_to_real.md say; every eighth."""
+    """What `models.graspnet_adaptation.DISTINCT` and docs/sim_to_real.md say; every eighth."""
     for sample in photographs.photographs(CORNELL)[::8]:
         misses = table_misses(sample.depth, K)
         base = misses.pop(FROM_BASE)

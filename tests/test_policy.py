@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from benchmarks.bench_policy import config_of, run_episodes
-from envs.cell import Cell
+from envs.cell_scenes import make_scene
+from envs.env_actions import HandCommands
 from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
-from envs.hand_commands import HandCommands
 from envs.objects import load_object_set
 from envs.policy_approach import PolicyApproach, nowhere_yet
-from envs.scenes import make_scene
-from envs.vector import make_env
-from envs.worlds import make_cell
+from envs.pybullet_cell import Cell
+from envs.simulators import make_cell
+from envs.vector_env import make_env
 from models.grasp_policy import load_policy
 from utils.config import load_config
 

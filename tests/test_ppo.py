@@ -21,23 +21,28 @@ from models.grasp_policy import (
     policy_for,
     relief_of,
 )
-from models.normalisers import LARGEST, ObservationNormaliser, RewardScaler
-from models.observations import ObservationLayout, Observations
 from models.ppo import Batch
-from models.ranks import ALONE
-from models.rollouts import (
+from models.ppo_observations import (
+    LARGEST,
+    ObservationLayout,
+    ObservationNormaliser,
+    Observations,
+    RewardScaler,
+)
+from models.ppo_rollouts import (
     NotFinite,
     Rollout,
     RolloutCollector,
+    StepMemory,
     derived_seeds,
     evaluate_policy,
 )
-from models.step_memory import StepMemory
+from models.ranks import ALONE
 from tests.test_train_graspnet import same
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
-from utils.stopwatch import Stopwatch
+from utils.runs import Stopwatch
 
 GAMMA, LAMBDA = 0.9, 0.8
 CPU = torch.device("cpu")

@@ -21,18 +21,16 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 import predict
-from envs.camera import Intrinsics
-from envs.cell import Cell
-from envs.scenes import Placement, Scene
+from envs.cell_scenes import Placement, Scene
+from envs.pybullet_camera import Intrinsics
+from envs.pybullet_cell import Cell
 from envs.studio import write_rgbd
-from models import backbones, prediction
+from models import graspnet_backbones, graspnet_inference
 from models.graspnet import GraspNet
-from models.graspnet_export import OUTPUTS, export_onnx
-from models.graspnet_io import SavedGraspNet, metres_per_pixel, save_graspnet
+from models.graspnet_io import OUTPUTS, SavedGraspNet, export_onnx, metres_per_pixel, save_graspnet
 from utils.errors import UserError
-from utils.image_files import intrinsics_matrix, read_depth, read_pose
-from utils.pixel_scaling import PixelScaling
-from utils.prediction_panel import is_prediction_panel
+from utils.image_overlay import is_prediction_panel
+from utils.images import PixelScaling, intrinsics_matrix, read_depth, read_pose
 from utils.table_plane import dominant_plane
 from utils.transforms import (
     RGBDFrame,
@@ -82,7 +80,7 @@ class HandMade(nn.Module):
 
 @pytest.fixture(autouse=True)
 def hand_made_backbone(monkeypatch):
-    monkeypatch.setitem(backbones.BACKBONES, "hand_made", HandMade)
+    monkeypatch.setitem(graspnet_backbones.BACKBONES, "hand_made", HandMade)
 
 
 def hand_made() -> GraspNet:
@@ -114,7 +112,7 @@ def cell(config, box_set):
 def checkpoint(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "graspnet.pt"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(backbones.BACKBONES, "hand_made", HandMade)
+        patch.setitem(graspnet_backbones.BACKBONES, "hand_made", HandMade)
         save_graspnet(path, hand_made(), PIXEL)
     return path
 
@@ -184,7 +182,7 @@ def test_resolutions_and_aspect_ratios_give_the_same_metric_grasps(cell):
     model, found = hand_made(), []
     for width, height in ((224, 224), (640, 480), (320, 240)):
         frame = cell.look(Intrinsics(width, height, 28), OVERHEAD)
-        result = prediction.predict(model, PIXEL, frame, 0.0)
+        result = graspnet_inference.predict(model, PIXEL, frame, 0.0)
         check_on_cubes(result.grasps, 0.0015)
         assert result.quality.shape == result.angle.shape == result.width.shape == (height, width)
         for grasp in result.grasps:  # the maps lie where the grasps do
@@ -203,7 +201,7 @@ def test_resolutions_and_aspect_ratios_give_the_same_metric_grasps(cell):
 def test_another_distance_and_focal_length_give_the_same_metric_grasps(cell):
     farther = look_at((0.5, 0.0, 1.3), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0))
     frame = cell.look(Intrinsics(400, 300, 20), farther)
-    check_on_cubes(prediction.predict(hand_made(), PIXEL, frame, 0.0).grasps, 0.002)
+    check_on_cubes(graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0).grasps, 0.002)
 
 
 @pytest.mark.parametrize("unknown", [0.0, -1.0, np.inf, np.nan])
@@ -214,7 +212,7 @@ def test_unknown_depth_has_no_part_in_the_scale(unknown):
     frame = RGBDFrame(
         np.zeros((64, 64, 3), np.uint8), depth, np.diag([400.0, 400.0, 1.0]), OVERHEAD
     )
-    scaling = prediction.training_scale(frame, 0.0015)
+    scaling = graspnet_inference.training_scale(frame, 0.0015)
     assert (scaling.u, scaling.v) == pytest.approx((1.0, 1.0))  # 0.6 / 400 = 1.5 mm
 
 
@@ -225,7 +223,7 @@ def test_pixels_that_are_not_square(cell):
         wider.image(square.rgb), wider.image(square.depth), wider.intrinsics(square.K), OVERHEAD
     )
     assert frame.depth.shape == (240, 400)
-    result = prediction.predict(hand_made(), PIXEL, frame, 0.0)
+    result = graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0)
     check_on_cubes(result.grasps, 0.0015)
     for grasp in result.grasps:  # the angle is that of the picture as it is
         shown = grasp_to_image(grasp.in_world, frame.K, OVERHEAD)

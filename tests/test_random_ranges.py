@@ -11,9 +11,9 @@ from scipy import stats
 
 from utils.adaptive_ranges import AdaptiveRanges, Bound
 from utils.config import ConfigError, UserError, load_config
-from utils.config_ranges import Range
+from utils.config_types import Range
 from utils.random_ranges import changed, draw, neutral
-from utils.textures import TextureRandomizer
+from utils.random_view import TextureRandomizer
 
 
 def spec(low, high, distribution="uniform", operation="add", every="episode") -> Range:

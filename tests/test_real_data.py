@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from utils.data_splits import Split, block_folds, image_wise_split, object_wise_split
 from utils.errors import UserError
-from utils.real_data import CornellDataset, JacquardDataset, fill_depth_holes, open_real_data
+from utils.real_data import (
+    CornellDataset,
+    JacquardDataset,
+    Split,
+    block_folds,
+    fill_depth_holes,
+    image_wise_split,
+    object_wise_split,
+    open_real_data,
+)
 
 CORNELL = Path(__file__).parents[2] / "shared" / "data" / "cornell"
 SQUARE = "10 5\n30 5\n30 15 \n10 15\n"  # opening 20, plates 10, centre (20, 10)

@@ -13,14 +13,19 @@ from PIL import Image
 import train_graspnet
 from models.graspnet import create_model
 from models.graspnet_io import SHIPPED, load_graspnet, save_graspnet
-from models.real_training_data import AUGMENTATION, VIEWS, folds_of, real_folds
-from models.rectangle_examples import RectangleExamples, RectangleImages, View
-from models.rectangle_scores import best_rectangle, judge, median_plate_length
+from models.rectangle_examples import (
+    RectangleExamples,
+    RectangleImages,
+    View,
+    best_rectangle,
+    judge,
+    median_plate_length,
+)
+from models.rectangle_folds import AUGMENTATION, VIEWS, folds_of, real_folds
 from utils.augmentation import Similarity
 from utils.config import load_config
-from utils.data_splits import image_folds, object_folds
 from utils.errors import UserError
-from utils.real_data import RealSample
+from utils.real_data import RealSample, image_folds, object_folds
 from utils.rectangles import GraspRectangle, rectangle_match
 
 QUICK = ("train.backbone=ggcnn", "train.epochs=1", "train.workers=0", "train.precision=float32")

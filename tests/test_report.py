@@ -13,22 +13,23 @@ import yaml
 
 from utils.config import load_config
 from utils.errors import UserError
-from utils.evaluation_plan import interruption, planned_rounds
-from utils.files import write_json_atomic
-from utils.overlay import FAILURE_COLOR, SUCCESS_COLOR, draw_grasp
+from utils.image_overlay import FAILURE_COLOR, SUCCESS_COLOR, draw_grasp
 from utils.report import GalleryItem, write_report
+from utils.result_records import AttemptRecord, RoundRecord, contestant
 from utils.results import (
     compare,
     format_table,
+    interruption,
+    planned_rounds,
     print_comparisons,
+    print_stop_reasons,
     print_table,
+    stop_reasons,
     summarise,
     write_csv,
     write_results,
 )
-from utils.round_records import AttemptRecord, RoundRecord, contestant
-from utils.runs import environment, git_state, new_run_folder
-from utils.stop_reasons import print_stop_reasons, stop_reasons
+from utils.runs import environment, git_state, new_run_folder, write_json_atomic
 from utils.transforms import ImageGrasp
 
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from envs.kinematics import (
+from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     JOINT_VELOCITY,
     forward_kinematics,
     geometric_jacobian,
 )
-from envs.safety import SafetyGate
+from envs.robot_safety import SafetyGate
 from utils.config import load_config
 from utils.errors import UserError
 

@@ -9,16 +9,15 @@ import pytest
 
 from benchmarks import bench_servo_cell
 from benchmarks.bench_servo_cell import LAWS, make_task, pose
-from envs.camera import Intrinsics, render
-from envs.cell import Cell
-from envs.kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
-from envs.scenes import Scene
-from envs.servo_target import Board
-from envs.servoing import ArmStoppedError, GuardedArm, Sight, servo_arm, servo_settings, view_of
-from envs.world import static_box
+from envs.board import Board
+from envs.board_servo import ArmStoppedError, GuardedArm, Sight, servo_arm, servo_settings, view_of
+from envs.cell_layout import static_box
+from envs.cell_scenes import Scene
+from envs.pybullet_camera import Intrinsics, render
+from envs.pybullet_cell import Cell
+from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
 from utils.config import load_config
-from utils.errors import UserError
-from utils.servo_errors import TargetLostError
+from utils.errors import TargetLostError, UserError
 from utils.servo_features import MOUNTINGS
 from utils.transforms import inverse_pose, project, transform_points
 

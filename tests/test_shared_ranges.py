@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import train_rl
 from envs.grasping_env import RobotGraspingEnv
-from envs.vector import vector_envs
+from envs.vector_env import vector_envs
 from models.ppo import KIND
 from tests.test_train_graspnet import same
 from tests.test_train_rl import REPOSITORY, TORCHRUN

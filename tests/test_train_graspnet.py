@@ -20,9 +20,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 import train_graspnet
-from models.grasp_examples import AtPixelSize, EpochBatches, GraspExamples
-from models.grasp_peaks import Peaks
 from models.graspnet import create_model
+from models.graspnet_decoding import Peaks
+from models.graspnet_examples import AtPixelSize, EpochBatches, GraspExamples
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores, check_graspable, score_labels, score_peak
 from models.graspnet_training import (
@@ -496,7 +496,7 @@ def test_the_best_epoch_is_kept(tiny_data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     qualities = iter([0.2, 0.5, 0.1])
     monkeypatch.setattr(
-        "models.training_data.score_labels",
+        "models.graspnet_data.score_labels",
         lambda model, images: LabelScores(next(qualities), 0.5, 0.1, 0.01, 1.0, 32),
     )
     assert train_graspnet.main([*tiny_data[1], *SMALL]) == 0

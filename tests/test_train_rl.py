@@ -18,19 +18,19 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_rl
-from envs.films import film_episode
-from envs.vector import WorkerError, make_env, vector_envs
+from envs.studio import film_episode
+from envs.vector_env import WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy
 from models.ppo import KIND
+from models.ppo_rollouts import evaluate_policy
 from models.ranks import ALONE
-from models.rollouts import evaluate_policy
 from tests.ppo_step import SIZE, take_step
 from tests.test_ppo import batch_of, ppo_of
 from tests.test_train_graspnet import same
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.errors import UserError
-from utils.stopwatch import Stopwatch
+from utils.runs import Stopwatch
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 POINT = [

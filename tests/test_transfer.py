@@ -12,7 +12,7 @@ import pytest
 import evaluate
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
-from utils.round_records import AttemptRecord, RoundRecord
+from utils.result_records import AttemptRecord, RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation
 from utils.transfer import (
     Score,

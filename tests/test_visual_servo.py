@@ -15,14 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import bench_servo
 from utils.errors import UserError
-from utils.se3 import (
-    pose_exp,
-    pose_log,
-    rotation_exp,
-    rotation_log,
-    skew,
-    velocity_transform,
-)
+from utils.servo_control import camera_jacobian, joint_velocities, pseudo_inverse
 from utils.servo_features import (
     depths_from_image,
     extended_interaction,
@@ -30,8 +23,7 @@ from utils.servo_features import (
     pose_from_points,
     rotation_interaction,
 )
-from utils.servo_laws import camera_jacobian, joint_velocities, pseudo_inverse
-from utils.servo_scenarios import (
+from utils.servo_reference import (
     CAMERA,
     FACING,
     FOCAL,
@@ -48,7 +40,17 @@ from utils.servo_scenarios import (
     steady_noise,
     turned,
 )
-from utils.transforms import inverse_pose, pose_matrix, transform_points
+from utils.transforms import (
+    inverse_pose,
+    pose_exp,
+    pose_log,
+    pose_matrix,
+    rotation_exp,
+    rotation_log,
+    skew,
+    transform_points,
+    velocity_transform,
+)
 from utils.visual_servo import (
     AdaptiveGain,
     CameraMatrixError,
@@ -825,7 +827,7 @@ def test_history_without_poses_or_points_still_draws(tmp_path):
 @pytest.mark.slow
 def test_demo_prints_the_table_and_draws(tmp_path, capsys, monkeypatch):
     some = [Row("right", 1.0, 1.0, 0.01), Row("wrong", 2.0, 1.0, 0.01)]
-    monkeypatch.setattr("utils.servo_scenarios.rows", lambda: some)
+    monkeypatch.setattr("utils.servo_reference.rows", lambda: some)
     main(["--folder", str(tmp_path)])
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["right", "1", "1", "yes"]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from utils.config_ranges import AdaptiveConfig, RandomizationConfig, Range
+from utils.config_types import AdaptiveConfig, RandomizationConfig, Range
 from utils.random_ranges import neutral, ranges_of
 
 WIDEST = "widest"  # what an episode of the task itself is asked for, in place of `shares`

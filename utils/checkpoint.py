@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from utils.errors import UserError
-from utils.files import write_atomic
+from utils.runs import write_atomic
 
 MAGIC = "robot-grasping checkpoint"
 FORMAT_VERSION = 1  # raise when the meaning of an entry changes

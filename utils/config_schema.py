@@ -2,7 +2,7 @@
 
 `configs/default.yaml` holds defaults, units and meanings; a new section is a new `Section` class
 here, a field of `Config` and its keys in that file. What sections are made of is in
-`utils.config_types`, the section of randomisation in `utils.config_ranges`. This module knows
+`utils.config_types`, the section of randomisation in `utils.config_types`. This module knows
 neither files nor command line, and not how a mistake is told.
 """
 
@@ -15,7 +15,6 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from utils.config_ranges import RandomizationConfig
 from utils.config_types import (
     Controller,
     Count,
@@ -25,6 +24,7 @@ from utils.config_types import (
     ObjectSet,
     Pixels,
     Positive,
+    RandomizationConfig,
     Scenario,
     ScoredScenario,
     Section,

@@ -15,13 +15,12 @@ import numpy as np
 import pybullet
 
 from utils.adaptive_ranges import Bound, adaptive_ranges
-from utils.config_ranges import RandomizationConfig, Range
+from utils.config_types import RandomizationConfig, Range
 from utils.errors import UserError
 from utils.random_physics import RandomPhysics
 from utils.random_physics import World as PhysicsWorld
 from utils.random_ranges import changed, draw, ranges_of
-from utils.random_view import RandomView
-from utils.textures import TextureRandomizer, random_colour
+from utils.random_view import RandomView, TextureRandomizer, random_colour
 from utils.transforms import pose_matrix
 
 __all__ = ["DomainRandomizer", "TextureRandomizer", "World"]

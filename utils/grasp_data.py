@@ -20,9 +20,8 @@ from torch.utils.data import Dataset
 
 from utils.augmentation import LabelledImage
 from utils.errors import UserError
-from utils.files import write_atomic
-from utils.grasp_labels import GraspLabels
-from utils.label_trials import Trial
+from utils.grasp_labels import GraspLabels, Trial
+from utils.runs import write_atomic
 from utils.transforms import RGBDFrame, project
 
 # To be raised with the format of the files, and with what makes scenes, images or labels.

@@ -1,4 +1,8 @@
-"""Orthographic height maps in the world frame, from a depth image or from the true geometry.
+"""Local maxima of an image, some distance apart: non-maximum suppression by a sliding window.
+
+This module knows neither what the image means nor what becomes of its peaks.
+
+Orthographic height maps in the world frame, from a depth image or from the true geometry.
 
 A height map answers "how high is the scene above (x, y)?", which is all that a straight descent
 has to know. This module knows no simulator and no network.
@@ -13,9 +17,34 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth_holes import HOLE_REACH, depth_of_plane, near_side, nearest_values, reach_in_pixels
+from utils.depth import HOLE_REACH, depth_of_plane, near_side, nearest_values, reach_in_pixels
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
+
+
+def local_maxima(
+    image: np.ndarray, radius: int, above: float, count: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (N,) of the highest pixels of their windows of side 2 radius + 1 in an
+    `image` (H, W), highest first; only those `above` a value, and no more than `count`.
+
+    Of equal pixels less than a window apart, the first in reading order stands for all.
+    """
+    side = 2 * radius + 1
+    highest = cv2.dilate(image, np.ones((side, side), np.uint8))
+    rows, columns = np.nonzero((image > above) & (image >= highest))
+    free = np.ones(image.shape, bool)
+    chosen: list[int] = []
+    for peak in np.argsort(-image[rows, columns], kind="stable"):
+        if len(chosen) == count:
+            break
+        row, column = rows[peak], columns[peak]
+        if free[row, column]:
+            chosen.append(peak)
+            top, left = max(row - radius, 0), max(column - radius, 0)
+            free[top : row + radius + 1, left : column + radius + 1] = False
+    return rows[chosen], columns[chosen]
+
 
 # Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
 # this much higher than the surface beside it.

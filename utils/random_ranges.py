@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from utils.config_ranges import Range
+from utils.config_types import Range
 
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
 NEUTRAL = {"scale": 1.0, "add": 0.0}  # changes nothing

@@ -1,4 +1,11 @@
-"""What a camera sees, changed: light, camera error, textures, colours and depth noise.
+"""Colours and solid textures, drawn from a generator.
+
+Textures are functions of a point on the object ("solid textures", Peachey 1985): they stick to
+it, need no texture coordinates and are laid over the rendered image, so every renderer shows the
+same, and nothing is loaded into the simulator, which never frees textures (bullet3 #3285). They are
+made up, or taken from a folder of pictures. Knows neither simulator nor scene.
+
+What a camera sees, changed: light, camera error, textures, colours and depth noise.
 
 Light, pose and field of view are for the renderer; the rest is laid over its image. Needs no
 renderer and knows no distribution.
@@ -6,17 +13,199 @@ renderer and knows no distribution.
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
 
+import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from utils.depth_noise import KinectNoise
+from utils.depth import KinectNoise
+from utils.errors import UserError
 from utils.random_ranges import changed
-from utils.textures import SolidTexture
 from utils.transforms import deproject, known_depth
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+_LARGEST_PICTURE = 256  # pixels, longer side that is kept
+_LATTICE = 16  # points of a grain's lattice along each axis, which then repeats
+
+
+class SolidTexture(Protocol):
+    def factor(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) what the colours at points (N, 3), in the object's frame in metres, are
+        multiplied by."""
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A sum of waves through space that brightens and darkens a colour.
+
+    waves: (M, 3) wave vectors, rad/m. phases: (M,). strength: (3,) per colour channel, in 0..1.
+    hard: two tones (stripes, checks) instead of smooth changes.
+    """
+
+    waves: np.ndarray
+    phases: np.ndarray
+    strength: np.ndarray
+    hard: bool
+
+    @staticmethod
+    def draw(rng: np.random.Generator) -> Texture:
+        count = int(rng.integers(1, 4))
+        direction = rng.normal(size=(count, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        length = np.exp(rng.uniform(np.log(0.006), np.log(0.08), size=(count, 1)))  # metres
+        return Texture(
+            2 * np.pi / length * direction,
+            rng.uniform(0, 2 * np.pi, count),
+            rng.uniform(0, 0.5) * rng.uniform(0.4, 1.0, 3),
+            bool(rng.random() < 0.4),
+        )
+
+    def factor(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) what the colours at points (N, 3) are multiplied by."""
+        wave = np.sin(points @ self.waves.T + self.phases).mean(axis=1)
+        wave = np.sign(wave) if self.hard else wave
+        return 1 + wave[:, None] * self.strength
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Spots: random values on a cubic lattice, interpolated between its points (value noise).
+
+    values: (L, L, L) in -1..1, repeating. size: metres between points. strength: (3,) in 0..1.
+    """
+
+    values: np.ndarray
+    size: float
+    strength: np.ndarray
+
+    def factor(self, points: np.ndarray) -> np.ndarray:
+        found = map_coordinates(self.values, points.T / self.size, order=1, mode="grid-wrap")
+        return 1 + found[:, None] * self.strength
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that repeats, seen along a direction through the object.
+
+    pixels: (H, W, 3) factors of mean 1. axes: (2, 3) unit vectors along its columns and rows.
+    size: metres that its width spans. offset: (2,) in pixels.
+    """
+
+    pixels: np.ndarray
+    axes: np.ndarray
+    size: float
+    offset: np.ndarray
+
+    def factor(self, points: np.ndarray) -> np.ndarray:
+        height, width = self.pixels.shape[:2]
+        pixel = points @ self.axes.T * (width / self.size) + self.offset
+        col, row = np.floor(pixel).astype(int).T
+        return self.pixels[row % height, col % width]
+
+
+class TextureRandomizer:
+    """Draws textures, made up or from a folder of pictures.
+
+    A draw is a plain dict, and `make` builds the texture from it: what is recorded shows the same
+    again. folder: of pictures (any below it), which then make half of the draws.
+    Raises UserError if the folder is missing or holds no picture.
+    """
+
+    def __init__(self, folder: Path | None = None):
+        self.files: tuple[str, ...] = ()
+        if folder is not None:
+            self.load_textures(folder)
+
+    def load_textures(self, folder: Path) -> None:
+        """Use the pictures of a folder instead of those so far; see the class for errors."""
+        folder = Path(folder).expanduser()
+        if not folder.is_dir():
+            raise UserError(f"texture folder {folder}: no such folder")
+        files = sorted(str(p) for p in folder.rglob("*") if p.suffix.lower() in PICTURES)
+        if not files:
+            raise UserError(f"texture folder {folder}: no picture ({', '.join(PICTURES)}) in it")
+        for file in files:
+            _read_picture(file)
+        self.files = tuple(files)
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+        """The description of a random texture."""
+        if self.files and rng.random() < 0.5:
+            across = rng.normal(size=(2, 3))
+            across[1] -= across[0] * (across[1] @ across[0]) / (across[0] @ across[0])
+            return {
+                "kind": "picture",
+                "file": self.files[int(rng.integers(len(self.files)))],
+                "axes": (across / np.linalg.norm(across, axis=1, keepdims=True)).tolist(),
+                "size": float(np.exp(rng.uniform(np.log(0.03), np.log(0.3)))),
+                "offset": rng.uniform(0, _LARGEST_PICTURE, 2).tolist(),
+            }
+        if rng.random() < 0.5:
+            wave = Texture.draw(rng)
+            return {
+                "kind": "waves",
+                "waves": wave.waves.tolist(),
+                "phases": wave.phases.tolist(),
+                "strength": wave.strength.tolist(),
+                "hard": wave.hard,
+            }
+        return {
+            "kind": "grain",
+            "seed": int(rng.integers(2**31)),
+            "size": float(np.exp(rng.uniform(np.log(0.002), np.log(0.04)))),
+            "strength": (rng.uniform(0, 0.6) * rng.uniform(0.4, 1.0, 3)).tolist(),
+        }
+
+    @staticmethod
+    def make(description: Mapping[str, Any]) -> SolidTexture:
+        """The texture of a draw. Raises UserError for one of an unknown kind, or whose picture
+        cannot be read."""
+        kind = description.get("kind")
+        if kind == "picture":
+            return Picture(
+                _read_picture(description["file"]), np.array(description["axes"]),
+                description["size"], np.array(description["offset"]),
+            )  # fmt: skip
+        strength = np.array(description.get("strength", ()))
+        if kind == "waves":
+            waves, phases = (np.array(description[name]) for name in ("waves", "phases"))
+            return Texture(waves, phases, strength, description["hard"])
+        if kind == "grain":
+            rng = np.random.default_rng(description["seed"])
+            return Grain(rng.uniform(-1, 1, (_LATTICE,) * 3), description["size"], strength)
+        raise UserError(f"texture kind {kind!r} is unknown; known are grain, picture, waves")
+
+
+def random_colour(rng: np.random.Generator) -> np.ndarray:
+    """(3,) RGB in 0..1, of any hue and saturation and not quite black."""
+    hue, saturation, value = rng.random(), rng.uniform(0, 1), rng.uniform(0.1, 1)
+    return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
+
+
+@lru_cache(maxsize=256)
+def _read_picture(file: str) -> np.ndarray:
+    """(H, W, 3) RGB factors of mean 1. Raises UserError."""
+    try:
+        data = np.fromfile(file, np.uint8)
+    except OSError as error:
+        raise UserError(f"texture {file}: cannot be read ({error.strerror})") from error
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if picture is None:
+        raise UserError(f"texture {file} is not a picture that OpenCV can read")
+    shrink = min(1.0, _LARGEST_PICTURE / max(picture.shape[:2]))
+    size = [max(1, round(side * shrink)) for side in picture.shape[1::-1]]
+    picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+    factors = picture / max(float(picture.mean()), 1.0)
+    factors.flags.writeable = False
+    return factors
+
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma weights, ITU-R BT.601
 _NOISE_STREAM = 2  # keeps a frame's noise apart from what else is drawn with the same seed

@@ -2,12 +2,15 @@
 
 Figures come from `utils.results`, the layout from report.html.j2 next to this file; here they are
 only brought together. The page loads nothing from anywhere: images and videos are inside it.
+
+Pictures of grasps, and which of them are shown: successes, failures, of each policy some.
 """
 
 from __future__ import annotations
 
 import base64
 import shlex
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,13 +23,20 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
-from utils.evaluation_plan import interruption
-from utils.files import write_atomic
-from utils.results import Comparison, Row, compare, failures_in_words, turn_ms_in_words
-from utils.round_records import FAILURES, SUCCESS, RoundRecord, contestant
-from utils.runs import git_state
+from utils.image_overlay import contact_sheet, draw_grasp
+from utils.result_records import FAILURES, SUCCESS, RoundRecord, contestant
+from utils.results import (
+    Comparison,
+    Row,
+    compare,
+    failures_in_words,
+    interruption,
+    stop_reasons,
+    turn_ms_in_words,
+)
+from utils.runs import git_state, write_atomic
 from utils.statistics import Difference
-from utils.stop_reasons import stop_reasons
+from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 PRIVILEGED = ("oracle",)  # policies that see the true scene: a bound, not a headline
@@ -195,3 +205,39 @@ def _percent(rate: float | None, sign: bool = False) -> str:
 
 def _number(value: float | None, digits: int = 0) -> str:
     return "–" if value is None else f"{value:,.{digits}f}"
+
+
+MOST_FAILURES = 24  # on failures.png
+
+
+def picture(frame: RGBDFrame, grasp: Grasp, policy: str, scenario: str, reason: str) -> GalleryItem:
+    """The frame with the grasp drawn in, and how it went: "success" or why not."""
+    on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
+    image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
+    return GalleryItem(image, f"{policy}, {scenario}: {reason}", success, policy)
+
+
+def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
+    """One picture of failed grasps, of each policy in turn; none if nothing failed."""
+    failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
+    if failures:
+        sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
+        write_atomic(path, iio.imwrite("<bytes>", sheet, extension=".png"))
+
+
+def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
+    """`count` pictures, half of them failures where there are enough: those teach the most."""
+    failures = _in_turns([p for p in pictures if not p.success])
+    successes = _in_turns([p for p in pictures if p.success])
+    take = min(len(failures), max(count // 2, count - len(successes)))
+    return failures[:take] + successes[: count - take]
+
+
+def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
+    """One of each policy, then another of each: the worst policy fails most and would fill all."""
+    number_of: Counter[str] = Counter()
+    turns = []
+    for position, item in enumerate(pictures):
+        turns.append((number_of[item.policy], position))
+        number_of[item.policy] += 1
+    return [pictures[position] for _, position in sorted(turns)]

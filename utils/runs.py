@@ -1,23 +1,89 @@
-"""Run folders: runs/<script>/<time>-<name>/, each with what is needed to repeat the run.
+"""Writing files so that a crash never leaves half of one.
+
+Where a program's time goes: seconds by name, and the rest as overhead.
+
+Run folders: runs/<script>/<time>-<name>/, each with what is needed to repeat the run.
 
 This module knows nothing of what a run computes.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import re
 import subprocess
 import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import TracebackType
 from typing import Any, NamedTuple
 
 from utils.config import Config, dump_config
 from utils.errors import UserError
-from utils.files import write_atomic, write_json_atomic
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a whole file or nothing: into a temporary neighbour, then renamed into place."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = content.encode() if isinstance(content, str) else content
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def write_json_atomic(path: Path, content: Mapping) -> None:
+    """Indented strict JSON; raises ValueError on NaN or infinity before touching the file."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    write_atomic(path, text + "\n")
+
+
+class Stopwatch:
+    """Sums up seconds spent in `with watch("simulation"): ...`, by name; not to be nested.
+
+    Everything since `start` that is not inside such a block counts as overhead.
+    """
+
+    OVERHEAD = "overhead"
+
+    def __init__(self):
+        self.start()
+
+    def start(self) -> None:
+        """Forget everything and begin anew."""
+        self._spent: defaultdict[str, float] = defaultdict(float)
+        self._begun = time.perf_counter()
+
+    def __call__(self, name: str) -> Stopwatch:
+        self._name = name
+        return self
+
+    def __enter__(self) -> None:
+        self._since = time.perf_counter()
+
+    def __exit__(
+        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._spent[self._name] += time.perf_counter() - self._since
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds by name, the overhead last; they sum up to the time since `start`."""
+        total = time.perf_counter() - self._begun
+        return dict(self._spent) | {self.OVERHEAD: total - sum(self._spent.values())}
+
 
 __all__ = [
     "GitState",

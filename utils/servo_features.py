@@ -16,16 +16,16 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from utils.errors import unknown_choice
-from utils.se3 import skew
-from utils.servo_errors import (
+from utils.errors import (
     CameraMatrixError,
     CollinearPointsError,
     DepthError,
     FeatureCountError,
     PointError,
     PoseError,
+    unknown_choice,
 )
+from utils.transforms import skew
 
 MIN_POINTS = 3  # six unknowns, two equations each; four or more have no singular cylinder
 COLLINEAR = 1e-3  # a set of points narrower than this share of its length is a line

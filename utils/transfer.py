@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from utils.config_schema import TransferPolicy
+from utils.result_records import RoundRecord
 from utils.results import aligned
-from utils.round_records import RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
 
 TITLES = {

@@ -20,9 +20,7 @@ from math import sin, sqrt
 
 import numpy as np
 
-from utils.errors import UserError, unknown_choice
-from utils.se3 import rotation_log
-from utils.servo_errors import (
+from utils.errors import (
     CameraMatrixError,
     CollinearPointsError,
     DepthError,
@@ -31,6 +29,15 @@ from utils.servo_errors import (
     PoseError,
     ServoError,
     SingularMatrixError,
+    UserError,
+    unknown_choice,
+)
+from utils.servo_control import (
+    AdaptiveGain,
+    TwistLimits,
+    joint_limit_avoidance,
+    pseudo_inverse,
+    scale_joint_velocities,
 )
 from utils.servo_features import (
     DepthFromMotion,
@@ -43,16 +50,8 @@ from utils.servo_features import (
     pose_from_points,
     rotation_interaction,
 )
-from utils.servo_history import ServoHistory
-from utils.servo_laws import (
-    AdaptiveGain,
-    TwistLimits,
-    joint_limit_avoidance,
-    pseudo_inverse,
-    scale_joint_velocities,
-)
-from utils.servo_loop import ServoStep, View, VisualServo
-from utils.transforms import inverse_pose, transform_points
+from utils.servo_loop import ServoHistory, ServoStep, View, VisualServo
+from utils.transforms import inverse_pose, rotation_log, transform_points
 
 __all__ = [
     "AdaptiveGain",
@@ -274,6 +273,6 @@ def relative_pose(view: View, goal: View) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    from utils.servo_scenarios import main
+    from utils.servo_reference import main
 
     main()

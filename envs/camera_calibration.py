@@ -1,0 +1,96 @@
+"""Where the cameras are believed to be, and where they are: what a calibration gets wrong.
+
+Images come from the cameras' true poses; whoever reasons about them has only these beliefs. Both
+cameras are off in a miscalibrated cell, each in a direction of its own. The one thing that a wrong
+belief cannot spoil is what was shown: `teach` has the wrist camera look at a board on a jig that
+sits at a known place before the fingers (teaching by showing), so that goals can be told as they
+look to that very camera.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from envs.board import Board
+from envs.cell import BaseCell, wrist_mount
+from envs.pybullet_camera import Intrinsics
+from envs.robot_kinematics import forward_kinematics
+from utils.table_plane import table_plane
+from utils.transforms import RGBDFrame, inverse_pose
+
+_BOARD_DEPTH = 0.25  # m from the camera to the board on the jig
+_BOARD_TURN = np.diag([1.0, -1.0, -1.0])  # its face towards the camera
+
+
+@dataclass(frozen=True)
+class CameraBeliefs:
+    """T_WC: (4, 4) overhead camera. T_EC: (4, 4) wrist camera in the gripper. levelled: whether
+    depth images are turned and lifted until the table in them lies where it is known to be."""
+
+    T_WC: np.ndarray
+    T_EC: np.ndarray
+    levelled: bool = False
+
+    def frame(self, frame: RGBDFrame, mount: str, T_WE: np.ndarray) -> RGBDFrame:
+        """A frame as it is believed to have been taken; T_WE: (4, 4) the gripper, by encoders."""
+        T_WC = self.T_WC if mount == "overhead" else T_WE @ self.T_EC
+        frame = replace(frame, T_WC=T_WC)
+        return level(frame) if self.levelled else frame
+
+
+def true_beliefs(cell: BaseCell) -> CameraBeliefs:
+    return CameraBeliefs(cell.camera_pose("overhead"), wrist_mount(cell.config.camera))
+
+
+def wrong_beliefs(
+    cell: BaseCell, rng: np.random.Generator, distance: float, angle: float
+) -> CameraBeliefs:
+    """Both cameras believed `distance` metres and `angle` radians off, in random directions."""
+    true = true_beliefs(cell)
+    T_WC, T_EC = (off(T, rng, distance, angle) for T in (true.T_WC, true.T_EC))
+    return CameraBeliefs(T_WC, T_EC, levelled=True)
+
+
+def off(T: np.ndarray, rng: np.random.Generator, distance: float, angle: float) -> np.ndarray:
+    """A pose (4, 4) shifted and turned on the spot, each in a direction uniform on the sphere."""
+    shift, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    wrong = T.copy()
+    wrong[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix() @ T[:3, :3]
+    wrong[:3, 3] += distance * shift
+    return wrong
+
+
+def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
+    """The frame with its camera turned about its own place and lifted so that the table that it
+    shows is level at z = `table`: a planner that believes the table to stand two centimetres in
+    the air plans nothing. Place and heading stay as wrong as they were."""
+    normal, offset = table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), table)
+    up = frame.T_WC[:3, :3] @ normal
+    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
+    T_WC = frame.T_WC.copy()
+    T_WC[:3, :3] = turn.as_matrix() @ T_WC[:3, :3]
+    T_WC[2, 3] = table + offset
+    return replace(frame, T_WC=T_WC)
+
+
+@functools.lru_cache(maxsize=2)
+def teach(cell: BaseCell) -> np.ndarray:
+    """(4, 4) T_CE as the wrist camera itself shows it: the board's pose in one image, taken while
+    the jig holds the board at a known pose in E. Empties the cell, the first time: a camera has to
+    be shown something once only."""
+    servo, camera = cell.config.servo, cell.config.camera
+    intrinsics = Intrinsics(
+        servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far
+    )
+    T_EB = np.eye(4)  # how the jig is built: the board's middle before the camera's nominal place
+    T_EB[:3, :3] = wrist_mount(camera)[:3, :3] @ _BOARD_TURN
+    T_EB[:3, 3] = np.add(camera.wrist_position, [0.0, 0.0, _BOARD_DEPTH])
+    board = Board(cell=0.009)
+    cell.show_board(board, forward_kinematics(cell.home) @ T_EB)
+    rgb = cell.look(intrinsics, cell.camera_pose("wrist")).rgb
+    T_CB = board.pose(board.find(rgb), intrinsics.K)
+    return T_CB @ inverse_pose(T_EB)

@@ -1,0 +1,207 @@
+"""HandCommands: from a policy's actions to what the arm and the gripper are told.
+
+Actions change the commanded pose a little at a time. What of them can be carried out, within joint
+limits, speeds, workspace and safety, is decided here.
+
+Where the hand is when an episode begins somewhere else than at home: poses of E in W, not yet
+checked for the arm's reach. Knows no robot.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from envs.grasp_goals import Grasp
+from envs.pybullet_panda import MAX_OPENING, Panda
+from envs.robot_kinematics import (
+    JOINT_LOWER,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    ServoStep,
+    moved,
+    pose_error,
+    rotation_matrix,
+)
+from utils.config import Config
+from utils.geometry import GripperGeometry
+
+_LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
+_HIGHEST_TIP = 0.50  # m
+_MARGIN = 0.08  # m that E may leave the workspace sideways
+# How far the arm's answer to a command may lie from it before the command is refused.
+_FOLLOW_POSITION, _FOLLOW_ROTATION = 0.01, 0.06  # m, rad
+# The quicker joints of the wrist go no faster than the others: Bullet can hold a body's joints to
+# one limit only, and what is held to the lowest is legal for all.
+_FASTEST = float(JOINT_VELOCITY.min())  # rad/s
+# Share of that speed that is commanded: inertia and contacts throw a joint a little over what its
+# motor asks for (3 % in free motion).
+_SPEED_HEADROOM = 0.95
+_LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
+_GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
+_FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
+
+
+class HandCommands:
+    """What is commanded in an episode; see `RobotGraspingEnv` for the actions.
+
+    config: whose section `env` says what actions mean. lowest, highest: (3,) m in W, the corners of
+    the box that E is held in. opening: m, as commanded. reachable: whether the arm could follow the
+    last action.
+    """
+
+    def __init__(self, config: Config):
+        self._settings = config.env
+        reach = config.workspace.size / 2 + _MARGIN
+        x, y = config.workspace.center
+        self.lowest = (x - reach, y - reach, _LOWEST_TIP)
+        self.highest = (x + reach, y + reach, _HIGHEST_TIP)
+        self._speed = _FASTEST * _SPEED_HEADROOM * config.robot.velocity_scale
+        self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency
+
+    def begin(self, robot: Panda, q: np.ndarray, opening: float) -> None:
+        """Begin with the arm of a robot at joint positions q (7,), its gripper commanded to open by
+        `opening` metres."""
+        self._robot = robot
+        robot.limit_speed(_FASTEST)
+        self._servo = ServoStep(q)  # at the commanded joint positions
+        self._T_command = self._servo.reached
+        self.opening, self.reachable = opening, True
+
+    def command(self, action: np.ndarray, state: np.ndarray) -> None:
+        """Move the commanded pose by an action (A,) and send the motors there. state: (15,) of the
+        robot as it is, see `RobotGraspingEnv`."""
+        self._state = state
+        if self._settings.control == "joint":
+            goal = self._servo.q + self._settings.joint_step * action[:7]
+            goal = np.minimum(np.maximum(goal, JOINT_LOWER), JOINT_UPPER)
+            servo = ServoStep(self._within_speed(goal)[0])
+            self.reachable = self._allowed(servo)
+            if self.reachable:
+                self._servo = servo
+        else:
+            self._follow(self._moved_pose(action))
+        self._robot.drive_arm_to(self._servo.q, self._speed)
+        self.opening = self._new_opening(float(action[-1]))
+        self._robot.command_gripper(self.opening)
+
+    def _new_opening(self, action: float) -> float:
+        """What the gripper is told, in metres."""
+        if self._settings.gripper == "opening":
+            return MAX_OPENING * (action + 1) / 2
+        opening = self.opening + self._settings.gripper_step * action
+        now = float(self._state[14])
+        opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
+        return min(max(opening, 0.0), MAX_OPENING)
+
+    def _moved_pose(self, action: np.ndarray) -> np.ndarray:
+        """(4, 4) the commanded pose of E moved by an action, within the workspace."""
+        settings, T = self._settings, self._T_command.copy()
+        move = settings.position_step * action[:3]
+        turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
+        if settings.frame == "hand":
+            move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
+        position = zip((T[:3, 3] + move).tolist(), self.lowest, self.highest)
+        T[:3, 3] = [min(max(value, low), high) for value, low, high in position]
+        if any(turn.tolist()):
+            T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
+        return T
+
+    def _follow(self, target: np.ndarray) -> None:
+        """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
+        where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
+        goal, share = self._within_speed(self._servo.towards(target))
+        for _ in range(_FOLLOW_TRIES):
+            wanted = target
+            if share < 1.0:
+                wanted = moved(self._T_command, share * pose_error(self._T_command, target))
+            servo = ServoStep(goal)
+            error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
+            if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
+                self.reachable = self._allowed(servo)
+                if self.reachable:
+                    self._servo, self._T_command = servo, wanted
+                return
+            goal, slower = self._within_speed(servo.towards(wanted))
+            share *= slower
+        self.reachable = False
+
+    def _allowed(self, goal: ServoStep) -> bool:
+        """Whether a goal may be commanded: the arm is free, and its gate lets that pass."""
+        tip = goal.reached[:3, 3]
+        return not self._blocked(goal.q) and self._robot.gate.refusal(goal.q, tip) is None
+
+    def _blocked(self, goal: np.ndarray) -> bool:
+        """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""
+        now = self._state[:7]
+        lead = abs(goal - now).max()
+        return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
+
+    def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
+        """Joint positions (7,) towards a goal, and the share of the way that an action gets."""
+        change = goal - self._servo.q
+        share = 1.0 / max(float(abs(change).max()) / self._max_joint_change, 1.0)
+        return self._servo.q + share * change, share
+
+
+_MAX_OPENING = GripperGeometry().max_opening
+_NEAR_SIDE, _NEAR_HEIGHT, _NEAR_TURN = 0.04, (0.01, 0.10), math.pi / 4
+# Looks: heights are even in the logarithm, as what is near moves most in the image.
+_LOOK_HEIGHT, _LOOK_TURN = (0.01, 0.42), math.pi / 2
+_LOOK_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
+_OPEN_SHARE = 0.6  # of the looks: with open fingers, as nearly all of an episode is seen
+_GRASP_SHARE = 0.4  # of the looks: on the way down to a grasp
+_MOVING_SHARE, _MOST_SQUEEZE = 0.5, 0.02  # of the looks: while the fingers close; m
+_GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
+_HALF_TURN = math.pi
+
+
+def near(
+    T_home: np.ndarray, object_place: np.ndarray, top: float, random: np.random.Generator
+) -> np.ndarray:
+    """(4, 4) a little over an object, and turned a little from how the hand is at home.
+
+    T_home: (4, 4) the hand at home. object_place: (2,) x, y of the object and top: its highest
+    point, in W, m.
+    """
+    side = random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
+    height = top + random.uniform(*_NEAR_HEIGHT)
+    return _hand(T_home, object_place + side, height, random.uniform(-_NEAR_TURN, _NEAR_TURN))
+
+
+def look(
+    T_home: np.ndarray,
+    object_place: np.ndarray,
+    top: float,
+    grasp: Grasp | None,
+    random: np.random.Generator,
+) -> tuple[np.ndarray, float, float]:
+    """A place to look at an object from, (4, 4), with the opening of the hand and the one that is
+    commanded, in metres: wherever an episode may lead, from high above to right around a grasp.
+
+    Arguments as of `near`; grasp: of the object, None where no looks on the way down to one are
+    wanted.
+    """
+    if grasp is not None and random.random() < _GRASP_SHARE:
+        place = grasp.position[:2] + random.normal(0, _GRASP_SIDE, 2)
+        height = random.uniform(grasp.position[2], top + _GRASP_HEIGHT)
+        turn = grasp.angle - math.atan2(T_home[1, 1], T_home[0, 1])
+        turn -= _HALF_TURN * round(turn / _HALF_TURN)
+        turn += random.normal(0, _GRASP_TURN)
+        opening = random.uniform(grasp.narrow, grasp.wide)
+    else:
+        rise = math.exp(random.uniform(*np.log(_LOOK_HEIGHT)))
+        place = object_place + random.normal(0, _LOOK_SIDE[0] + _LOOK_SIDE[1] * rise, 2)
+        height, turn = top + rise, random.uniform(-_LOOK_TURN, _LOOK_TURN)
+        opened = random.random() < _OPEN_SHARE
+        opening = _MAX_OPENING if opened else random.uniform(0, _MAX_OPENING)
+    squeeze = random.uniform(0, _MOST_SQUEEZE) if random.random() < _MOVING_SHARE else 0.0
+    return _hand(T_home, place, height, turn), opening, max(opening - squeeze, 0.0)
+
+
+def _hand(T_home: np.ndarray, place: np.ndarray, height: float, turn: float) -> np.ndarray:
+    T = T_home.copy()
+    T[:3, 3] = *place, height
+    T[:3, :3] = rotation_matrix(np.array([0.0, 0.0, turn])) @ T[:3, :3]
+    return T

@@ -1,0 +1,251 @@
+"""The gate that every command to the arm passes: what of it may be sent, and why not.
+
+`ArmGate` stands before the motors: whatever moves the arm, be it a planned motion, an action of
+the Gymnasium environment or a servo loop, passes it. It holds the workspace box and the joints'
+limits, and slows a command that is too fast as a whole.
+
+`SafetyGate` is what a loop that goes by what it sees has to pass before: it holds the watchdog, the
+contact stop and the servo's own lower speeds, and approaches each limit so that the arm can still
+stop in front of it: a speed of at most sqrt(2 a d) where a room d is left and a is the deceleration
+that the arm has for certain.
+
+Both slow the arm by one factor for all joints, so that its direction is kept; where nothing may be
+sent they say why in words. Pure Python and numpy: they know neither PyBullet nor cameras nor where
+a command comes from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.robot_kinematics import (
+    CARTESIAN_ACCELERATION,
+    JOINT_ACCELERATION,
+    JOINT_LOWER,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    forward_kinematics,
+    geometric_jacobian,
+    tip_position,
+)
+from utils.config import RobotConfig, SafetyConfig
+from utils.errors import ServoError, UserError
+
+_LEAST_SHARE = 0.01  # of a wish: where a limit leaves less, the arm stops and says so
+_FINGERTIPS = ((0.0, 0.0, 0.0),)
+_TOO_FAST = 1.0 + 1e-6  # of a speed limit: what is planned to be at the limit passes unchanged
+_LEAD = 0.001  # m by which a reference may be ahead of an arm that has stopped at the box's edge
+_JOINT_RANGES = list(zip(JOINT_LOWER.tolist(), JOINT_UPPER.tolist()))
+
+
+class ArmStoppedError(ServoError):
+    """A gate stopped the arm. contact: because something presses against it."""
+
+    def __init__(self, reason: str, contact: bool = False):
+        super().__init__(reason)
+        self.contact = contact
+
+
+def contact_reason(force: float, limit: float) -> str | None:
+    """Why an arm on which `force` newtons press has to stop; None where it may go on."""
+    return None if force <= limit else f"contact with {force:.1f} N, allowed are {limit} N"
+
+
+def reaching_down(safety: SafetyConfig, floor: float) -> SafetyConfig:
+    """The limits with a box that begins at `floor` m where that is lower than its own."""
+    lower = (*safety.box_lower[:2], min(safety.box_lower[2], floor))
+    return safety.model_copy(update={"box_lower": lower})
+
+
+class ArmGate:
+    """Judges every command before it reaches the motors of one arm, whoever gives it.
+
+    Commands are joint references: it knows the one that was sent last. A reference outside the
+    joints' limits, or with E outside the workspace box, is refused, unless it brings the arm back.
+    In plain floats: a command takes about 4 us.
+    """
+
+    def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, floor: float):
+        """dt: seconds of one control period. floor: m, of the box where that is lower than
+        safety.box_lower: planned grasps reach down to the table."""
+        safety = reaching_down(safety, floor)
+        self._box = [
+            (low - _LEAD, high + _LEAD) for low, high in zip(safety.box_lower, safety.box_upper)
+        ]
+        self.speeds = (JOINT_VELOCITY * robot.velocity_scale).tolist()  # rad/s
+        self._dt = dt
+        self.restart(robot.home)
+
+    def restart(self, q: Sequence[float]) -> None:
+        """The arm is, and is told to be, at joint positions q (7,), rad, wherever that is."""
+        self._q = [float(angle) for angle in q]
+        self._tip = tip_position(self._q)
+        self._judged = self._q, (None, self._tip)  # the last question and its answer
+
+    def refusal(self, q: np.ndarray, tip: np.ndarray | None = None) -> str | None:
+        """Why joint references q (7,), rad, may not be sent; None where they may. tip: (3,) m,
+        where they bring E, for who knows that already."""
+        angles = q.tolist()
+        self._judged = angles, self._judge(angles, None if tip is None else tuple(tip.tolist()))
+        return self._judged[1][0]
+
+    def passed(self, q: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is sent of a reference q (7,) and its velocity (7,), rad/s, for one control period:
+        these very arrays where they are legal. Raises ArmStoppedError."""
+        angles, rates = q.tolist(), velocity.tolist()
+        if not math.isfinite(sum(angles) + sum(rates)):
+            raise ArmStoppedError("the commanded joint positions or velocities are not finite")
+        fastest = max(
+            max(abs(new - old) / self._dt, abs(rate)) / limit
+            for new, old, rate, limit in zip(angles, self._q, rates, self.speeds)
+        )
+        if fastest > _TOO_FAST:
+            before = np.array(self._q)
+            q, velocity = before + (q - before) / fastest, velocity / fastest
+        self.admit(q)
+        return q, velocity
+
+    def admit(self, q: np.ndarray) -> None:
+        """Take note that joint references q (7,), rad, are sent; raises ArmStoppedError."""
+        angles = q.tolist()
+        if angles != self._judged[0]:  # not asked about by `refusal` just now
+            self._judged = angles, self._judge(angles)
+        reason, tip = self._judged[1]
+        if reason is not None:
+            raise ArmStoppedError(reason)
+        self._q, self._tip = angles, tip
+
+    def _judge(
+        self, q: list[float], tip: tuple | None = None
+    ) -> tuple[str | None, tuple[float, float, float]]:
+        """Why not, and where E would be. A number that is not finite fails each comparison."""
+        for number, (angle, before, (low, high)) in enumerate(zip(q, self._q, _JOINT_RANGES), 1):
+            if not low <= angle <= high and not min(low, before) <= angle <= max(high, before):
+                return f"joint {number} would leave its limits ({angle:.3f} rad)", self._tip
+        tip = tip_position(q) if tip is None else tip
+        for axis, place, before, (low, high) in zip("xyz", tip, self._tip, self._box):
+            if not low <= place <= high and not min(low, before) <= place <= max(high, before):
+                return f"the workspace ends here ({axis} = {place:.3f} m)", tip
+        return None, tip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """velocity: (7,) rad/s that may be sent. reason: why it is zero; None where the arm may go.
+    contact: whether the reason is that something presses against the arm."""
+
+    velocity: np.ndarray
+    reason: str | None = None
+    contact: bool = False
+
+
+class SafetyGate:
+    """Judges every wish for joint velocities of a loop that goes by what it sees.
+
+    Keeps the guarded points within the workspace box and under a linear speed, the hand under an
+    angular speed, and the joints within their limits of position, velocity and acceleration. A stop
+    is at once: nothing is sent on contact, or when what the wish was computed from is too old.
+    """
+
+    def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, guarded_E=_FINGERTIPS):
+        """dt: seconds for which a velocity is sent. guarded_E: (n, 3) points in E, metres, such as
+        the corners of something carried."""
+        self.safety, self.dt = safety, dt
+        self.guarded_E = np.asarray(guarded_E, dtype=float)
+        if self.guarded_E.ndim != 2 or self.guarded_E.shape[1] != 3 or not len(self.guarded_E):
+            raise UserError(f"guarded_E: expected (n, 3) points, got {self.guarded_E.shape}")
+        self._speed = JOINT_VELOCITY * robot.velocity_scale
+        self._lower = JOINT_LOWER + safety.joint_margin
+        self._upper = JOINT_UPPER - safety.joint_margin
+        self._joint_acceleration = JOINT_ACCELERATION * robot.acceleration_scale
+        self._deceleration = CARTESIAN_ACCELERATION * robot.acceleration_scale
+        self._box = np.array(safety.box_lower), np.array(safety.box_upper)
+
+    def check(
+        self,
+        wish: np.ndarray,
+        q: np.ndarray,
+        contact_force: float,
+        perception_age: float,
+        before: np.ndarray | None = None,
+    ) -> Verdict:
+        """What may be sent of the wished joint velocities (7,), rad/s.
+
+        q: (7,) rad, where the joints are. contact_force: N on the arm and what it carries.
+        perception_age: seconds since the image was taken from which the wish was computed.
+        before: (7,) rad/s, what was sent last, from where the arm gets no faster or slower than its
+        acceleration limits allow; None: as if it had been this wish.
+        """
+        reason = self._refusal(wish, q, perception_age)
+        if reason is not None:
+            return Verdict(np.zeros(7), reason)
+        reason = contact_reason(contact_force, self.safety.contact_stop)
+        if reason is not None:
+            return Verdict(np.zeros(7), reason, contact=True)
+        T_WE, J = forward_kinematics(q), geometric_jacobian(q)
+        arms = self.guarded_E @ T_WE[:3, :3].T
+        twist = J @ wish
+        velocity = wish * self._speed_share(wish, _speeds(twist, arms), twist[3:])
+        choices = [velocity]
+        if before is not None:  # the wish itself, where braking that gently would leave no room
+            change = velocity - before
+            choices.insert(0, before + change * self._change_share(change))
+        for velocity in choices:
+            speeds = _speeds(J @ velocity, arms)
+            share, reason = self._room_share(velocity, q, T_WE[:3, 3] + arms, speeds)
+            if share >= _LEAST_SHARE:
+                return Verdict(share * velocity)
+        return Verdict(np.zeros(7), reason)
+
+    def _refusal(self, wish, q, perception_age) -> str | None:
+        """Why nothing at all may be sent. A number that is not finite fails each comparison."""
+        if not (np.isfinite(wish).all() and np.isfinite(q).all()):
+            return "the wished joint velocities or the joint positions are not finite"
+        if not perception_age <= self.safety.watchdog:
+            return (
+                f"what was seen last is {1000 * perception_age:.0f} ms old, "
+                f"the watchdog allows {1000 * self.safety.watchdog:.0f} ms"
+            )
+        return None
+
+    def _speed_share(self, wish, speeds, turn) -> float:
+        """The factor, at most 1, that brings every speed within its limit."""
+        excess = max(
+            float(np.max(np.abs(wish) / self._speed)),
+            float(np.linalg.norm(speeds, axis=1).max()) / self.safety.linear_speed,
+            float(np.linalg.norm(turn)) / self.safety.angular_speed,
+        )
+        return 1.0 / max(excess, 1.0)
+
+    def _change_share(self, change) -> float:
+        """The factor, at most 1, that brings a change of velocities (7,) within one period within
+        the acceleration limits."""
+        excess = float(np.max(np.abs(change) / (self._joint_acceleration * self.dt)))
+        return 1.0 / max(excess, 1.0)
+
+    def _room_share(self, velocity, q, points, speeds) -> tuple[float, str]:
+        """The factor, at most 1, that lets the arm stop before each limit; who sets it."""
+        joints = self._shares(velocity, q - self._lower, self._upper - q, self._joint_acceleration)
+        box = self._shares(speeds, points - self._box[0], self._box[1] - points, self._deceleration)
+        joint, place = int(joints.argmin()), np.unravel_index(box.argmin(), box.shape)
+        if joints[joint] <= box[place]:
+            return joints[joint], f"joint {joint + 1} is at its limit ({q[joint]:.3f} rad)"
+        axis = "xyz"[place[1]]
+        return box[place], f"the workspace ends here ({axis} = {points[place]:.3f} m)"
+
+    def _shares(self, speed, room_below, room_above, deceleration) -> np.ndarray:
+        """For each speed (...) the share of it that the room in its direction allows, at most 1."""
+        room = np.maximum(np.where(speed < 0, room_below, room_above), 0.0)
+        # The second bound: within the next period the limit is not crossed.
+        allowed = np.minimum(np.sqrt(2.0 * deceleration * room), room / self.dt)
+        size = np.abs(speed)
+        return np.divide(allowed, size, out=np.ones_like(size), where=size > allowed)
+
+
+def _speeds(twist: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """(n, 3) m/s in W of points at `arms` (n, 3) from E, which moves with a twist (6,)."""
+    return twist[:3] + np.cross(twist[3:], arms)

@@ -1,0 +1,325 @@
+"""Many copies of a Gymnasium environment, each in a worker process, that fail loudly.
+
+A worker that raises, dies or hangs ends the call with what is known about it; nothing waits for
+ever. Environments never reset on their own, so that no final observation is lost. This module knows
+no policy.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import yaml
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from utils.adaptive_ranges import WIDEST, adaptive_ranges
+from utils.config import Config
+from utils.errors import UserError
+
+RANDOMIZED = "RandomizedGrasping-v0"
+OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # are given the whole config
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
+warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
+
+
+class WorkerError(RuntimeError):
+    """A worker process raised something, died or did not answer; the message holds its traceback,
+    as far as there is one."""
+
+
+@contextmanager
+def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
+    """`count` environments of the config's section `rl`, closed at the end.
+
+    Raises UserError for an environment that does not exist or cannot be made from its arguments.
+    """
+    envs = VectorEnvs(config, count)
+    try:
+        yield envs
+    except BaseException:
+        envs.kill()  # a worker in an unknown state would not answer a request to close
+        raise
+    envs.close()
+
+
+def full_difficulty(env_id: str) -> dict[str, Any]:
+    """Options of a reset for an episode of the task itself, whatever makes training easier."""
+    options = {"start": "home"} if env_id in OWN_ENVS else {}
+    return options | ({"ranges": WIDEST} if env_id == RANDOMIZED else {})
+
+
+class VectorEnvs:
+    """See `models.ppo_rollouts.VectorEnvs` for the methods that stepping takes.
+
+    observation_space, action_space: of a single environment. ranges: automatic ones, None without:
+    those of all environments, which are told of a change when they next begin an episode.
+    """
+
+    def __init__(self, config: Config, count: int):
+        self.num_envs = count
+        self._options: dict[str, Any] = {}
+        self._id = config.rl.env_id
+        randomized = self._id == RANDOMIZED
+        self.ranges = adaptive_ranges(config.randomization) if randomized else None
+        self._timeout = config.rl.worker_timeout
+        makers = [partial(make_env, config, index) for index in range(count)]
+        self._parallel = config.rl.parallel and count > 1
+        if self._parallel:
+            # Not forked from here: threads, GPU contexts and OpenGL do not survive that.
+            multiprocessing.set_forkserver_preload(loaded_here())
+            with worker_environment(), _told(self._died):
+                self._envs = AsyncVectorEnv(
+                    makers, context="forkserver", copy=False, autoreset_mode=AutoresetMode.DISABLED
+                )
+        else:
+            self._envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
+
+    def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
+        options = {} if self.ranges is None else {"ranges": self.ranges.shares}
+        options |= self._options | ({} if which is None else {"reset_mask": which})
+        with _told(self._died):
+            if not self._parallel:
+                return self._envs.reset(seed=list(seeds), options=options or None)[0]
+            self._envs.reset_async(seed=list(seeds), options=options or None)
+            return self._envs.reset_wait(self._timeout)[0]
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        with _told(self._died):
+            if not self._parallel:
+                return self._envs.step(actions)
+            self._envs.step_async(actions)
+            return self._envs.step_wait(self._timeout)
+
+    def keep_episodes(self, folder: Path | None, first: int = 0) -> None:
+        """Have environments that change their world write down every episode from now on, each in a
+        new file of its own in a folder: env0.jsonl and so on, counted from `first`. None: no more.
+        """
+        if self._id != RANDOMIZED:
+            return
+        journals: list[Path | None] = [None] * self.num_envs
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            journals = [folder / f"env{first + number}.jsonl" for number in range(self.num_envs)]
+            for journal in journals:
+                journal.unlink(missing_ok=True)
+        with _told(self._died):
+            self._envs.set_attr("journal", journals)
+
+    @contextmanager
+    def at_full_difficulty(self) -> Iterator[None]:
+        """Episodes begun in here are as hard as the task, whatever makes training easier."""
+        with self._begun_with(full_difficulty(self._id)):
+            yield
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """Episodes begun in here, which are not played, begin anywhere that one may lead to."""
+        with self._begun_with({"start": "look"}):
+            yield
+
+    @contextmanager
+    def _begun_with(self, options: dict[str, Any]) -> Iterator[None]:
+        """Options of the cell's resets; other environments know none of them."""
+        self._options = options if self._id in OWN_ENVS else {}
+        try:
+            yield
+        finally:
+            self._options = {}
+
+    @property
+    def processes(self) -> list[multiprocessing.Process]:
+        """The workers, if there are any."""
+        return self._envs.processes if self._parallel else []
+
+    def close(self) -> None:
+        self._envs.close()
+
+    def kill(self) -> None:
+        """End the workers without asking them."""
+        for process in self.processes:
+            process.kill()
+        for process in self.processes:
+            process.join()
+        if self._parallel:
+            self._envs.closed = True
+        else:
+            self._envs.close()
+
+    def _died(self) -> str:
+        """Which workers do not live any more."""
+        if not hasattr(self, "_envs"):
+            return "a worker process died while it was started; its message stands above"
+        wait([process.sentinel for process in self.processes], timeout=1.0)
+        dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes)
+                if not p.is_alive()]  # fmt: skip
+        return f"worker process {', '.join(dead) or 'of an environment'} died (out of memory?)"
+
+
+@contextmanager
+def _told(died) -> Iterator[None]:
+    """Turns how Gymnasium reports a lost worker into a WorkerError."""
+    try:
+        yield
+    except (EOFError, BrokenPipeError, ConnectionResetError) as error:
+        raise WorkerError(died()) from error
+    except multiprocessing.TimeoutError as error:
+        raise WorkerError(
+            f"an environment hangs: {error}; rl.worker_timeout is how long it may take"
+        ) from error
+
+
+def loaded_here() -> list[str]:
+    """Modules that a worker would import, as it imports the script: their common parent does so
+    once for all of them."""
+    own = {path.stem for path in REPOSITORY.iterdir() if path.suffix in ("", ".py")}
+    names = [name for name in sys.modules if name.partition(".")[0] in own]
+    return [*names, "torch.utils.tensorboard"]
+
+
+@contextmanager
+def worker_environment() -> Iterator[None]:
+    """Processes started in here find this project, and compute with one thread each: there are as
+    many of them as cores."""
+    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
+    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> gymnasium.Env:
+    """One environment of the config's section `rl`, with all that is to be seen in its
+    observations. Raises UserError if it cannot be made."""
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    settings = config.rl
+    arguments = {}
+    for text in settings.env_kwargs or ():
+        name, _, value = text.partition("=")
+        arguments[name] = yaml.safe_load(value)
+    if render_mode is not None:  # panda-gym does not take None
+        arguments["render_mode"] = render_mode
+    if settings.env_id in OWN_ENVS:
+        arguments["config"] = config
+    try:
+        env = gymnasium.make(settings.env_id, disable_env_checker=True, **arguments)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        raise UserError(f"rl.env_id {settings.env_id}: {error}") from error
+    except TypeError as error:
+        raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
+    seen = settings.policy_observations, settings.privileged_observations
+    wanted = [name for names in (*seen, settings.estimated_observations) for name in names or ()]
+    return Watched(with_info(env, wanted), index)
+
+
+def with_info(env: gymnasium.Env, wanted: Sequence[str]) -> gymnasium.Env:
+    """The environment, its observation completed by wanted entries that only its info has."""
+    space = env.observation_space
+    here = space.spaces if isinstance(space, spaces.Dict) else {}
+    missing = [name for name in wanted if name not in here]
+    if not missing or not isinstance(space, spaces.Dict):
+        return env
+    _, info = env.reset(seed=0)
+    missing = [name for name in missing if name in info]
+    return InfoInObservation(env, missing, info) if missing else env
+
+
+class InfoInObservation(gymnasium.ObservationWrapper):
+    """Adds numeric entries of info to a dict observation, as float32 vectors."""
+
+    def __init__(self, env: gymnasium.Env, names: Sequence[str], example: dict[str, Any]):
+        super().__init__(env)
+        self._names = names
+        added = {
+            name: spaces.Box(-np.inf, np.inf, self._vector(example, name).shape) for name in names
+        }
+        self.observation_space = spaces.Dict({**env.observation_space.spaces, **added})
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        observation, info = self.env.reset(**arguments)
+        return self._complete(observation, info), info
+
+    def step(self, action: np.ndarray) -> tuple:
+        observation, *middle, info = self.env.step(action)
+        return self._complete(observation, info), *middle, info
+
+    def _complete(self, observation: dict, info: dict) -> dict[str, np.ndarray]:
+        return {**observation, **{name: self._vector(info, name) for name in self._names}}
+
+    @staticmethod
+    def _vector(info: dict[str, Any], name: str) -> np.ndarray:
+        try:
+            return np.atleast_1d(np.asarray(info[name], np.float32))
+        except (TypeError, ValueError):
+            raise UserError(f"info entry {name!r} is no number or vector: {info[name]!r}") from None
+
+
+class Watched(gymnasium.Wrapper):
+    """Checks what an environment returns, and turns what it raises into one message.
+
+    The message has to be text: an error that cannot be pickled would never leave its process.
+    """
+
+    def __init__(self, env: gymnasium.Env, index: int):
+        super().__init__(env)
+        self._index = index
+        space = env.observation_space
+        self._shapes = (
+            {key: box.shape for key, box in space.items()}
+            if isinstance(space, spaces.Dict)
+            else space.shape
+        )
+
+    def reset(self, **arguments: Any) -> tuple:
+        return self._checked(lambda: self.env.reset(**arguments))
+
+    def step(self, action: np.ndarray) -> tuple:
+        return self._checked(lambda: self.env.step(action))
+
+    def _checked(self, call) -> tuple:
+        try:
+            result = call()
+        except UserError as error:
+            raise UserError(f"environment {self._index}: {error}") from None
+        except Exception:  # whatever the environment of a user raises: told with its traceback
+            raise WorkerError(
+                f"environment {self._index} raised an error:\n{traceback.format_exc()}"
+            ) from None
+        found = (
+            {key: np.shape(value) for key, value in result[0].items()}
+            if isinstance(result[0], dict)
+            else np.shape(result[0])
+        )
+        if found != self._shapes:
+            raise UserError(
+                f"environment {self._index}: the observation has shapes {found}, its "
+                f"space says {self._shapes}"
+            )
+        return result

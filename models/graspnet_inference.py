@@ -1,0 +1,170 @@
+"""GraspNet on any camera's image: the scale it was trained at, and everything mapped back.
+
+Convolutions know sizes in pixels only. So the image is resampled, with square pixels, until one of
+its pixels spans as many metres at the median depth as in training; grasps and maps then return to
+the original's pixels. This module knows no simulator and no files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, to_input
+from models.graspnet_decoding import (
+    LABELS,
+    PANDA_HAND,
+    Peaks,
+    PeakSettings,
+    find_peaks,
+    surface_grasps,
+)
+from utils.depth import fill_holes
+from utils.errors import UserError
+from utils.geometry import GripperGeometry
+from utils.grasp_labels import LabelSettings, grasp_below_surface
+from utils.images import PixelScaling
+from utils.transforms import Grasp, ImageGrasp, RGBDFrame, deproject
+
+SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
+MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
+PEAKS = PeakSettings()
+CANDIDATES = 1000  # peaks that are looked at for some that stand on the table
+
+
+@dataclass(frozen=True)
+class PredictedGrasp:
+    """on_image: on the visible surface, in pixels of the original image. in_world: where the
+    fingertips close, in W."""
+
+    on_image: ImageGrasp
+    in_world: Grasp
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """grasps: best first. quality, angle, width: (H, W) float32 at the original image's pixels:
+    in [0, 1], image angles in [0, pi), metres."""
+
+    grasps: list[PredictedGrasp]
+    quality: np.ndarray
+    angle: np.ndarray
+    width: np.ndarray
+
+
+def predict(
+    model: GraspNet,
+    metres_per_pixel: float,
+    frame: RGBDFrame,
+    table_height: float,
+    count: int = 20,
+    gripper: GripperGeometry = PANDA_HAND,
+    labels: LabelSettings = LABELS,
+    peaks: PeakSettings = PEAKS,
+) -> Prediction:
+    """The `count` best grasps of a frame, whatever its size, aspect ratio and focal lengths.
+
+    metres_per_pixel: of the images that the model was trained on. table_height: z of the table
+    in W. peaks: in pixels at the training's scale. A grasp needs a surface that the fingertips
+    can go beside, as in the labels; peaks on the table are none. Raises UserError for images that
+    cannot be meant.
+    """
+    scaling, maps = scaled_maps(model, metres_per_pixel, frame)
+    grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)
+    quality, angle, width = maps
+    shape = frame.depth.shape
+    bins = angle[0].argmax(dim=0).numpy() * (np.pi / model.num_angle_bins)
+    # Lines at 0 and 180 degrees are the same: doubled angles are interpolated as vectors.
+    cosine, sine = (
+        scaling.original_map(part(2 * bins).astype(np.float32), shape) for part in (np.cos, np.sin)
+    )
+    return Prediction(
+        grasps[:count],
+        scaling.original_map(quality[0, 0].numpy(), shape),
+        scaling.original_angles(np.arctan2(sine, cosine) / 2).astype(np.float32),
+        scaling.original_map(width[0, 0].numpy(), shape),
+    )
+
+
+def scaled_maps(
+    model: GraspNet, metres_per_pixel: float, frame: RGBDFrame, centres: bool = False
+) -> tuple[PixelScaling, tuple[torch.Tensor, ...]]:
+    """The scaling to the training's pixels, and the network's three maps there; with `centres` a
+    fourth one, of the centre head."""
+    if model.input_channels != INPUT_CHANNELS:
+        raise UserError(
+            f"the network takes {model.input_channels} channels; an RGB-D image has "
+            f"{INPUT_CHANNELS}"
+        )
+    scaling = training_scale(frame, metres_per_pixel)
+    return scaling, run_network(model, frame, scaling, centres)
+
+
+def grasps_in_maps(
+    maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    scaling: PixelScaling,
+    frame: RGBDFrame,
+    table_height: float,
+    gripper: GripperGeometry,
+    labels: LabelSettings,
+    peaks: PeakSettings,
+) -> list[PredictedGrasp]:
+    """Grasps on whatever rises from the table, best first, at the original's pixels."""
+    found = find_peaks(*maps, PeakSettings(peaks.threshold, CANDIDATES, peaks.radius, peaks.blur))
+    rows, columns = frame.depth.shape
+    original = Peaks(
+        np.clip(scaling.original_pixels(found.pixel), 0, (columns - 1, rows - 1)),
+        scaling.original_angles(found.angle),
+        found.width,
+        found.quality,
+    )
+    # As far around in metres as one pixel at the training's scale.
+    radius = max(1, round(1 / min(scaling.u, scaling.v)))
+    seen = surface_grasps(original, frame.depth, gripper, radius)
+    pixels = np.array([grasp.pixel for grasp in seen]).reshape(-1, 2)
+    surface = deproject(pixels, [grasp.depth for grasp in seen], frame.K, frame.T_WC)
+    rises = surface[:, 2] - table_height > labels.table_clearance + labels.min_engagement
+    return [
+        PredictedGrasp(
+            grasp,
+            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
+        )
+        for grasp, high in zip(seen, rises)
+        if high
+    ]
+
+
+def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
+    """The scaling after which a pixel spans `metres_per_pixel` at the median known depth.
+
+    Raises UserError for images that cannot be meant, and where the view would be far too small or
+    too wide.
+    """
+    distance = check_rgbd(frame.rgb, frame.depth)
+    scaling = PixelScaling.to_focal_length(frame.K, distance / metres_per_pixel)
+    height, width = frame.depth.shape
+    rows, columns = height * scaling.v, width * scaling.u
+    if min(rows, columns) < SMALLEST_SIDE or rows * columns > MOST_PIXELS:
+        raise UserError(
+            f"at the median depth of {distance:.3g} m the image would span "
+            f"{columns * metres_per_pixel:.3g} m x {rows * metres_per_pixel:.3g} m, too "
+            f"{'little' if min(rows, columns) < SMALLEST_SIDE else 'much'} for a hand's grasps; "
+            "check the unit of the depth and the focal length"
+        )
+    return scaling
+
+
+@torch.no_grad()
+def run_network(
+    model: GraspNet, frame: RGBDFrame, scaling: PixelScaling, centres: bool = False
+) -> tuple[torch.Tensor, ...]:
+    """GraspNet's three maps of the scaled image, with `centres` four, on the CPU."""
+    depth = scaling.image(fill_holes(frame.depth))
+    image = to_input(scaling.image(frame.rgb), depth)
+    device = next(model.parameters()).device
+    if model.training:  # eval() walks through all modules
+        model.eval()
+    maps = model(image[None].to(device), centres=centres)
+    return tuple(part.float().cpu() for part in maps)

@@ -1,0 +1,439 @@
+"""Many grasps in the making, held column by column so that they are judged all at once.
+
+This module knows neither how grasps are found nor what makes one good.
+
+Antipodal search on a height map: where two parallel fingers can close on opposite faces.
+
+First runs of matter along the closing line that fit between the fingers (dense, every angle and
+height); each survivor is then posed on the map, its contacts, clearances and lever arms measured,
+and it is centred and turned onto the faces. This module knows height maps only: neither the image
+nor the solids behind them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import HeightMap
+from utils.transforms import Grasp, angle_difference
+
+
+@dataclass
+class Candidates:
+    """N grasps in the making.
+
+    xy: (N, 2) fingertips' centre in W. angle: (N,). tip: (N,) height of the fingertips' lowest
+    point in W. width: (N,) of what is between the fingers. opening: (N,) before closing.
+    turn: (N,) rotation that would bring the pads flat onto the faces. label: (N,) the object in
+    the height map. score: (N,), 0 = not feasible.
+    """
+
+    xy: np.ndarray
+    angle: np.ndarray
+    tip: np.ndarray
+    width: np.ndarray
+    opening: np.ndarray
+    turn: np.ndarray
+    label: np.ndarray
+    score: np.ndarray
+
+    @staticmethod
+    def rough(xy, angle, tip, width, score) -> Candidates:
+        """Candidates of the dense stage, not measured yet."""
+        return Candidates(
+            xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
+        )
+
+    def __len__(self) -> int:
+        return len(self.angle)
+
+    def take(self, index) -> Candidates:
+        return Candidates(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def best(self, count: int) -> Candidates:
+        """The `count` best feasible ones, best first."""
+        order = np.argsort(-self.score, kind="stable")[:count]
+        return self.take(order[self.score[order] > 0])
+
+    def replaced(self, index: np.ndarray, others: Candidates) -> Candidates:
+        """All of them, but `others` in the places `index`."""
+        result = self.take(np.arange(len(self)))
+        for field in fields(self):
+            getattr(result, field.name)[index] = getattr(others, field.name)
+        return result
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2) unit vectors along the closing line and across it."""
+        along = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
+        return along, np.stack([-along[:, 1], along[:, 0]], axis=-1)
+
+    def distinct(self, count: int, distance: float, angle: float) -> Candidates:
+        """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
+        apart = np.linalg.norm(self.xy[:, None] - self.xy, axis=2) >= distance
+        apart |= angle_difference(self.angle[:, None], self.angle) >= angle
+        kept, free = [], np.ones(len(self), bool)
+        while free.any() and len(kept) < count:
+            kept.append(int(free.argmax()))
+            free &= apart[kept[-1]]
+            free[kept[-1]] = False
+        return self.take(kept)
+
+    def grasps(self, gripper: GripperGeometry) -> list[Grasp]:
+        height = self.tip + gripper.tip_below_centre
+        return [
+            Grasp(np.array([x, y, z]), angle, opening, score)
+            for (x, y), z, angle, opening, score in zip(
+                self.xy, height, self.angle, self.opening.tolist(), self.score.tolist()
+            )
+        ]
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Margins and preferences of the search; metres and radians unless said."""
+
+    angles: int = 18  # bin k is centred at k * 180 / angles degrees
+    level_step: float = 0.006  # between the heights of the fingertips that are tried
+    table_clearance: float = 0.004  # under the fingertips
+    clearance: float = 0.003  # over whatever lies under fingers and palm
+    rooms: tuple[float, ...] = (0.004, 0.006, 0.008, 0.012)  # room beside each contact when open
+    inner_margin: float = 0.0015  # of that room, free of matter beside the descending finger
+    min_engagement: float = 0.006  # the object must rise this far over the fingertips
+    good_engagement: float = 0.022  # and gains nothing beyond this
+    max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
+    min_facing: float = 0.75  # cosine of an edge's gradient against the closing line, dense stage
+    reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
+    shortlist: int = 1000  # survivors of the dense stage that are measured
+    finalists: int = 250  # of these, turned onto the faces and measured again
+    split_factor: float = 0.5  # on a grasp whose ends lie on different objects, by the map
+    returned: int = 20  # grasps at most
+    distinct_distance: float = 0.01  # no two returned ones are both closer than this
+    distinct_turn: float = np.deg2rad(20)  # and turned by less than this
+
+    def daring(self) -> SearchSettings:
+        """What is given up where nothing meets the margins: room and wedge for things on slopes or
+        between others, height under the tips for things as flat as a pencil."""
+        return replace(
+            self,
+            table_clearance=min(self.table_clearance, 0.002),
+            clearance=min(self.clearance, 0.001),
+            rooms=(min(self.rooms[0], 0.003), *self.rooms),
+            inner_margin=0.0,
+            min_engagement=min(self.min_engagement, 0.003),
+            max_wedge=max(self.max_wedge, np.deg2rad(38)),
+            min_facing=min(self.min_facing, 0.6),
+        )
+
+
+def search(
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    settings: SearchSettings,
+    value: Callable[[Candidates], np.ndarray] | None = None,
+) -> Candidates:
+    """Feasible candidates on a height map, measured and scored, best first; may be empty.
+
+    value: (N,) what else is known of the candidates' worth, such as a network's opinion; a factor
+    on their scores. Where nothing meets the margins, a second search gives some of them up: a poor
+    attempt may clear an object, none ends the round.
+    """
+    found = _search_once(heights, gripper, workspace, settings, value)
+    if len(found) == 0:
+        found = _search_once(heights, gripper, workspace, settings.daring(), value)
+    return found
+
+
+def _search_once(heights, gripper, workspace, settings, value) -> Candidates:
+    found = _valued(dense_candidates(heights, gripper, workspace, settings), value)
+    found = found.best(settings.shortlist)
+    if len(found) == 0:
+        return found
+    found = measure(found, heights, gripper, settings).best(settings.finalists)
+    found = turn_onto_faces(found, heights, gripper, settings)
+    return _valued(found, value).best(len(found))
+
+
+def _valued(found: Candidates, value) -> Candidates:
+    return found if value is None else replace(found, score=found.score * value(found))
+
+
+def dense_candidates(
+    heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
+) -> Candidates:
+    """Every angle, fingertip height and row of the map: what might fit between the fingers."""
+    cell, lowest = heights.cell, heights.table_height + settings.table_clearance
+    levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
+    if len(levels) == 0 or len(heights.centres) == 0:  # nothing stands up, or only slivers do
+        return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
+    # A square that holds whatever may be grasped, and fingers beside it, at any angle.
+    matter = np.argwhere(heights.height > lowest)[:, ::-1]
+    first, last = matter.min(axis=0), matter.max(axis=0)
+    centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
+    beside = max(settings.rooms) + 2 * thickness
+    half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
+    size, middle = 2 * half + 1, heights.origin + cell * centre_cell
+    # Gradients of the blurred map point across an edge whatever its height.
+    slope = np.stack(
+        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1
+    )
+    slope /= np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9
+    finger = np.ones(
+        (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
+    )
+    palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
+    palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
+    parts = []
+    for angle in np.arange(settings.angles) * np.pi / settings.angles:
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        axes = np.column_stack([along, across])
+        warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
+        turned = cv2.warpAffine(
+            heights.height, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderValue=heights.table_height,
+        )  # fmt: skip
+        level, row, first, last = _runs(
+            turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell
+        )
+        tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
+        under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
+        limit = tip - settings.clearance
+        free = np.zeros(len(tip), bool)
+        for room in settings.rooms:  # a sloping flank asks for more of it
+            offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
+            left, right = (
+                np.clip(np.rint(at).astype(int), 0, size - 1)
+                for at in (first - offset, last + offset)
+            )
+            fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
+            free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
+        free &= under_palm[row, centre] < limit + gripper.palm_height
+        row, first, last, tip = row[free], first[free], last[free], tip[free]
+
+        base = middle + cell * (row - half)[:, None] * across
+        at_first, at_inside, xy, at_last = (
+            base + cell * (column - half)[:, None] * along
+            for column in (first, first + 1.5, (first + last) / 2, last)
+        )
+        reach = np.abs(xy - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
+        # Outward normals are minus the gradient: cosines against the closing line on both sides.
+        facing = np.minimum(
+            slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
+        )
+        inside = heights.label[heights.index(at_inside)]
+        arm = np.abs((heights.centres[inside, :2] - xy) @ across)
+        rise = turned[row, first] - tip
+        score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
+        score *= (
+            reach
+            * (facing > settings.min_facing)
+            * np.clip(rise / settings.good_engagement, 0.2, 1)
+        )
+        parts.append(
+            Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
+        )
+    return Candidates(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates))
+    )
+
+
+def _runs(
+    turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float
+) -> tuple[np.ndarray, ...]:
+    """Runs of cells over a level along the rows: level, row, first and last column, each (M,).
+
+    A run may bridge a gap to the next one or two of its row (a ring, a mug). Every second row is
+    enough: the pad spans several.
+    """
+    rows = np.nonzero(turned.max(axis=1) > levels[0])[0]
+    picked = np.arange(rows[0], rows[-1] + 1, 2) if len(rows) else rows
+    matter = turned[picked] > levels[:, None, None]
+    edge = np.diff(np.pad(matter, ((0, 0), (0, 0), (1, 1))).view(np.int8), axis=-1)
+    level, row, first = np.nonzero(edge == 1)
+    last = np.nonzero(edge == -1)[2] - 1
+    found = []
+    for bridge in range(3):
+        n = max(len(level) - bridge, 0)
+        fits = (level[:n] == level[bridge:]) & (row[:n] == row[bridge:])
+        fits &= (last[bridge:] - first[:n] + 1) * cell < max_width + cell
+        found.append((level[:n][fits], picked[row[:n][fits]], first[:n][fits], last[bridge:][fits]))
+    return tuple(np.concatenate(column) for column in zip(*found))
+
+
+def turn_onto_faces(
+    found: Candidates,
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+    times: int = 2,
+) -> Candidates:
+    """Measured candidates, each turned and measured again as long as that makes it better."""
+    better = np.arange(len(found))
+    for _ in range(times):
+        before = found.take(better)
+        turned = replace(before, angle=np.mod(before.angle + before.turn, np.pi))
+        turned = measure(turned, heights, gripper, settings)
+        wins = turned.score > before.score
+        better = better[wins]
+        found = found.replaced(better, turned.take(wins))
+    return found
+
+
+def measure(
+    candidates: Candidates, heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings
+) -> Candidates:
+    """Pose each candidate on the map; centre it between its contacts and score it.
+
+    The pads are flat: a pad stops where the first of the lines across it meets matter. Slopes of
+    the meeting points across the pad give the angle to the face, their shift with height its tilt.
+    """
+    N, tip = len(candidates), candidates.tip
+    along, across = candidates.axes()
+    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + 0.004
+    most = np.ceil(reach / heights.cell)
+    u = np.arange(-most, most + 1) * heights.cell
+    v = np.linspace(-1, 1, 9) * gripper.finger_half_width
+    where = _cells(candidates.xy, along, across, u, v, heights)  # (N, V, U)
+    height = heights.height.take(where)
+    highest = height.max(axis=1)  # across the pads
+
+    # Contacts, searched a little beyond the width that the candidate claims.
+    window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
+    top = np.where(window, highest, -np.inf).max(axis=1)
+    engagement = top - tip
+    upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
+    low = (height > tip[:, None, None] + 0.001) & window[:, None]
+    low_left, low_right = _first_contacts(low, u, heights.cell)
+    high = (highest > upper[:, None]) & window
+    high_left, high_right = _first_contacts(high, u, heights.cell)
+    left, right = low_left.min(axis=1), low_right.max(axis=1)
+    touched = np.isfinite(left) & np.isfinite(high_left)
+    left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
+    width, shift = right - left, (right + left) / 2
+    slope, cover = _face(np.stack([low_left - left[:, None], right[:, None] - low_right]), v)
+    yaw_left, yaw_right = np.arctan(slope) * [[1], [-1]]
+    turn, wedge = -(yaw_left + yaw_right) / 2, np.abs(yaw_left - yaw_right) / 2
+    rise = upper - tip - 0.001
+    tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
+    tilt_right = np.arctan2(np.maximum(right - high_right, 0), rise)
+    tilt = np.where(touched, (tilt_left + tilt_right) / 2, np.pi / 2)
+
+    # What is held, and how far from its centre of mass.
+    xy = candidates.xy + shift[:, None] * along
+    inner = np.minimum(0.003, width / 3)
+    ends = [
+        heights.label[heights.index(candidates.xy + (end[:, None] * along))]
+        for end in (left + inner, right - inner)
+    ]
+    label = np.maximum(*ends)
+    centre = heights.centres[label]
+    arm_across = np.abs(((centre[:, :2] - xy) * across).sum(axis=1))
+    arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
+    arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
+
+    # Clearance of fingers and palm on a straight descent, where all else is in order.
+    left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
+    near, opening, blind = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
+    opening[left_over] = _widest_opening(
+        heights.highest_around("height", 1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
+        near[left_over], tip[left_over], width[left_over], gripper, settings,
+    )  # fmt: skip
+    left_over = left_over[opening[left_over] > 0]
+    gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
+    left_over = left_over[gap >= settings.clearance - tip[left_over]]
+    under = gripper.finger_underside(near[left_over] - opening[left_over, None] / 2)
+    over = heights.ceiling.take(where[left_over]) - under[:, None]
+    blind[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
+
+    score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
+    score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
+    score *= 0.4 + 0.6 * cover.min(axis=0)
+    score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
+    score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
+    score *= np.exp(-4 * blind)
+    score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
+    score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
+    feasible = np.zeros(N, bool)
+    feasible[left_over] = True
+    turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
+    return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
+
+
+def _cells(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
+    """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
+    xy, along, across = (part.T[..., None, None] for part in (xy, along, across))
+    row, col = heights.index(np.moveaxis(xy + u * along + v[:, None] * across, 0, -1))
+    return row * heights.height.shape[1] + col
+
+
+def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
+    """(...) where lines (..., U) first meet matter, from the left and from the right.
+
+    Lines that meet nothing hold +inf (left) and -inf (right).
+    """
+    hit = matter.any(axis=-1)
+    left = u[matter.argmax(axis=-1)] - cell / 2
+    right = u[len(u) - 1 - matter[..., ::-1].argmax(axis=-1)] + cell / 2
+    return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
+
+
+def _widest_opening(
+    obstacles: np.ndarray,
+    near: np.ndarray,
+    tip: np.ndarray,
+    width: np.ndarray,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> np.ndarray:
+    """(N,) widest opening of the fingers that is free on a straight descent; 0 if none is.
+
+    obstacles, near: (N, U) heights along the closing line and their distances from the middle.
+    """
+    # Between contact and finger only the closing pads pass, over anything below the tips.
+    sill = np.where(
+        near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
+    )
+    opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
+    for room in reversed(settings.rooms):
+        half = np.minimum(width[open_yet] / 2 + room, gripper.max_opening / 2)
+        outward = near[open_yet] - half[:, None]
+        below_finger = gripper.finger_underside(np.maximum(outward, 0))
+        under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
+        fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
+        fits &= half >= width[open_yet] / 2 + settings.rooms[0] - 1e-9
+        opening[open_yet[fits]] = 2 * half[fits]
+        open_yet = open_yet[~fits]
+    return opening
+
+
+def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.0025):
+    """Slope (...) of the gap (..., V) between pad and face across the pad, and share in touch."""
+    weight = (gap < near).astype(float)
+    gap = np.where(gap < near, gap, 0.0)
+    total = np.maximum(weight.sum(axis=-1), 1)
+    mean_v = (weight * v).sum(axis=-1) / total
+    spread = weight * (v - mean_v[..., None])
+    variance = (spread * v).sum(axis=-1)
+    slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
+    return slope, (weight * (gap < touch)).mean(axis=-1)
+
+
+def _palm_gap(
+    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
+) -> np.ndarray:
+    """(N,) smallest height of the palm's underside, fingertips at 0, over whatever may be there."""
+    # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
+    # more cell for rounding to the grid.
+    radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
+    scene = heights.highest_around("ceiling", radius, cv2.MORPH_ELLIPSE)
+    ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
+    u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
+    nearby = scene.take(_cells(xy, along, across, u, v, heights)).max(axis=2)
+    return (gripper.palm_underside(v) - nearby).min(axis=1)

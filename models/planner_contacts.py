@@ -1,0 +1,141 @@
+"""Judging grasps by the true solids: exact line-solid contacts of the pads, and what lies on top.
+
+Needs the scene's true geometry, so only privileged planners and labels may use it. This module
+knows no image, and not how the candidates were found.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.planner_antipodal import Candidates
+from utils.geometry import GripperGeometry, SceneGeometry, Workspace, intersect_lines
+from utils.height_map import HeightMap, height_map_from_scene
+
+# Pose errors under which a grasp should hold: (along, across) in metres, then angle in radians.
+PERTURBATIONS = np.array(
+    [(0, 0, 0)]
+    + [(s * 0.005, 0, 0) for s in (-1, 1)]
+    + [(0, s * 0.005, 0) for s in (-1, 1)]
+    + [(0, 0, s * np.deg2rad(5)) for s in (-1, 1)]
+)
+
+
+def exact_quality(
+    candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
+) -> np.ndarray:
+    """(N,) in [0, 1]: contacts of the flat pads with the true solids, nominal and perturbed.
+
+    A pose counts 0 unless both pads first meet the same object with normals inside the friction
+    cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
+    """
+    N, P = len(candidates), len(PERTURBATIONS)
+    along, across = candidates.axes()
+    along, across = (
+        np.broadcast_to(np.pad(axis, ((0, 0), (0, 1)))[:, None], (N, P, 3))
+        for axis in (along, across)
+    )
+    cos, sin = np.cos(PERTURBATIONS[:, 2, None]), np.sin(PERTURBATIONS[:, 2, None])
+    centre = np.column_stack([candidates.xy, candidates.tip])[:, None]
+    centre = centre + PERTURBATIONS[:, :1] * along + PERTURBATIONS[:, 1:2] * across
+    along, across = cos * along + sin * across, cos * across - sin * along
+    value = _pad_contacts(
+        centre.reshape(-1, 3), along.reshape(-1, 3), across.reshape(-1, 3),
+        np.repeat(candidates.opening / 2, P), scene, gripper,
+    ).reshape(N, P)  # fmt: skip
+    return 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
+
+
+def _pad_contacts(
+    centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
+) -> np.ndarray:
+    """(N,) quality in [0, 1] of pads that close along lines over their faces.
+
+    centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
+    """
+    offset, height = (
+        axis.ravel()
+        for axis in np.meshgrid(
+            np.linspace(-1, 1, 5) * 0.92 * gripper.pad_half_width,
+            np.linspace(0.08, 0.95, 4) * gripper.pad_height,
+        )
+    )
+    N, L = len(centre), len(offset)
+    origins = (
+        centre[:, None]
+        + offset[:, None] * across[:, None]
+        + height[:, None] * np.array((0, 0, 1.0))
+    )
+    flat, directions = origins.reshape(-1, 3), np.repeat(along, L, axis=0)
+    limit = np.repeat(half, L)
+    # Travel of each pad from its open position to the first matter on each line, left then right.
+    travel = np.full((2, N * L), np.inf)
+    owner = np.full((2, N * L), -1)
+    facing = np.zeros((2, N * L))
+    for number, thing in enumerate(scene.objects):
+        for solid in thing.solids:
+            middle = (solid.vertices.max(axis=0) + solid.vertices.min(axis=0)) / 2
+            radius = np.linalg.norm(solid.vertices - middle, axis=1).max()
+            offset_ = middle - flat
+            t = (offset_ * directions).sum(axis=1)
+            close = np.linalg.norm(offset_ - t[:, None] * directions, axis=1) < radius
+            lines = np.nonzero(close & (np.abs(t) < limit + radius))[0]
+            if len(lines) == 0:
+                continue
+            hits = intersect_lines(solid, flat[lines], directions[lines])
+            # A solid that lies wholly behind a pad, outside, is not between the fingers.
+            between = hits.hit & (hits.leave > -limit[lines]) & (hits.enter < limit[lines])
+            for side, (distance, normal, sign) in enumerate(
+                ((hits.enter, hits.enter_normal, -1), (-hits.leave, hits.leave_normal, 1))
+            ):
+                distance = distance + limit[lines]
+                better = between & (distance < travel[side, lines])
+                chosen = lines[better]
+                travel[side, chosen] = distance[better]
+                owner[side, chosen] = number
+                facing[side, chosen] = sign * (normal[better] * directions[chosen]).sum(axis=1)
+    travel, owner, facing = (x.reshape(2, N, L) for x in (travel, owner, facing))
+
+    first = travel.min(axis=2, keepdims=True)
+    touch = travel < first + 0.0015
+    share = touch.mean(axis=2)
+    count = np.maximum(touch.sum(axis=2), 1)
+    angle = np.arccos(np.clip((facing * touch).sum(axis=2) / count, -1, 1))
+    held = np.take_along_axis(owner, travel.argmin(axis=2)[..., None], axis=2)
+    alone = np.where(touch, owner == held, True).all(axis=2)
+    point = (
+        np.stack([(touch * offset).sum(axis=2), (touch * height).sum(axis=2)], axis=-1)
+        / count[..., None]
+    )
+    good = (held[0] == held[1])[:, 0] & (held[0, :, 0] >= 0) & alone.all(axis=0)
+    good &= (first[..., 0] > 0.0005).all(axis=0)  # a pad that starts inside matter has hit it
+    held = held[0, :, 0]
+    friction = np.array([thing.friction for thing in scene.objects])[held]
+    cone = 0.9 * np.arctan(np.minimum(friction, 1.0))  # the fingers' own friction is 1
+    worst = angle.max(axis=0)
+    to_mass = np.array([thing.centre_of_mass for thing in scene.objects])[held] - centre
+    arm = np.abs((to_mass * across).sum(axis=1) - point[..., 0].mean(axis=0))
+    above = np.abs(to_mass[:, 2] - point[..., 1].mean(axis=0))
+    value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(
+        -((arm / 0.02) ** 2) - (above / 0.06) ** 2
+    )
+    return value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
+
+
+def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
+    """(M,) share of each object's plan view that another object covers."""
+    seen = np.bincount(heights.label[heights.label >= 0], minlength=len(scene.objects))
+    whole = np.empty(len(scene.objects))
+    workspace, margin = _square_of(heights)
+    for number, thing in enumerate(scene.objects):
+        alone = SceneGeometry((thing,), scene.table_height)
+        whole[number] = (
+            height_map_from_scene(alone, workspace, 2 * heights.cell, margin).label >= 0
+        ).sum()
+    return np.clip(1 - seen / np.maximum(4 * whole, 1), 0, 1)
+
+
+def _square_of(heights: HeightMap) -> tuple[Workspace, float]:
+    """The workspace (and zero margin) that a square height map covers."""
+    side = heights.cell * (heights.height.shape[0] - 1)
+    return Workspace(tuple(heights.origin + side / 2), side, heights.table_height), 0.0

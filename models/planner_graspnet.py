@@ -1,0 +1,185 @@
+"""Which object every part of a height map belongs to, by votes for the objects' centres of mass.
+
+A network's centre head says at each pixel what leads to the centre of mass of the object seen
+there. All parts of one object point at one place, whatever touches it, so the places where many
+votes meet are the objects (a Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018;
+Cheng et al., Panoptic-DeepLab, CVPR 2020). Parts whose votes lead nowhere stay what the height map
+takes them for.
+
+GraspNet as a planner: the depth image tells which grasps fit, the network what they are worth.
+
+A network names places well to a few millimetres; fingers need better than that beside an object.
+So the antipodal search of the other planners proposes exact poses, and what the network says of
+their places and angles ranks them: before they are measured on the height map, so that few have to
+be, and after. Its votes for centres of mass tell the objects apart, and the colours what a hole in
+the depth image is. Nothing but the RGB-D image is seen.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from models.graspnet_inference import scaled_maps
+from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
+from models.planner_antipodal import Candidates, SearchSettings, search
+from utils.depth import table_in_holes
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import HeightMap, height_map_from_frame, local_maxima
+from utils.images import PixelScaling
+from utils.transforms import Grasp, RGBDFrame, deproject, project
+
+
+@dataclass(frozen=True)
+class VoteSettings:
+    """In pixels of the network's image, unless said."""
+
+    blur: float = 2.0  # standard deviation of the Gaussian over the votes
+    apart: int = 5  # two objects' centres are farther apart in u or v
+    least: float = 8e-5  # m2 of surface whose votes meet within the blur make an object
+    reach: float = 12.0  # a vote that misses every centre by more belongs to none
+    margin: int = 40  # how far outside the image a centre may lie
+
+
+def labelled_by_centres(
+    heights: HeightMap,
+    frame: RGBDFrame,
+    scaling: PixelScaling,
+    offset: np.ndarray,
+    settings: VoteSettings = VoteSettings(),
+) -> HeightMap:
+    """The height map with a network's objects: their labels and their centres of mass.
+
+    offset: (2, h, w) pixels to the centre of mass, at the network's scale; scaling leads there from
+    the frame's pixels. What has a label keeps one. The network says where in the image a centre
+    is; its height is that of the columns under the object's visible surface, an estimate that is
+    too low where the object rests on others.
+    """
+    row, column = np.nonzero(heights.label >= 0)
+    height = heights.height[row, column]
+    surface = np.column_stack(
+        [heights.origin + heights.cell * np.column_stack([column, row]), height]
+    )
+    place = scaling.pixels(project(surface, frame.K, frame.T_WC)[0])
+    limits = offset.shape[2] - 1, offset.shape[1] - 1
+    u, v = np.clip(np.rint(place).astype(int), 0, limits).T
+    votes = place + offset[:, v, u].T
+    # A hidden cell's height is borrowed, and its pixel shows something else: it has no vote.
+    seen = heights.ceiling[row, column] <= height
+    centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
+    if len(centres) == 0:
+        return heights
+    miss = np.linalg.norm(votes[:, None] - centres, axis=2)
+    count, owner = len(centres), miss.argmin(axis=1)
+    owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
+    label = np.full(heights.label.shape, -1)
+    label[row, column] = owner
+
+    rise = height - heights.table_height
+    total = np.bincount(owner, rise, count)[:count]
+    mean = np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
+    ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
+    eye = frame.T_WC[:3, 3]
+    share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
+    found = eye + share[:, None] * (ahead - eye)
+    return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
+
+
+def vote_centres(
+    votes: np.ndarray,
+    shape: tuple[int, int],
+    cell: float,
+    settings: VoteSettings = VoteSettings(),
+) -> np.ndarray:
+    """(M, 2) places (u, v) in or near an image of `shape` where many of the votes (N, 2) meet, most
+    first; each vote stands for cell x cell metres of surface."""
+    rows, columns = np.array(shape) + 2 * settings.margin
+    place = np.rint(votes + settings.margin).astype(int)
+    u, v = place[((place >= 0) & (place < (columns, rows))).all(axis=1)].T
+    count = np.bincount(v * columns + u, minlength=rows * columns).reshape(rows, columns)
+    density = cv2.GaussianBlur(count.astype(np.float32), (0, 0), settings.blur)
+    least = settings.least / cell**2 / (2 * np.pi * settings.blur**2)  # all at one point, blurred
+    peaks = local_maxima(density, settings.apart, least)
+    found = np.column_stack(peaks[::-1]) - settings.margin
+    near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
+    return np.array([votes[around].mean(axis=0) for around in near]).reshape(-1, 2)
+
+
+# Half the heuristic's angles: turning onto the faces and the network make up for it. What belongs
+# together is known better than by height alone.
+SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0.1)
+BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
+LEAST = 0.02  # quality that anything has which fits
+
+
+@functools.cache
+def _loaded(path: Path, changed: float) -> SavedGraspNet:
+    saved = load_graspnet(path)
+    return saved._replace(model=for_inference(saved.model))
+
+
+class GraspNetPlanner:
+    """The network of a checkpoint, unless one is given. UserError if it cannot be loaded."""
+
+    needs_truth = False
+
+    def __init__(
+        self,
+        gripper: GripperGeometry,
+        workspace: Workspace,
+        seed: int = 0,
+        checkpoint: Path = SHIPPED,
+        network: SavedGraspNet | None = None,
+        settings: SearchSettings = SETTINGS,
+    ):
+        changed = checkpoint.stat().st_mtime if checkpoint.exists() else 0.0
+        self.network = network or _loaded(checkpoint, changed)
+        self.gripper, self.workspace, self.settings = gripper, workspace, settings
+
+    def reset(self, seed: int) -> None:
+        """Nothing to do: the planner is deterministic."""
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        model, metres_per_pixel, *_ = self.network
+        frame = table_in_holes(frame, self.workspace.table_height)
+        knows_centres = model.centre_head is not None
+        scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
+        heights = height_map_from_frame(frame, self.workspace)
+
+        def value(candidates: Candidates) -> np.ndarray:
+            xy, (along, _) = candidates.xy, candidates.axes()
+            surface = np.column_stack([xy, heights.height[heights.index(xy)]])
+            ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
+            pixels, _ = project(ends, frame.K, frame.T_WC)
+            return np.maximum(quality_between(maps, *scaling.pixels(pixels)), LEAST)
+
+        if knows_centres:
+            heights = labelled_by_centres(heights, frame, scaling, maps[3][0].numpy())
+        found = search(heights, self.gripper, self.workspace, self.settings, value)
+        found = found.distinct(
+            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
+        )
+        return found.grasps(self.gripper)
+
+
+def quality_between(
+    maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor], start: np.ndarray, end: np.ndarray
+) -> np.ndarray:
+    """(N,) what a network's maps say of closing along the lines from `start` to `end` (N, 2), in
+    the maps' pixels: the quality in their middle times the share of the best angle's that theirs
+    has. The cube root turns the bins' probabilities into qualities (`targets_from_labels`)."""
+    quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
+    u, v = np.rint((start + end) / 2).astype(int).T
+    u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
+    share = np.cbrt(maps[1][0, :, v, u].softmax(dim=0).numpy())
+    bins, each = len(share), np.arange(len(u))
+    du, dv = (end - start).T
+    place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
+    below, part = np.floor(place).astype(int), place - np.floor(place)
+    at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
+    return quality[v, u] * at / share.max(axis=0)

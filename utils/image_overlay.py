@@ -1,0 +1,208 @@
+"""Grasps drawn on images. Knows the pinhole camera, no simulator and no planner.
+
+One picture of a prediction: the image with its grasps, and the maps of quality, angle, width.
+
+Knows the pinhole camera, no network and no files.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from utils.images import PixelScaling
+from utils.transforms import ImageGrasp
+
+SUCCESS_COLOR = (52, 211, 123)  # RGB
+FAILURE_COLOR = (248, 92, 92)
+PLATE_LENGTH = 0.02  # m, width of a Panda fingertip across the closing line
+OUTLINE = (20, 20, 20)
+TITLE_HEIGHT = 20  # pixels, of a caption
+_SHIFT = 4  # OpenCV's fixed-point bits: ends of lines at 1/16 pixel
+
+
+def draw_grasp(
+    image: np.ndarray,
+    grasp: ImageGrasp,
+    K: np.ndarray,
+    color: tuple[int, int, int] | None = None,
+    success: bool | None = None,
+) -> np.ndarray:
+    """A copy of the (H, W, 3) uint8 RGB image with the grasp on it.
+
+    Two finger plates stand at +-width/2 along the closing line, which is drawn thinly between
+    them; lengths in pixels are metres * fx / depth. Without `color`, green is a success and red a
+    failure, white neither. Raises ValueError on another image type or a depth that is not > 0.
+    """
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"draw_grasp: need (H, W, 3) uint8, got {image.shape} {image.dtype}")
+    if not grasp.depth > 0:
+        raise ValueError(f"draw_grasp: the grasp's depth must be > 0 m, got {grasp.depth}")
+    if color is None:
+        color = {True: SUCCESS_COLOR, False: FAILURE_COLOR, None: (255, 255, 255)}[success]
+    closing = np.array([np.cos(grasp.angle), np.sin(grasp.angle)])
+    across = np.array([-closing[1], closing[0]])
+    half_width = closing * grasp.width / 2 * K[0, 0] / grasp.depth
+    half_plate = across * PLATE_LENGTH / 2 * K[0, 0] / grasp.depth
+    left, right = grasp.pixel - half_width, grasp.pixel + half_width
+    thin = max(1, round(min(image.shape[:2]) / 220))
+    lines = [
+        (left, right, thin),
+        (left - half_plate, left + half_plate, 2 * thin + 1),
+        (right - half_plate, right + half_plate, 2 * thin + 1),
+    ]
+    drawn = np.ascontiguousarray(image).copy()
+    for extra, shade in ((2, OUTLINE), (0, color)):  # a dark rim shows on any background
+        for start, end, thickness in lines:
+            _line(drawn, start, end, shade, thickness + extra)
+    return drawn
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 6
+) -> np.ndarray:
+    """Images (H, W, 3) uint8 of one size in rows of `columns`, each with its caption above."""
+    height, width = images[0].shape[:2]
+    tiles = []
+    for image, caption in zip(images, captions):
+        title = np.full((TITLE_HEIGHT, width, 3), 255, np.uint8)
+        scale = min(0.42, 0.42 * width / max(_text_width(caption), 1))
+        cv2.putText(
+            title, caption, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, scale, OUTLINE, 1, cv2.LINE_AA
+        )
+        tiles.append(np.vstack([title, image]))
+    columns = min(columns, len(tiles))
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
+
+
+def _text_width(text: str) -> int:
+    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]
+
+
+def _line(image: np.ndarray, start, end, color, thickness: int) -> None:
+    ends = [tuple(int(round(x * 2**_SHIFT)) for x in point) for point in (start, end)]
+    cv2.line(image, *ends, color, thickness, cv2.LINE_AA, _SHIFT)
+
+
+NUMBERED = 10  # grasps that carry their rank; more would hide each other
+PICTURE_SIDE = 1000  # pixels, the longer side of the image in the panel
+NOTHING, CERTAIN = 0.1, 0.5  # quality at which angle and width fade out, and are in full colour
+INK, PAPER = "#1d2430", "white"
+MARK = "Software", "robot-grasping predict.py"  # PNG text that tells our pictures from others
+
+
+def prediction_panel(
+    rgb: np.ndarray,
+    K: np.ndarray,
+    grasps: Sequence[ImageGrasp],
+    quality: np.ndarray,
+    angle: np.ndarray,
+    width: np.ndarray,
+    max_width: float,
+) -> bytes:
+    """A PNG file's bytes.
+
+    rgb: (H, W, 3) uint8. K: (3, 3). grasps: best first, in pixels of rgb; the first ten are
+    numbered in that order, the best is green. quality, angle, width: (H, W); image angles in
+    radians, widths in metres. max_width: metres at the top of the width's scale.
+    """
+    scaling = _to_picture(K, rgb.shape[:2])
+    picture = _with_grasps(scaling, rgb, K, grasps)
+    rows, columns = picture.shape[:2]
+    height = 6.6  # inches; the maps take a third of it each
+    image_width = height * columns / rows
+    map_width = 0.3 * image_width + 0.7  # with room for its scale
+    figure = Figure(figsize=(image_width + map_width, height + 0.3), layout="constrained")
+    figure.set_facecolor(PAPER)
+    grid = figure.add_gridspec(3, 2, width_ratios=(image_width, map_width))
+    image = figure.add_subplot(grid[:, 0])
+    image.imshow(picture, interpolation="antialiased")
+    title = f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}, best first"
+    _finish(image, title if grasps else "no grasp found")
+    for rank, grasp in reversed(list(enumerate(grasps[:NUMBERED], start=1))):  # the best on top
+        _number(image, rank, scaling.pixels(grasp.pixel))
+
+    known = scaling.image(quality.astype(np.float32))
+    shown = np.clip((known - NOTHING) / (CERTAIN - NOTHING), 0, 1)
+    bare = np.full((*shown.shape, 3), 0.93)
+    for row, (name, values, high, colours, alpha) in enumerate((
+        ("quality", quality, 1.0, "viridis", None),
+        ("angle on the image, degrees", np.rad2deg(angle), 180.0, "hsv", shown),
+        ("width, mm", 1000 * width, 1000 * max_width, "plasma", shown),
+    )):  # fmt: skip
+        axes = figure.add_subplot(grid[row, 1])
+        axes.imshow(bare)
+        drawn = axes.imshow(_nearest(scaling, values), vmin=0, vmax=high, cmap=colours, alpha=alpha)
+        scale = matplotlib.cm.ScalarMappable(drawn.norm, drawn.cmap)  # without the fading
+        bar = figure.colorbar(scale, ax=axes, fraction=0.05, pad=0.03)
+        if high == 180.0:
+            bar.set_ticks([0, 45, 90, 135, 180])
+        bar.ax.tick_params(labelsize=8, colors=INK)
+        bar.outline.set_visible(False)
+        _finish(axes, name)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150, metadata=dict([MARK]))
+    return file.getvalue()
+
+
+def is_prediction_panel(path) -> bool:
+    """Whether the file is a picture that `prediction_panel` made."""
+    try:
+        with Image.open(path) as image:
+            return image.info.get(MARK[0]) == MARK[1]
+    except (OSError, SyntaxError, ValueError):
+        return False
+
+
+def _to_picture(K: np.ndarray, shape: tuple[int, int]) -> PixelScaling:
+    """Square pixels, and the longer side as the panel wants it."""
+    focal = K[0, 0]
+    factor = PICTURE_SIDE / max(shape[1], shape[0] * focal / K[1, 1])
+    return PixelScaling.to_focal_length(K, factor * focal)
+
+
+def _with_grasps(
+    scaling: PixelScaling, rgb: np.ndarray, K: np.ndarray, grasps: Sequence[ImageGrasp]
+) -> np.ndarray:
+    picture = scaling.image(rgb)
+    for rank, grasp in reversed(list(enumerate(grasps))):
+        angle = np.arctan2(np.sin(grasp.angle) * scaling.v, np.cos(grasp.angle) * scaling.u)
+        moved = ImageGrasp(
+            scaling.pixels(grasp.pixel), angle, grasp.depth, grasp.width, grasp.quality
+        )
+        color = SUCCESS_COLOR if rank == 0 else None
+        picture = draw_grasp(picture, moved, scaling.intrinsics(K), color)
+    return picture
+
+
+def _nearest(scaling: PixelScaling, values: np.ndarray) -> np.ndarray:
+    """The scaled map without interpolation, which would invent angles across the seam."""
+    rows, columns = scaling.size(values.shape)
+    v = np.clip(np.rint((np.arange(rows) + 0.5) / scaling.v - 0.5), 0, values.shape[0] - 1)
+    u = np.clip(np.rint((np.arange(columns) + 0.5) / scaling.u - 0.5), 0, values.shape[1] - 1)
+    return values[v.astype(int)[:, None], u.astype(int)]
+
+
+def _number(axes: Axes, rank: int, pixel: np.ndarray) -> None:
+    text = axes.annotate(
+        str(rank), pixel, xytext=(5, 5), textcoords="offset points",
+        color="white", fontsize=9, fontweight="bold", annotation_clip=True,
+    )  # fmt: skip
+    text.set_path_effects([patheffects.withStroke(linewidth=2.5, foreground=INK)])
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10, color=INK, loc="left")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)

@@ -1,0 +1,303 @@
+"""Images resampled to another pixel size, and pixels, angles and maps taken back exactly.
+
+A `PixelScaling` is one factor for each image axis. Integer coordinates lie at pixel centres, so
+pixel u becomes (u + 0.5) * factor - 0.5. This module knows neither networks nor grasps.
+
+A user's own RGB-D image from files: colour, depth, intrinsics, camera pose.
+
+Whatever is missing or cannot be meant is a `UserError` that names the file or the option. This
+module knows no network and no simulator.
+
+What a camera straight above the table would see of an RGB-D image that was taken from the side.
+
+A network that has learned from above knows no other view. Every known pixel goes to where its point
+lies; what the image does not show is bare table, as in a height map. This module knows no network.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from utils.depth import nearest_values
+from utils.errors import UserError
+from utils.geometry import Workspace
+from utils.transforms import RGBDFrame, deproject, known_depth, look_at, project
+
+
+@dataclass(frozen=True)
+class PixelScaling:
+    """u, v: scaled pixels per original pixel along each axis, > 0."""
+
+    u: float
+    v: float
+
+    @staticmethod
+    def to_focal_length(K: np.ndarray, focal: float) -> PixelScaling:
+        """Makes the camera's two focal lengths equal to `focal` pixels, and so its pixels square.
+
+        With square pixels already, this is one factor for both axes.
+        """
+        return PixelScaling(focal / K[0, 0], focal / K[1, 1])
+
+    def intrinsics(self, K: np.ndarray) -> np.ndarray:
+        """The (3, 3) pinhole matrix of the scaled image."""
+        centre = self.pixels(K[:2, 2])
+        return np.array(
+            [[K[0, 0] * self.u, 0.0, centre[0]], [0.0, K[1, 1] * self.v, centre[1]], [0, 0, 1]]
+        )
+
+    def size(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """(H, W) of the scaled image: the pixels that the original covers whole."""
+        # Up to rounding: 0.7 * 320 must not lose a row to floating point.
+        return int(shape[0] * self.v + 1e-6), int(shape[1] * self.u + 1e-6)
+
+    def pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Scaled places of original pixels (..., 2) as (u, v)."""
+        return (np.asarray(pixels, float) + 0.5) * (self.u, self.v) - 0.5
+
+    def original_pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Original places of scaled pixels (..., 2). Inverse of `pixels`."""
+        return (np.asarray(pixels, float) + 0.5) / (self.u, self.v) - 0.5
+
+    def original_angles(self, angles: np.ndarray) -> np.ndarray:
+        """Original directions, in [0, pi), of lines at `angles` (...) in the scaled image."""
+        return np.mod(np.arctan2(np.sin(angles) / self.v, np.cos(angles) / self.u), np.pi)
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        """The scaled image of (H, W) or (H, W, C), float32 or uint8.
+
+        Area averages where it shrinks, so that nothing aliases; linear where it grows.
+        """
+        rows, columns = self.size(image.shape[:2])
+        for along_u, along_v in ((self.u, 1.0), (1.0, self.v)):
+            method = cv2.INTER_AREA if min(along_u, along_v) < 1 else cv2.INTER_LINEAR
+            # Factors, not a size: a size would round them.
+            image = cv2.resize(image, None, fx=along_u, fy=along_v, interpolation=method)
+        return np.ascontiguousarray(image[:rows, :columns])
+
+    def original_map(self, values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+        """A scaled map (h, w) float32, linearly interpolated at the original's (H, W) pixels."""
+        # The matrix takes an original pixel to its scaled place, as WARP_INVERSE_MAP wants it.
+        matrix = np.array(
+            [[self.u, 0.0, (self.u - 1) / 2], [0.0, self.v, (self.v - 1) / 2]], dtype=float
+        )
+        return cv2.warpAffine(
+            values,
+            matrix,
+            (shape[1], shape[0]),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+
+
+MILLIMETRES = 0.001  # what whole numbers in a depth file are, unless the user says otherwise
+SATURATED = 65535  # the other usual value of an unknown pixel in 16 bits, beside 0
+MAX_PIXEL_ASPECT = 1.5  # fx / fy: real sensors stay well below; swapped numbers do not
+RIGID_TOLERANCE = 1e-3  # of a rotation's orthonormality: poses are often printed with 4 digits
+
+
+def open_image(path: Path) -> Image.Image:
+    """The decoded image; UserError if it is missing, unreadable or cut short."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image.copy()
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    # Pillow raises any of these for damaged files.
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        raise UserError(f"{path}: not a readable image, or cut short ({error})") from error
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 of a PNG or JPEG; an alpha channel is dropped, grey images are refused."""
+    image = open_image(path)
+    if image.mode not in ("RGB", "RGBA", "P"):
+        raise UserError(
+            f"{path}: an image with channels {''.join(image.getbands())!r}, "
+            "expected colour: red, green, blue"
+        )
+    return np.array(image.convert("RGB"))
+
+
+def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
+    """(H, W) float32 metres along the optical axis of a PNG, TIFF or NPY; 0 where unknown.
+
+    scale: metres that 1 in the file stands for; None: whole numbers are millimetres, fractional
+    ones metres. Zero, negative, not finite, and 65535 in 16 bits are unknown.
+    """
+    if scale is not None and not 0 < scale < np.inf:
+        raise UserError(f"--depth-scale: got {scale:g}, expected a positive number such as 0.001")
+    values = _load_array(path) if path.suffix.lower() == ".npy" else np.asarray(open_image(path))
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2:
+        raise UserError(
+            f"{path}: an array of shape {values.shape}, expected one channel of depth, (H, W)"
+        )
+    if values.dtype.kind not in "uif" or values.dtype.itemsize == 1:
+        raise UserError(
+            f"{path}: depth as {values.dtype}, expected 16-bit whole numbers or floats; "
+            "8 bits are a picture of depth, not depth"
+        )
+    if scale is None:
+        scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
+    known = known_depth(values)
+    if values.dtype == np.uint16:
+        known &= values != SATURATED
+    return np.where(known, values * np.float64(scale), 0).astype(np.float32)
+
+
+def intrinsics_matrix(numbers: Sequence[float], width: int, height: int) -> np.ndarray:
+    """The (3, 3) K of [fx, fy, cx, cy] in pixels of an image of that size, once they are checked.
+
+    Integer coordinates lie at pixel centres, as in OpenCV and ROS.
+    """
+    if len(numbers) != 4:
+        raise UserError(f"--intrinsics: got {len(numbers)} numbers, expected 4: fx fy cx cy")
+    if not np.isfinite(numbers).all():
+        raise UserError(f"--intrinsics: {_listed(numbers)}: expected finite numbers")
+    fx, fy, cx, cy = map(float, numbers)
+    if fx <= 0 or fy <= 0:
+        raise UserError(f"--intrinsics: focal lengths {fx:g} and {fy:g}, expected positive pixels")
+    if max(fx / fy, fy / fx) > MAX_PIXEL_ASPECT:
+        raise UserError(
+            f"--intrinsics: focal lengths {fx:g} and {fy:g} differ by more than a factor of "
+            f"{MAX_PIXEL_ASPECT:g}; the order is fx fy cx cy"
+        )
+    if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
+        raise UserError(
+            f"--intrinsics: the principal point ({cx:g}, {cy:g}) lies far outside the image of "
+            f"{width}x{height} pixels; are these the intrinsics of another resolution?"
+        )
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def read_pose(path: Path) -> np.ndarray:
+    """(4, 4) T_WC, rigid, of an .npy, .json, .yaml or text file.
+
+    The file holds 4x4 or 16 numbers row by row; JSON and YAML may name them T_WC. Rotations that
+    are orthonormal up to rounding are made so exactly.
+    """
+    T = _pose_numbers(path)
+    if T.size == 16 and T.ndim in (1, 2):
+        T = T.reshape(4, 4)
+    if T.shape != (4, 4):
+        raise UserError(f"{path}: numbers of shape {T.shape}, expected a 4x4 camera pose T_WC")
+    if not np.isfinite(T).all():
+        raise UserError(f"{path}: the camera pose holds a number that is not finite")
+    if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise UserError(
+            f"{path}: the last row of the camera pose is {_listed(T[3])}, expected 0 0 0 1; "
+            "is it transposed?"
+        )
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+        raise UserError(
+            f"{path}: the camera pose is not rigid: its 3x3 part must be a rotation "
+            f"(determinant {np.linalg.det(R):.3g}, expected 1)"
+        )
+    rigid = np.eye(4)
+    rigid[:3, :3] = Rotation.from_matrix(R).as_matrix()
+    rigid[:3, 3] = T[:3, 3]
+    return rigid
+
+
+def _load_array(path: Path) -> np.ndarray:
+    try:
+        values = np.load(path, allow_pickle=False)  # a pickled object could run code
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path}: not a readable array, or cut short ({error})") from error
+    if not isinstance(values, np.ndarray):  # an .npz under a wrong name
+        raise UserError(f"{path}: holds several arrays, expected one as np.save writes it")
+    return values
+
+
+def _pose_numbers(path: Path) -> np.ndarray:
+    try:
+        suffix = path.suffix.lower()
+        if suffix == ".npy":
+            return np.asarray(_load_array(path), dtype=float)
+        text = path.read_text(encoding="utf-8")
+        if suffix in (".json", ".yaml", ".yml"):
+            content: Any = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
+            if isinstance(content, dict):
+                if "T_WC" not in content:
+                    raise UserError(f"{path}: has no entry T_WC")
+                content = content["T_WC"]
+            return np.asarray(content, dtype=float)
+        rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
+        return np.asarray(rows, dtype=float)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except UserError:
+        raise
+    # A ValueError is also what JSON and UTF-8 raise.
+    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: cannot be read as a 4x4 camera pose ({error})") from error
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
+
+
+DISTANCE = 0.8  # m over the table, as the cell's overhead camera
+ON_TABLE = 0.01  # m over the table, up to which a pixel lends its colour to hidden table
+PARTS = (-0.25, 0.25)  # each pixel stands for points of its square, two by two
+
+
+def overhead_view(
+    frame: RGBDFrame, workspace: Workspace, metres_per_pixel: float, margin: float = 0.0
+) -> RGBDFrame:
+    """The workspace widened by `margin` (metres) as seen from DISTANCE above its middle, in pixels
+    that span `metres_per_pixel` of the table, whose +v runs along the world's -y.
+
+    The highest of the points that fall into a pixel is seen. Where there is none the depth is the
+    table's, and the colour that of the nearest table.
+    """
+    size = 8 * round((workspace.size + 2 * margin) / metres_per_pixel / 8)
+    focal, middle = DISTANCE / metres_per_pixel, (size - 1) / 2
+    K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+    foot = np.array([*workspace.centre, workspace.table_height])
+    T_WC = look_at(foot + (0.0, 0.0, DISTANCE), foot, (0.0, 1.0, 0.0))
+
+    depth = np.full((size, size), DISTANCE, np.float32)
+    rgb = np.zeros((size, size, 3), np.uint8)
+    seen = np.zeros((size, size), bool)
+    points, colours = _points(frame)
+    pixels, far = project(points, K, T_WC)
+    u, v = np.rint(pixels).astype(int).T
+    inside = np.flatnonzero((u >= 0) & (u < size) & (v >= 0) & (v < size))
+    inside = inside[np.argsort(-far[inside], kind="stable")]  # the nearest is written last
+    at = v[inside], u[inside]
+    depth[at], seen[at] = far[inside], True
+    rgb[at] = colours[inside]
+
+    table = seen & (depth > DISTANCE - ON_TABLE)
+    if table.any():
+        rgb = np.where(seen[..., None], rgb, nearest_values(rgb, table))
+    return replace(frame, rgb=rgb, depth=depth, K=K, T_WC=T_WC, segmentation=None, truth=None)
+
+
+def _points(frame: RGBDFrame) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) points in W of all parts of the known pixels, and their colours (N, 3)."""
+    row, column = np.nonzero(known_depth(frame.depth))
+    depth, colour = frame.depth[row, column], frame.rgb[row, column]
+    parts = [
+        deproject(np.stack([column + du, row + dv], axis=-1), depth, frame.K, frame.T_WC)
+        for dv, du in itertools.product(PARTS, PARTS)
+    ]
+    return np.concatenate(parts), np.concatenate([colour] * len(parts))
