@@ -4,7 +4,7 @@
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
     python evaluate.py evaluate.object_sets=path/to/meshes objects.fit=0.06
     python evaluate.py --config configs/servo.yaml     # closed loops on what moves
-    python evaluate.py world=mujoco                    # in another simulator, closed loops too
+    python evaluate.py simulator=mujoco                    # in another simulator, closed loops too
     python evaluate.py --config configs/sim_to_real.yaml  # what is lost from world to world
 
 Prints a table and leaves results.json, results.csv, rounds.jsonl, report.html and failures.png in
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import ObjectSet, load_object_set, prepare
@@ -162,7 +162,7 @@ def announce(config: Config, run: Path) -> None:
         f"{', '.join(contestant(*pair) for pair in contestants(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, in {config.world}, on {device_of(config)}; results in {run}",
+        f"seed {config.seed}, in {config.simulator}, on {device_of(config)}; results in {run}",
         flush=True,
     )
 
@@ -174,7 +174,7 @@ def device_of(config: Config) -> str:
 # --- Every policy on every scene ------------------------------------------------------------
 
 _config: Config  # of this worker process, as the cell is
-_cell: BaseCell
+_cell: Cell
 
 
 def evaluate(config: Config, run: Path) -> Outcome:
@@ -260,7 +260,7 @@ def contests(config: Config) -> list[Contest]:
         plan = {"policies": list(dict.fromkeys(who.planner for who in rows))}
         plan |= {"scenarios": list(scenes.scenarios), "object_sets": list(scenes.objects)}
         here = with_settings(config, "evaluate", plan)
-        for world in config.transfer.worlds:
+        for world in config.transfer.columns:
             if world not in PHOTOGRAPHS:
                 found.append(Contest(world, scenes, rows, in_world(here, world)))
     return found
@@ -297,11 +297,11 @@ def check_contest(contest: Contest) -> None:
 
 def report_transfer(config: Config, resume: Path | None, results: Path | None) -> int:
     """Each policy on the same scenes in every world, and how well one foretells another."""
-    worlds, policies = config.transfer.worlds, config.transfer.policies
+    worlds, policies = config.transfer.columns, config.transfer.policies
     if any(controller != OPEN_LOOP for _, controller in contestants(config)):
         raise UserError(
             "transfer.policies: the report compares open loops; leave evaluate.controllers null "
-            "and grasp.controller open_loop"
+            "and closed_loop.controller open_loop"
         )
     to_play = contests(config)
     for contest in to_play:

@@ -9,7 +9,7 @@ rl.films=N, films of N episodes in runs/train_rl/<time>/; --weights FILE is the 
 RandomizedGrasping-v0 adds episodes/STEP/env*.jsonl: the worlds of all episodes of training, in a
 folder for the steps from one checkpoint to the next.
 Ctrl-C stops early; --resume RUN goes on from last.pt, bit for bit on the same device and number of
-processes. The first is written after the looks (rl.looks); until then Ctrl-C ends all.
+processes. The first is written after the looks (rl.pretraining_images); until then Ctrl-C ends all.
 
 No simulator can be stored in a file. So at every evaluation, which is when a checkpoint is written,
 all environments begin new episodes from seeds that follow from the run's seed and the number of
@@ -203,7 +203,7 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
     step = ppo.updates * per_update
     writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.leads else None
     try:
-        if config.rl.looks and not history:
+        if config.rl.pretraining_images and not history:
             learn_to_see(config, envs, ppo, watch, writer)
         bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
         with stop_on_interrupt() as interrupted, bar:
@@ -259,9 +259,9 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
 def learn_to_see(
     config: Config, envs: VectorEnvs, ppo: GraspPPO, watch: Stopwatch, writer: SummaryWriter | None
 ) -> None:
-    """Before anything is done, learn to estimate from rl.looks images of many scenes."""
+    """Before anything is done, learn to estimate from rl.pretraining_images images of many scenes."""
     us, settings = ppo.team, config.rl
-    chunks = -(-settings.looks // (settings.envs * LOOKS))
+    chunks = -(-settings.pretraining_images // (settings.envs * LOOKS))
     seeds: Sequence[int | None] = derived_seeds(envs.num_envs, config.seed, LOOKING, us.rank)
     ppo.generator.manual_seed(derived_seeds(1, config.seed, LOOKING, us.rank)[0])
     with envs.looking(), tqdm(
@@ -274,7 +274,7 @@ def learn_to_see(
             with watch(NETWORK):
                 ppo.network.observe(looks, us)
                 new = ppo.estimate_loss(looks)  # before it learns from them
-                ppo.learn_to_see(looks, settings.looks_lr * (1 - chunk / chunks))
+                ppo.learn_to_see(looks, settings.pretraining_lr * (1 - chunk / chunks))
             seeds = [None] * envs.num_envs
             bar.update(settings.envs * LOOKS)
             bar.set_postfix(loss=f"{new:.3g}")

@@ -26,7 +26,7 @@ from envs.cell_scenes import Scene, make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set, spawn
 from envs.pybullet_camera import Intrinsics, render
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from utils.config import Config, load_config, run_script, with_settings
 
 STEPS = 40  # of an environment, between two readings of the clock
@@ -102,7 +102,7 @@ def seconds_per_step(env: gymnasium.Env) -> float:
 def our_world(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
     """A physics client with our table, (robot and bin,) and the scene's objects."""
     if robot:
-        with Cell(config) as cell:
+        with PybulletCell(config) as cell:
             cell.build(scene)
             yield cell.client
         return
@@ -157,7 +157,7 @@ def both_worlds(
 
 def bench_frames(config: Config, scenes: Sequence[Scene], repeats: int) -> list[Metric]:
     """An RGB-D frame of the overhead camera against the stock meshes with PyBullet's defaults."""
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         T_WC = cell.camera_pose("overhead")
 
     def compare(stock: int, ours: int, side: int) -> float:

@@ -18,7 +18,7 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.board import Board
 from envs.board_servo import BoardCamera, CarriedBoard, servo_arm, servo_settings, view_of
 from envs.cell_scenes import Scene
-from envs.pybullet_cell import Cell, wrist_mount
+from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.pybullet_panda import ARM
 from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
 from utils.config import load_config
@@ -52,7 +52,7 @@ class Task:
     T_GO: (4, 4) the board in the camera at the goal. body: PyBullet's number of the board.
     """
 
-    cell: Cell
+    cell: PybulletCell
     mounting: str
     board: Board
     body: int
@@ -106,7 +106,7 @@ def pose(position, degrees, R: np.ndarray | None = None) -> np.ndarray:
     return T
 
 
-def make_task(cell: Cell, mounting: str, seed: int, straight: bool = False) -> Task:
+def make_task(cell: PybulletCell, mounting: str, seed: int, straight: bool = False) -> Task:
     """A start and a goal drawn from a seed, about 5 to 15 cm and 5 to 20 degrees apart.
 
     straight: at the goal the camera looks straight at the board and their axes are parallel. The
@@ -142,7 +142,7 @@ def make_task(cell: Cell, mounting: str, seed: int, straight: bool = False) -> T
     return Task(cell, mounting, board, carried.body, carried, T_GO)
 
 
-def accuracy_metrics(cell: Cell, seeds: Sequence[int], straight: bool) -> list[Metric]:
+def accuracy_metrics(cell: PybulletCell, seeds: Sequence[int], straight: bool) -> list[Metric]:
     """For each mounting and law the largest errors at the end, the time, and who did not settle."""
     metrics = []
     for mounting in MOUNTINGS:
@@ -171,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first start")
     options = parser.parse_args(argv)
     count = 1 if options.quick else options.starts
-    with Cell(load_config()) as cell:
+    with PybulletCell(load_config()) as cell:
         seeds = range(options.seed, options.seed + count)
         metrics = accuracy_metrics(cell, seeds, straight=False)
         if not options.quick:

@@ -21,7 +21,7 @@ from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import choose_posture
 from envs.objects import load_object_set
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import UnreachableError, moved
 from models.planners import make_planner
 from utils.config import load_config, run_script
@@ -57,13 +57,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     scenes, views = (2, 1) if options.quick else (options.scenes, options.views)
     config = load_config(None, options.overrides)
     metrics = []
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         for objects in OBJECT_SETS:
             metrics += figures(objects, measure(cell, objects, scenes, views))
     report(metrics, options.json)
 
 
-def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Errors]:
+def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[float, Errors]:
     """Errors by height over the grasp, on `scenes` scenes of an object set."""
     config = cell.config
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
@@ -96,7 +96,7 @@ def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Er
 
 
 def sightings(
-    cell: Cell,
+    cell: PybulletCell,
     camera: WristCamera,
     tracker: ObjectTracker,
     T_WB: np.ndarray,

@@ -1,6 +1,6 @@
 """A picture of a closed loop at work: python -m benchmarks.show_grasp_loop [FILE] [SCENARIO]
 
-KEY=VALUE overrides may follow, world=mujoco too. Above what a bystander sees, below the wrist
+KEY=VALUE overrides may follow, simulator=mujoco too. Above what a bystander sees, below the wrist
 camera's depth image with the points that the law looks at, at four moments of one grasp of the test
 object that `seed` chooses.
 """

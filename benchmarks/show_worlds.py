@@ -14,12 +14,12 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
 from utils.config import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
     scene = make_scene(chosen.layout, objects, config.seed, config)
-    with Cell(config) as bullet, MujocoCell(config) as mujoco:
+    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
         for cell in (bullet, mujoco):
             cell.build(scene)
         frames = bullet.frame(), mujoco.frame()
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"wrote {chosen.output}")
 
 
-def scenic(cell: BaseCell) -> np.ndarray:
+def scenic(cell: Cell) -> np.ndarray:
     view = Intrinsics(640, 480, fov_deg=45.0, near=0.05, far=5.0)
     return cell.image(view, look_at(SCENIC_EYE, SCENIC_TARGET)).rgb
 

@@ -16,9 +16,9 @@ import numpy as np
 import pybullet
 
 from envs.board import Board
-from envs.cell import BaseCell, wrist_mount
+from envs.cell import Cell, wrist_mount
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.robot_safety import ArmStoppedError, SafetyGate
@@ -43,19 +43,19 @@ class Sight(NamedTuple):
     seconds: float
 
 
-def servo_period(cell: BaseCell) -> int:
+def servo_period(cell: Cell) -> int:
     """Physics steps from one image to the next."""
     return max(1, round(cell.config.sim.frequency / cell.config.servo.rate))
 
 
-def servo_intrinsics(cell: BaseCell, mounting: str) -> Intrinsics:
+def servo_intrinsics(cell: Cell, mounting: str) -> Intrinsics:
     """Of the wrist (eye_in_hand) or overhead (eye_to_hand) camera, in the servo's resolution."""
     camera, servo = cell.config.camera, cell.config.servo
     fov = camera.wrist_fov_deg if _mount(mounting) == "wrist" else camera.fov_deg
     return Intrinsics(servo.width, servo.height, fov, camera.near, camera.far)
 
 
-def servo_settings(cell: BaseCell, mounting: str) -> dict:
+def servo_settings(cell: Cell, mounting: str) -> dict:
     """Arguments for a `VisualServo` of this cell: `camera_config`, and `dt` between two images."""
     intrinsics = servo_intrinsics(cell, mounting)
     config = {
@@ -86,7 +86,7 @@ def view_of(board: Board, camera: ServoCamera, T_CO: np.ndarray) -> View:
 class BoardCamera:
     """One of the cell's cameras, and the eyes that find the board in its images."""
 
-    def __init__(self, cell: BaseCell, board: Board, mounting: str):
+    def __init__(self, cell: Cell, board: Board, mounting: str):
         self.cell, self.board = cell, board
         self.intrinsics, self.mount = servo_intrinsics(cell, mounting), _mount(mounting)
 
@@ -105,7 +105,7 @@ class BoardCamera:
 class CarriedBoard:
     """A board screwed to the hand at T_EO (4, 4): a body with mass that its constraint holds."""
 
-    def __init__(self, cell: Cell, board: Board, T_EO: np.ndarray):
+    def __init__(self, cell: PybulletCell, board: Board, T_EO: np.ndarray):
         client, robot = cell.client, cell.robot
         self.client = client
         T_WO = forward_kinematics(robot.q) @ T_EO
@@ -129,12 +129,12 @@ class CarriedBoard:
         return sum(contact[9] for contact in contacts)
 
 
-class GuardedArm:
+class ServoArm:
     """The arm behind the servo's gate: the only way for a servo's velocities to the arm's own."""
 
     def __init__(
         self,
-        cell: BaseCell,
+        cell: Cell,
         carried: CarriedBoard | None = None,
         safety: SafetyConfig | None = None,
     ):
@@ -184,7 +184,7 @@ class GuardedArm:
 
 
 def servo_arm(
-    cell: BaseCell,
+    cell: Cell,
     servo: VisualServo,
     goal: View,
     see: Callable[[], Sight | None],
@@ -197,7 +197,7 @@ def servo_arm(
     it the time, a lost target or the gate. Raises ServoError where that happens before the target
     was seen even once.
     """
-    arm, settings = GuardedArm(cell, carried), cell.config.servo
+    arm, settings = ServoArm(cell, carried), cell.config.servo
     views: list[View] = []
     steps: list[ServoStep] = []
     wish, seen, settled = np.zeros(7), cell.seconds, 0

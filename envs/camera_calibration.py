@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.board import Board
-from envs.cell import BaseCell, wrist_mount
+from envs.cell import Cell, wrist_mount
 from envs.pybullet_camera import Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.table_plane import table_plane
@@ -42,12 +42,12 @@ class CameraBeliefs:
         return level(frame) if self.levelled else frame
 
 
-def true_beliefs(cell: BaseCell) -> CameraBeliefs:
+def true_beliefs(cell: Cell) -> CameraBeliefs:
     return CameraBeliefs(cell.camera_pose("overhead"), wrist_mount(cell.config.camera))
 
 
 def wrong_beliefs(
-    cell: BaseCell, rng: np.random.Generator, distance: float, angle: float
+    cell: Cell, rng: np.random.Generator, distance: float, angle: float
 ) -> CameraBeliefs:
     """Both cameras believed `distance` metres and `angle` radians off, in random directions."""
     true = true_beliefs(cell)
@@ -78,7 +78,7 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
 
 
 @functools.lru_cache(maxsize=2)
-def teach(cell: BaseCell) -> np.ndarray:
+def teach(cell: Cell) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: the board's pose in one image, taken while
     the jig holds the board at a known pose in E. Empties the cell, the first time: a camera has to
     be shown something once only."""

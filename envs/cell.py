@@ -36,7 +36,7 @@ class PhysicsError(RuntimeError):
     """The simulation left the realm of finite numbers."""
 
 
-class BaseCell(ABC):
+class Cell(ABC):
     """A simulated robot cell, whatever simulates it. Close it, or use it in a `with` block.
 
     dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
@@ -70,14 +70,14 @@ class BaseCell(ABC):
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
-        self.on_step: Callable[[BaseCell], None] | None = None
-        self.before_step: Callable[[BaseCell], None] | None = None
+        self.on_step: Callable[[Cell], None] | None = None
+        self.before_step: Callable[[Cell], None] | None = None
         self.sample: dict[str, Any] | None = None
         self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
 
     def _new_gate(self) -> ArmGate:
         config = self.config
-        return ArmGate(config.safety, config.robot, self.dt, config.grasp.floor)
+        return ArmGate(config.safety, config.robot, self.dt, config.closed_loop.floor)
 
     @abstractmethod
     def load(self, scene: Scene) -> None:

@@ -2,7 +2,7 @@
 
 The hand goes straight on along the grasp's axis and along with the object's motion as it was
 foreseen, and follows it while the fingers close. Images go on being taken: the watchdog stops the
-arm here too when they stop coming. All velocities pass the safety gate (`GuardedArm`).
+arm here too when they stop coming. All velocities pass the safety gate (`ServoArm`).
 
 Which way round to grasp: the fingers are alike, so every grasp is two, half a turn apart.
 
@@ -20,7 +20,7 @@ near    the controller's own law, towards a goal that sinks along the grasp's ax
         the law's, which takes away the lag behind what moves.
 blind   the rest of the way, some centimetres, without looking (`envs.closed_loop`).
 
-All velocities pass the safety gate (`GuardedArm`). Reads depth images and encoders; where the
+All velocities pass the safety gate (`ServoArm`). Reads depth images and encoders; where the
 cameras are comes from `CameraBeliefs` alone. Frames: W world, E gripper, C camera, O object on the
 table below its grasp.
 """
@@ -34,9 +34,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from envs.board_servo import GuardedArm, servo_period
+from envs.board_servo import ServoArm, servo_period
 from envs.camera_calibration import CameraBeliefs
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.closed_loop_tracker import DepthSight, SightedObject, WristCamera
 from envs.execution import HALF_TURN, Around, GraspFailure
 from envs.pybullet_camera import Intrinsics
@@ -92,14 +92,14 @@ class BlindDescent:
 
     def __init__(
         self,
-        arm: GuardedArm,
+        arm: ServoArm,
         camera: Callable[[], DepthSight | None],
         target: SightedObject,
         start: np.ndarray,
         height: float,
     ):
         self.arm, self.cell, self.camera, self.target = arm, arm.cell, camera, target
-        self.settings = arm.cell.config.grasp
+        self.settings = arm.cell.config.closed_loop
         self.start, self.start_seconds, self.height = start, arm.cell.seconds, height
         self.gone = 0.0  # m of the height
         self._steps_to_image = 0  # physics steps
@@ -170,7 +170,7 @@ _LITTLE_ROOM = 0.3  # rad of it at which the other way round is looked at
 _LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
 
 
-def turned_is_better(cell: BaseCell, T_WE: np.ndarray) -> bool:
+def turned_is_better(cell: Cell, T_WE: np.ndarray) -> bool:
     """Whether to turn a gripper pose (4, 4) round before setting out for it: the smaller turn of
     the wrist that leaves it room to turn with the object. Raises UnreachableError if neither way
     is in reach."""
@@ -179,7 +179,7 @@ def turned_is_better(cell: BaseCell, T_WE: np.ndarray) -> bool:
     return min(roomy, key=lambda turned: abs(ways[turned][-1] - now))
 
 
-def must_turn(cell: BaseCell, T_WE: np.ndarray) -> bool:
+def must_turn(cell: Cell, T_WE: np.ndarray) -> bool:
     """Whether to turn round on the way to a gripper pose (4, 4), where the wrist, following the
     object, is about to meet its limit."""
     try:
@@ -191,7 +191,7 @@ def must_turn(cell: BaseCell, T_WE: np.ndarray) -> bool:
     return kept < _LITTLE_ROOM < other and abs(ways[True][-1] - now) < _LONGEST_TURN
 
 
-def _ways(cell: BaseCell, T_WE: np.ndarray) -> dict[bool, np.ndarray]:
+def _ways(cell: Cell, T_WE: np.ndarray) -> dict[bool, np.ndarray]:
     """Joint positions (7,) at a pose as it is (False) and turned by half a turn (True), those that
     can be reached; raises UnreachableError if there are none."""
     ways, error = {}, None
@@ -258,7 +258,7 @@ class ClosedLoop:
 
     def __init__(
         self,
-        cell: BaseCell,
+        cell: Cell,
         controller: str,
         frame: RGBDFrame,
         beliefs: CameraBeliefs,
@@ -269,7 +269,7 @@ class ClosedLoop:
         self.cell, self.controller, self.frame = cell, controller, frame
         self.T_EC, self.latency = beliefs.T_EC, latency
         self.camera = camera or WristCamera(cell, latency)
-        grasp = cell.config.grasp
+        grasp = cell.config.closed_loop
         intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
         self.K, self.size = intrinsics.K, (grasp.width, grasp.height)
         period = servo_period(cell) * cell.dt
@@ -279,11 +279,11 @@ class ClosedLoop:
         self.goal_T_CE = T_CE
         self.record = LoopRecord()
 
-    def __call__(self, cell: BaseCell, grasp: Grasp) -> Around:
+    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
-        robot, settings = cell.robot, cell.config.grasp
+        robot, settings = cell.robot, cell.config.closed_loop
         robot.command_gripper(min(grasp.width, MAX_OPENING))
-        arm = GuardedArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
+        arm = ServoArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
         with _told_as_failure(arm):
             guided = GuidedDescent(self, arm, grasp)
             end = cell.seconds + settings.seconds
@@ -304,7 +304,7 @@ class ClosedLoop:
 
 
 @contextlib.contextmanager
-def _told_as_failure(arm: GuardedArm) -> Iterator[None]:
+def _told_as_failure(arm: ServoArm) -> Iterator[None]:
     """Whatever ends the block early leaves the arm at rest; what a servo can stop for is told as
     the failure of the grasp."""
     try:
@@ -326,11 +326,11 @@ def _reason_of(error: ServoError) -> str:
 class GuidedDescent:
     """The far and the near stage of one approach: what the arm does while it sees the object."""
 
-    def __init__(self, loop: ClosedLoop, arm: GuardedArm, grasp: Grasp):
+    def __init__(self, loop: ClosedLoop, arm: ServoArm, grasp: Grasp):
         """Takes the first image that comes; raises TargetLostError, and UnreachableError where the
         grasp is out of reach."""
         self.loop, self.cell, self.arm = loop, loop.cell, arm
-        self.settings = settings = loop.cell.config.grasp
+        self.settings = settings = loop.cell.config.closed_loop
         self.target = loop.target = SightedObject(
             loop.frame, grasp, loop.K, loop.size, loop.T_EC, settings.lost_seconds,
             self.cell.seconds,

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.pybullet_camera import Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.depth import KinectNoise
@@ -45,8 +45,8 @@ class WristCamera:
     the image: every controller meets the same.
     """
 
-    def __init__(self, cell: BaseCell, latency: float = 0.0):
-        camera, grasp = cell.config.camera, cell.config.grasp
+    def __init__(self, cell: Cell, latency: float = 0.0):
+        camera, grasp = cell.config.camera, cell.config.closed_loop
         self.cell, self.latency = cell, latency
         self.intrinsics = Intrinsics(
             grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far

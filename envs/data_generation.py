@@ -26,7 +26,7 @@ from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.pybullet_appearance import Appearance, draw_camera
-from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics
+from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics
 from utils.config import Config, dump_config, with_settings
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
@@ -172,7 +172,7 @@ def _claim(folder: Path, config: Config) -> None:
 # --- In a worker process --------------------------------------------------------------------
 
 _worker_config: Config
-_worker_cell: Cell
+_worker_cell: PybulletCell
 _worker_sets: dict[tuple[str, str], ObjectSet]
 
 
@@ -180,7 +180,7 @@ def _start_worker(config: Config) -> None:
     global _worker_config, _worker_cell, _worker_sets
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     cv2.setNumThreads(1)  # the workers fill the cores
-    _worker_config, _worker_cell = config, Cell(config)
+    _worker_config, _worker_cell = config, PybulletCell(config)
     _worker_sets = object_sets(config)
 
 
@@ -216,7 +216,11 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
 
 
 def draw_scene(
-    config: Config, split: str, seed: int, sets: dict[tuple[str, str], ObjectSet], cell: Cell
+    config: Config,
+    split: str,
+    seed: int,
+    sets: dict[tuple[str, str], ObjectSet],
+    cell: PybulletCell,
 ) -> tuple[Scene, str]:
     """A scene of random layout, object set and number of objects, and the name of its set.
 
@@ -242,7 +246,7 @@ def draw_scene(
 
 
 def label_scene(
-    config: Config, scene: Scene, set_name: str, cell: Cell
+    config: Config, scene: Scene, set_name: str, cell: PybulletCell
 ) -> Iterator[tuple[LabelledFrame, list[Trial]]]:
     """Labelled frames of a scene and of random parts of it, some with trials of their labels."""
     rng = np.random.default_rng([config.seed, scene.seed, 1])
@@ -297,7 +301,9 @@ def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
     return replace(scene, placements=tuple(placements))
 
 
-def execute_pairs(cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator) -> list[Trial]:
+def execute_pairs(
+    cell: PybulletCell, scene: Scene, frame, labels, rng: np.random.Generator
+) -> list[Trial]:
     """Carry out labelled pairs of every quality, each on the scene freshly loaded. Where the
     simulation blows up, the grasp has failed."""
     trials = []

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
 from envs.pybullet_panda import MAX_OPENING
 from envs.robot_kinematics import (
@@ -76,7 +76,7 @@ class Around(NamedTuple):
     pose: np.ndarray | None
 
 
-def open_loop(cell: BaseCell, grasp: Grasp) -> Around:
+def open_loop(cell: Cell, grasp: Grasp) -> Around:
     """Bring the open gripper around a grasp as planned, without looking again. Raises
     ArmStoppedError on a collision and UnreachableError before anything has moved."""
     settings = cell.config.execution
@@ -92,14 +92,14 @@ def open_loop(cell: BaseCell, grasp: Grasp) -> Around:
     return Around(cell.step, target)
 
 
-Approach = Callable[[BaseCell, Grasp], Around]
+Approach = Callable[[Cell, Grasp], Around]
 
 
 def check_bin(config: Config) -> None:
     """Raise UserError where the gate's box ends before the bin: whatever is picked would end as
     `stopped` on its way there, so that no grasp could succeed."""
     told, place = config.safety, OVER_BIN.round(3).tolist()
-    box = reaching_down(told, config.grasp.floor)
+    box = reaching_down(told, config.closed_loop.floor)
     if not all(low <= at <= high for low, at, high in zip(box.box_lower, place, box.box_upper)):
         raise UserError(
             f"safety: the box from box_lower {list(told.box_lower)} to box_upper "
@@ -109,7 +109,7 @@ def check_bin(config: Config) -> None:
         )
 
 
-def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
+def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
     """Approach, close, lift, hold, carry to the bin, release, go home.
 
     Success: one object gripped by both fingers, off the table, its centre of mass above
@@ -140,7 +140,7 @@ def execute_grasp(cell: BaseCell, grasp: Grasp, approach: Approach = open_loop) 
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at)
 
 
-def _grip(cell: BaseCell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray]:
+def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray]:
     """From home to an object between the fingers: its number, and (4, 4) T_WE to which to lift it.
     Raises GraspFailure."""
     around = approach(cell, grasp)
@@ -156,7 +156,7 @@ def _grip(cell: BaseCell, grasp: Grasp, approach: Approach) -> tuple[int, np.nda
     return index, lifted
 
 
-def _lift(cell: BaseCell, index: int, lifted: np.ndarray) -> None:
+def _lift(cell: Cell, index: int, lifted: np.ndarray) -> None:
     """Raise the hand to `lifted` (4, 4) and hold the object there. Raises GraspFailure."""
     settings = cell.config.execution
     _follow(cell, _line(cell, cell.robot.q, lifted))
@@ -167,12 +167,12 @@ def _lift(cell: BaseCell, index: int, lifted: np.ndarray) -> None:
         _still_lifted(cell, index)
 
 
-def _still_lifted(cell: BaseCell, index: int) -> None:
+def _still_lifted(cell: Cell, index: int) -> None:
     if not cell.is_lifted(index, cell.config.execution.lift_height):
         raise GraspFailure("dropped")
 
 
-def _carry_to_bin(cell: BaseCell, index: int) -> None:
+def _carry_to_bin(cell: Cell, index: int) -> None:
     posture = choose_posture(cell, top_down_pose(OVER_BIN, -np.pi / 2))
     carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
     every = round(_LOOK_SECONDS / cell.dt)
@@ -184,7 +184,7 @@ def _carry_to_bin(cell: BaseCell, index: int) -> None:
     cell.retire(index)
 
 
-def _close(cell: BaseCell, wait: Callable[[int], None]) -> None:
+def _close(cell: Cell, wait: Callable[[int], None]) -> None:
     """Close the fingers until they stop moving."""
     cell.robot.command_gripper(0.0)
     before = cell.robot.opening
@@ -196,7 +196,7 @@ def _close(cell: BaseCell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: BaseCell) -> str:
+def _go_home(cell: Cell) -> str:
     """Open, rise on a straight line if the hand is low, and return to the home posture. A remark
     for the outcome's detail where the arm could not do so by itself."""
     robot = cell.robot
@@ -222,7 +222,7 @@ def _go_home(cell: BaseCell) -> str:
     return ""
 
 
-def choose_posture(cell: BaseCell, pose: np.ndarray) -> np.ndarray:
+def choose_posture(cell: Cell, pose: np.ndarray) -> np.ndarray:
     """Joint positions (7,) for a gripper pose or the same grasp turned by half a turn, whichever
     is nearer to home. Raises UnreachableError if neither can be reached."""
     found, error = [], None
@@ -241,12 +241,12 @@ def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ HALF_TURN
 
 
-def _line(cell: BaseCell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
+def _line(cell: Cell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
     speed = cell.config.execution.approach_speed
     return cell.robot.straight_move(q, pose, speed, cell.home, **_scales(cell))
 
 
-def _scales(cell: BaseCell) -> dict[str, float]:
+def _scales(cell: Cell) -> dict[str, float]:
     robot = cell.config.robot
     return {
         "velocity_scale": robot.velocity_scale,
@@ -254,7 +254,7 @@ def _scales(cell: BaseCell) -> dict[str, float]:
     }
 
 
-def _follow(cell: BaseCell, trajectory: Trajectory, stop_force: float | None = None) -> None:
+def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> None:
     """Run a trajectory; raises ArmStoppedError, with the arm held where it is, at a contact above
     `stop_force` N and where the gate refuses to go on."""
     for q, velocity in zip(trajectory.positions, trajectory.velocities):

@@ -25,7 +25,7 @@ from envs.env_actions import HandCommands
 from envs.env_rewards import Outline
 from envs.grasp_goals import GraspGoals
 from envs.objects import ObjectSet, load_object_set
-from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
+from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics, wrist_mount
 from envs.pybullet_panda import MAX_OPENING
 from envs.robot_kinematics import (
     JOINT_LOWER,
@@ -114,7 +114,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self,
         render_mode: str | None = None,
         config: Config | Path | str | None = None,
-        cell: Cell | None = None,
+        cell: PybulletCell | None = None,
         **settings: Any,
     ):
         self._closed = True  # until everything below has been built
@@ -138,7 +138,7 @@ class RobotGraspingEnv(gymnasium.Env):
                 "use render_mode='rgb_array'"
             )
         self._borrowed = cell is not None
-        self.cell = cell or Cell(self.config, gui=render_mode == "human")
+        self.cell = cell or PybulletCell(self.config, gui=render_mode == "human")
         self._studio: Studio | None = None
         self._running = False
         self._looks_left = 0

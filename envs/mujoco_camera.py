@@ -154,7 +154,7 @@ def _gl_context():
         context.make_current()
     except Exception as error:  # of OpenGL's many: its loaders raise what they like
         raise UserError(
-            f"world=mujoco: no OpenGL context to draw with ({type(error).__name__}: {error}); "
+            f"simulator=mujoco: no OpenGL context to draw with ({type(error).__name__}: {error}); "
             "install libegl1 (Mesa's needs no graphics card), or set MUJOCO_GL to egl, osmesa or "
             "glfw"
         ) from error

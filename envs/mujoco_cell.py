@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from envs.board import BLACK, WHITE, Board
-from envs.cell import ROBOT, TABLE_OR_BACKGROUND, BaseCell, PhysicsError
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Cell, PhysicsError
 from envs.cell_layout import (
     BIN_CENTRE,
     BIN_HALF_SIZE,
@@ -138,7 +138,7 @@ def _add_object(mujoco, spec, name: str, model: ObjectModel, position, quaternio
 SUBSTEPS = 4  # of MuJoCo in one of the cell's steps: a grip lasts through about one millisecond
 
 
-class MujocoCell(BaseCell):
+class MujocoCell(Cell):
     """A cell simulated by MuJoCo. Raises UserError where MuJoCo is not installed."""
 
     def __init__(self, config: Config):

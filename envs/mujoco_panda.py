@@ -15,7 +15,7 @@ import numpy as np
 import pybullet_data
 
 from envs.pybullet_panda import FINGER_SPEED, GRIP_COSINE, MAX_OPENING
-from envs.robot import GuardedArm
+from envs.robot import Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -175,7 +175,7 @@ def _urdf() -> str:
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-class MujocoPanda(GuardedArm):
+class MujocoPanda(Robot):
     """The Panda in MuJoCo with the commands of `envs.pybullet_panda.Panda`; model and data are MuJoCo's.
 
     gate: what every command to the arm passes. dt: s, a control period, in which MuJoCo takes

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.cell import BaseCell, PhysicsError
+from envs.cell import Cell, PhysicsError
 from envs.execution import Around, GraspFailure
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
@@ -42,7 +42,7 @@ class PolicyApproach:
 
     def __init__(
         self,
-        cell: BaseCell,
+        cell: Cell,
         policy: Callable[[dict[str, np.ndarray]], np.ndarray],
         trained: dict[str, dict[str, Any]],
     ):
@@ -53,7 +53,7 @@ class PolicyApproach:
         self.policy = policy
         self.closed_at: Grasp | None = None
 
-    def __call__(self, cell: BaseCell, grasp: Grasp) -> Around:
+    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
         """Raises GraspFailure when nothing is gripped in as many actions as in training."""
         self.closed_at, ended, gripped = None, False, 0
         try:
@@ -80,7 +80,7 @@ def nowhere_yet(frame: RGBDFrame) -> list[Grasp]:
     return [Grasp(np.array([0.5, 0.0, 0.0]), 0.0, 0.0, 0.0)]
 
 
-def _grasp_of(cell: BaseCell) -> Grasp:
+def _grasp_of(cell: Cell) -> Grasp:
     """The hand's pose as a planar grasp."""
     T_WE = forward_kinematics(cell.robot.q)
     angle = math.atan2(T_WE[1, 1], T_WE[0, 1]) % math.pi
@@ -125,7 +125,7 @@ def check_learned(name: str, scenarios: Sequence[str], controllers: Sequence[str
 
 
 @functools.cache
-def approach_by(name: str, cell: BaseCell) -> PolicyApproach:
+def approach_by(name: str, cell: Cell) -> PolicyApproach:
     """How a learned policy brings the hand around an object in a cell."""
     policy = learned(name)
     return PolicyApproach(cell, policy, policy.config)

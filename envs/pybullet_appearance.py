@@ -12,7 +12,7 @@ import numpy as np
 import pybullet
 
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import TABLE_OR_BACKGROUND, Cell, camera_intrinsics
+from envs.pybullet_cell import TABLE_OR_BACKGROUND, PybulletCell, camera_intrinsics
 from utils.config import CameraConfig
 from utils.random_view import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at
@@ -55,7 +55,7 @@ class Appearance:
             rng.uniform(0, 6),
         )
 
-    def paint(self, cell: Cell) -> None:
+    def paint(self, cell: PybulletCell) -> None:
         """Colour the loaded scene's table and objects."""
         if self.table is None:
             return
@@ -66,7 +66,7 @@ class Appearance:
             )
 
     def photograph(
-        self, cell: Cell, intrinsics: Intrinsics, T_WC: np.ndarray, rng: np.random.Generator
+        self, cell: PybulletCell, intrinsics: Intrinsics, T_WC: np.ndarray, rng: np.random.Generator
     ) -> RGBDFrame:
         """The painted scene in this light, with textures and colour noise, and with its truth."""
         frame = cell.look(intrinsics, T_WC, with_truth=True, light=self.light)

@@ -17,7 +17,7 @@ from envs.board import Board
 from envs.cell import (
     ROBOT,
     TABLE_OR_BACKGROUND,
-    BaseCell,
+    Cell,
     PhysicsError,
     camera_intrinsics,
     wrist_mount,
@@ -33,7 +33,7 @@ from utils.random_view import RandomView
 from utils.transforms import position_quaternion
 
 __all__ = [
-    "ROBOT", "TABLE_OR_BACKGROUND", "Cell", "PhysicsError", "camera_intrinsics", "wrist_mount",
+    "ROBOT", "TABLE_OR_BACKGROUND", "PybulletCell", "PhysicsError", "camera_intrinsics", "wrist_mount",
 ]  # fmt: skip
 
 # As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
@@ -41,7 +41,7 @@ _CALM_RESIDUAL = 1e-6
 _CALM_LOOKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
 
 
-class Cell(BaseCell):
+class PybulletCell(Cell):
     """A simulated robot cell.
 
     `fine` loads the detailed visual meshes, for pictures; physics is the same. `on_build` is called
@@ -51,13 +51,13 @@ class Cell(BaseCell):
 
     def __init__(self, config: Config, fine: bool = False, gui: bool = False):
         super().__init__(config)
-        if config.world != "pybullet":
+        if config.simulator != "pybullet":
             raise UserError(
-                f"world={config.world}: only evaluate.py can score policies there; leave it out, "
-                "or set world=pybullet"
+                f"simulator={config.simulator}: only evaluate.py can score policies there; leave it out, "
+                "or set simulator=pybullet"
             )
         self.fine = fine
-        self.on_build: Callable[[Cell], None] | None = None
+        self.on_build: Callable[[PybulletCell], None] | None = None
         self.view: RandomView | None = None
         self._gui = gui
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)

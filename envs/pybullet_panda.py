@@ -17,7 +17,7 @@ import pybullet
 import pybullet_data
 from scipy.spatial.transform import Rotation
 
-from envs.robot import GuardedArm
+from envs.robot import Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -37,7 +37,7 @@ ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
 
-class Panda(GuardedArm):
+class Panda(Robot):
     """The robot's body in one physics client.
 
     position_gain, velocity_gain, gripper_gain: factors on the motors' gains. latency: physics steps

@@ -74,7 +74,7 @@ class MotionPlanner:
         )  # fmt: skip
 
 
-class GuardedArm(MotionPlanner):
+class Robot(MotionPlanner):
     """gate: what every command to the arm passes. q: (7,) rad, where its joints are."""
 
     gate: ArmGate

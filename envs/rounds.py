@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from envs.camera_calibration import CameraBeliefs, teach
-from envs.cell import BaseCell, PhysicsError
+from envs.cell import Cell, PhysicsError
 from envs.cell_scenes import Scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
@@ -33,7 +33,7 @@ ROOM_OVER_TOUCH = 0.004  # m
 
 
 def run_round(
-    cell: BaseCell,
+    cell: Cell,
     scene: Scene,
     plan: Callable[[RGBDFrame], list[Grasp]],
     *,
@@ -77,7 +77,7 @@ def run_round(
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
                 # What is worked out of an image late is what a late image would have been worth.
-                late = challenge.latency + cell.config.grasp.compute_seconds
+                late = challenge.latency + cell.config.closed_loop.compute_seconds
                 approach = ClosedLoop(cell, controller, seen, beliefs, taught, late)
             elif approach_by is not None:
                 approach = approach_by
@@ -116,7 +116,7 @@ def run_round(
     )  # fmt: skip
 
 
-def believed(cell: BaseCell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
+def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
     """A frame of the cell's camera, taken now, with the camera where it is believed to be. An image
     in which no table is found cannot be levelled."""
     mount, T_WE = cell.config.camera.mount, forward_kinematics(cell.robot.q)

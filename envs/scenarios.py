@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from envs.camera_calibration import CameraBeliefs, true_beliefs, wrong_beliefs
-from envs.cell import BaseCell
+from envs.cell import Cell
 from utils.table_plane import planar
 from utils.transforms import inverse_pose
 
@@ -75,7 +75,7 @@ class Conveyor:
 
 
 @contextlib.contextmanager
-def disturbed(cell: BaseCell, motion: Displacement | Conveyor | None) -> Iterator[None]:
+def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[None]:
     """Within the block a motion carries the objects of the cell, from now on, unless it is None."""
     if motion is None or not cell.remaining:
         yield
@@ -90,14 +90,14 @@ def disturbed(cell: BaseCell, motion: Displacement | Conveyor | None) -> Iterato
 class _Carrier:
     """Carries all bodies along one motion, until something ends it."""
 
-    def __init__(self, cell: BaseCell, motion: Displacement | Conveyor):
+    def __init__(self, cell: Cell, motion: Displacement | Conveyor):
         self.motion, self.start = motion, cell.seconds
         self.poses = {index: cell.object_pose(index) for index in cell.remaining}
         first = self.poses[min(self.poses)]
         self.pivot = planar(*first[:2, 3], 0.0)
         self.over = False
 
-    def __call__(self, cell: BaseCell) -> None:
+    def __call__(self, cell: Cell) -> None:
         if self.over:
             return
         now = cell.seconds - self.start
@@ -134,7 +134,7 @@ class Challenge:
     miscalibrated: bool = False
     latency: float = 0.0
 
-    def motion(self, cell: BaseCell, attempt: int) -> Displacement | Conveyor | None:
+    def motion(self, cell: Cell, attempt: int) -> Displacement | Conveyor | None:
         """What happens to the objects during an attempt, 0 being the first."""
         rng = self._rng(cell, attempt)
         if not cell.remaining:
@@ -149,15 +149,15 @@ class Challenge:
             return conveyor(rng, place, centre, self.speed, self.turning)
         return None
 
-    def beliefs(self, cell: BaseCell) -> CameraBeliefs:
+    def beliefs(self, cell: Cell) -> CameraBeliefs:
         """Where the cameras are believed to be, in every attempt of a round."""
         if not self.miscalibrated:
             return true_beliefs(cell)
-        off = cell.config.grasp
+        off = cell.config.closed_loop
         rng = self._rng(cell, -1)
         return wrong_beliefs(cell, rng, off.camera_shift, np.radians(off.camera_turn_deg))
 
-    def _rng(self, cell: BaseCell, attempt: int) -> np.random.Generator:
+    def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
         return np.random.default_rng([cell.scene.seed, attempt + 1, _STREAM])
 
 

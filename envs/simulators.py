@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.mujoco_cell import MujocoCell
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from utils.config import Config, with_settings
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
 
-WORLDS = {"pybullet": Cell, "mujoco": MujocoCell}
+SIMULATORS = {"pybullet": PybulletCell, "mujoco": MujocoCell}
 
 
-def make_cell(config: Config) -> BaseCell:
+def make_cell(config: Config) -> Cell:
     """A cell in the configured world; with evaluate.randomise, one that differs from scene to scene
     by what the section `randomization` says, the same way for the same scene. Noise and bias of
     actions are a policy's that acts in turns; a planner's trajectories are no actions."""
-    check_world(config)
-    cell = WORLDS[config.world](config)
+    check_simulator(config)
+    cell = SIMULATORS[config.simulator](config)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
         randomizer.at_limits = True
@@ -30,10 +30,12 @@ def in_world(config: Config, world: str) -> Config:
     """The config of an evaluation in a world of the transfer report: `pybullet`, `mujoco`, or
     `outside`, which is PyBullet changed by the section `randomization`."""
     config = with_settings(config, "evaluate", {"randomise": world == "outside"})
-    return config.model_copy(update={"world": "mujoco" if world == "mujoco" else "pybullet"})
+    return config.model_copy(update={"simulator": "mujoco" if world == "mujoco" else "pybullet"})
 
 
-def check_world(config: Config) -> None:
+def check_simulator(config: Config) -> None:
     """Raise UserError for what is to be evaluated and cannot be had in the configured world."""
-    if config.world != "pybullet" and config.evaluate.randomise:
-        raise UserError("evaluate.randomise=true changes PyBullet's physics; use world=pybullet")
+    if config.simulator != "pybullet" and config.evaluate.randomise:
+        raise UserError(
+            "evaluate.randomise=true changes PyBullet's physics; use simulator=pybullet"
+        )

@@ -26,11 +26,11 @@ import imageio.v2 as imageio
 import numpy as np
 import pybullet
 
-from envs.cell import BaseCell
+from envs.cell import Cell
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.pybullet_camera import Intrinsics, render
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
 from utils.config import parse_args, run_script
 from utils.errors import UserError
@@ -43,10 +43,12 @@ _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 
 class Studio:
     """Takes pictures of a cell. Close it, or use it in a `with` block."""
 
-    def __init__(self, cell: BaseCell, width: int = 640, height: int = 480):
+    def __init__(self, cell: Cell, width: int = 640, height: int = 480):
         self._cell = cell
         # Only PyBullet's cell has detailed meshes to show; another shows itself.
-        self._twin = Cell(cell.config, fine=True) if isinstance(cell, Cell) else None
+        self._twin = (
+            PybulletCell(cell.config, fine=True) if isinstance(cell, PybulletCell) else None
+        )
         self._intrinsics = Intrinsics(width, height, fov_deg=45.0, near=0.05, far=5.0)
         self._T_WC = look_at(SCENIC_EYE, SCENIC_TARGET)
 
@@ -80,14 +82,14 @@ class Studio:
 class Film:
     """Films a cell from now on, at `rate` pictures a second of simulated time, until written."""
 
-    def __init__(self, cell: BaseCell, rate: int = 6, width: int = 480, height: int = 368):
+    def __init__(self, cell: Cell, rate: int = 6, width: int = 480, height: int = 368):
         self._cell, self._rate = cell, rate
         self._studio = Studio(cell, width, height)
         self._pictures: list[np.ndarray] = []
         self._every = max(1, round(1 / (rate * cell.dt)))
         cell.on_step = self._on_step
 
-    def _on_step(self, cell: BaseCell) -> None:
+    def _on_step(self, cell: Cell) -> None:
         if cell.steps % self._every == 0:
             self._pictures.append(self._studio.picture())
 
@@ -132,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.load(make_scene(chosen.layout, objects, config.seed, config))
         with Studio(cell) as studio:
             picture = studio.picture()

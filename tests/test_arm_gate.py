@@ -8,7 +8,7 @@ import pytest
 from envs.cell_scenes import make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.grasping_env import RobotGraspingEnv
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.robot_safety import ArmGate, ArmStoppedError
 from utils.config import load_config
@@ -100,7 +100,7 @@ def test_the_tip_stays_in_the_box_and_may_come_back():
 def narrow():
     """A cell whose workspace ends before the bin, which is 48 cm to the right."""
     config = load_config(None, ["sim.renderer=tiny", "safety.box_lower=[0.15,-0.3,0.02]"])
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         yield cell
 
 
@@ -124,7 +124,7 @@ def test_a_box_without_the_bin_is_refused(narrow, config):
     check_bin(config)
     with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.25\] m.*widen the box"):
         check_bin(narrow.config)
-    low = ["safety.box_lower=[0.15,-0.55,0.3]", "grasp.floor=0.009"]
+    low = ["safety.box_lower=[0.15,-0.55,0.3]", "closed_loop.floor=0.009"]
     check_bin(load_config(None, low))  # planned motions reach down to the floor of grasps
 
 
@@ -176,4 +176,4 @@ def test_a_home_outside_the_box_is_refused():
     """Home's fingertips are 0.485 m up: the arm could leave, and never come back."""
     config = load_config(None, ["sim.renderer=tiny", "safety.box_upper=[0.8,0.55,0.4]"])
     with pytest.raises(UserError, match="robot.home has the fingertips at .*0.485.* widen the box"):
-        Cell(config)
+        PybulletCell(config)

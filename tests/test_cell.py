@@ -8,7 +8,7 @@ from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
 from envs.cell_scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.execution import choose_posture, execute_grasp
 from envs.objects import load_object_set
-from envs.pybullet_cell import ROBOT, TABLE_OR_BACKGROUND, Cell, PhysicsError
+from envs.pybullet_cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError, PybulletCell
 from envs.pybullet_panda import FINGERS
 from envs.robot_kinematics import forward_kinematics, inverse_kinematics
 from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
@@ -18,7 +18,7 @@ from utils.transforms import Grasp, top_down_pose
 
 @pytest.fixture(scope="module")
 def cell(config):
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         yield cell
 
 
@@ -86,7 +86,7 @@ def test_frame_shows_the_cube_where_it_is(cell, box_set):
 
 def test_wrist_camera_sees_the_workspace(config, box_set):
     wrist = with_settings(config, "camera", {"mount": "wrist"})
-    with Cell(wrist) as cell:
+    with PybulletCell(wrist) as cell:
         cell.load(cube_scene(box_set, position=(0.42, 0.0, 0.03)))
         frame = cell.frame()
         cube = frame.points()[(frame.segmentation == 0) & (frame.points()[..., 2] > 0.059)]
@@ -108,7 +108,7 @@ def test_steps_in_one_call_are_the_same_steps(config, box_set, count):
     """A cube falls on the table and the hand presses on it: bit-identical to single steps."""
     ends = []
     for on_step in (None, lambda cell: None):  # with a hook every step is a call of its own
-        with Cell(config) as cell:
+        with PybulletCell(config) as cell:
             cell.build(cube_scene(box_set, position=(0.5, 0.0, 0.06)))
             cell.on_step = on_step
             pressing = inverse_kinematics(

@@ -117,7 +117,7 @@ def test_object_set_may_be_a_folder(tmp_path):
         ("rounds=5", ["did you mean evaluate.rounds?"]),
         ("lift_height=1", ["execution.lift_height or env.lift_height"]),
         ("round=5", ["did you mean evaluate.rounds?"]),
-        ("zzz=5", ["zzz", "allowed here: seed, cache_dir, world, sim"]),
+        ("zzz=5", ["zzz", "allowed here: seed, cache_dir, simulator, sim"]),
         ("sim.zzz=5", ["sim.zzz", "frequency, solver_iterations, renderer"]),
         ("seed.x=5", ["seed.x", "unknown"]),
         ("evaluate.rounds=0", ["evaluate.rounds", "got 0", "command line", "whole number >= 1"]),

@@ -10,7 +10,7 @@ import torch
 
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from utils.augmentation import Augmentation, LabelledImage
 from utils.config import ConfigError, load_config, with_settings
 from utils.depth import KinectNoise, dot_pattern
@@ -241,10 +241,10 @@ def frames(config):
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
     noisy = with_settings(config, "camera", {"depth_noise": "kinect"})
     scene, other = (make_scene("pile", objects, seed, config) for seed in (1, 2))
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.load(scene)
         clean = [cell.frame(with_truth=True), cell.frame()]
-    with Cell(noisy) as cell:
+    with PybulletCell(noisy) as cell:
         cell.load(scene)
         first = [cell.frame(with_truth=True), cell.frame()]
         cell.load(other)

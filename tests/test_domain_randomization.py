@@ -11,7 +11,7 @@ import pytest
 import envs  # noqa: F401 - registers the environments
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
 from envs.rounds import run_round
 from envs.simulators import make_cell
@@ -43,7 +43,7 @@ def scene(wild):
 
 @pytest.fixture
 def cell(wild, scene):
-    with Cell(wild) as cell:
+    with PybulletCell(wild) as cell:
         cell.build(scene)
         yield cell
 
@@ -83,7 +83,7 @@ def only(**changes):
     return config.model_copy(update={"randomization": still})
 
 
-def everything(cell: Cell) -> list:
+def everything(cell: PybulletCell) -> list:
     """All that PyBullet says of the world, joint damping apart, and what the camera sees."""
     client, robot = cell.client, cell.robot
     links = [(body, -1) for body in (*cell.bodies, cell.table, *cell.bin)]
@@ -101,7 +101,7 @@ def everything(cell: Cell) -> list:
     ]  # fmt: skip
 
 
-def states(cell: Cell) -> list:
+def states(cell: PybulletCell) -> list:
     """Where everything is and goes after some motion of the arm, as exact numbers."""
     seen = []
     for i in range(4):
@@ -117,7 +117,7 @@ def states(cell: Cell) -> list:
     return seen
 
 
-def randomizer_of(cell: Cell, config=None) -> DomainRandomizer:
+def randomizer_of(cell: PybulletCell, config=None) -> DomainRandomizer:
     return DomainRandomizer(cell, (config or cell.config).randomization, ARM, FINGERS)
 
 
@@ -192,7 +192,7 @@ def test_the_sample_tells_every_parameter(cell):
             assert all(spec.low <= v <= spec.high for v in np.atleast_1d(values))
 
 
-def dynamics(cell: Cell, body: int, link: int = -1) -> dict:
+def dynamics(cell: PybulletCell, body: int, link: int = -1) -> dict:
     info = pybullet.getDynamicsInfo(body, link, physicsClientId=cell.client)
     places = {"mass": 0, "friction": 1, "inertia": 2, "restitution": 5, "rolling": 6,
               "spinning": 7, "damping": 8, "stiffness": 9}  # fmt: skip
@@ -201,7 +201,7 @@ def dynamics(cell: Cell, body: int, link: int = -1) -> dict:
 
 def test_mass_takes_inertia_with_it(scene):
     config = only(object_mass="2,2,uniform,scale,episode")
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         before = [dynamics(cell, body) for body in cell.bodies]
         randomizer_of(cell).randomize(0)
@@ -224,7 +224,7 @@ def test_fingers_table_and_gravity(scene):
         gravity="-0.19,-0.19,uniform,add,episode",
         restitution="0.1,0.1,uniform,set,episode",
     )
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         randomizer_of(cell).randomize(0)
         for finger in FINGERS:  # panda.urdf: friction 1, spinning 0.1, 30000 N/m, 1000 N s/m
@@ -243,7 +243,7 @@ def test_restitution_makes_an_object_bounce(box_set, wild):
     heights = {}
     for value in (0.0, 0.6):
         config = only(restitution=f"{value},{value},uniform,set,episode")
-        with Cell(config) as cell:
+        with PybulletCell(config) as cell:
             cell.build(make_scene("isolated", box_set, 0, config))
             randomizer_of(cell).randomize(0)
             body = cell.bodies[0]
@@ -257,7 +257,7 @@ def test_restitution_makes_an_object_bounce(box_set, wild):
     assert heights[0.6] == pytest.approx(0.36 * 0.2, rel=0.3)
 
 
-def _height_after_a_step(cell: Cell) -> float:
+def _height_after_a_step(cell: PybulletCell) -> float:
     cell.step()
     return float(cell.object_position(0)[2])
 
@@ -267,7 +267,7 @@ def test_joint_damping_slows_a_free_joint(scene):
     speeds = {}
     for damping in (0.0, 0.01):
         config = only(joint_damping=f"{damping},{damping},uniform,add,episode")
-        with Cell(config) as cell:
+        with PybulletCell(config) as cell:
             cell.build(scene)
             randomizer = randomizer_of(cell)
             randomizer.randomize(0)
@@ -278,7 +278,7 @@ def test_joint_damping_slows_a_free_joint(scene):
     assert speeds[0.01, "restored"] == pytest.approx(speeds[0.0], rel=1e-6)
 
 
-def _speed_after_spin(cell: Cell) -> float:
+def _speed_after_spin(cell: PybulletCell) -> float:
     robot, client = cell.robot, cell.client
     robot.place(cell.home)
     pybullet.setJointMotorControl2(
@@ -291,7 +291,7 @@ def _speed_after_spin(cell: Cell) -> float:
 
 def test_latency_delays_commands_by_whole_steps(scene):
     config = only(latency=f"{5 / 240},{5 / 240},uniform,set,episode")
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         runs = {}
         for name in ("late", "prompt"):
             cell.build(scene)
@@ -310,7 +310,7 @@ def test_latency_delays_commands_by_whole_steps(scene):
 
 
 def test_latency_is_the_same_in_one_call_and_in_many(scene, wild):
-    with Cell(wild) as cell:
+    with PybulletCell(wild) as cell:
         seen = []
         for parts in ([40], [1] * 40, [7, 13, 20]):
             cell.build(scene)
@@ -328,7 +328,7 @@ def test_actions_get_bias_and_noise(scene):
         action_noise="0.05,0.05,uniform,set,episode",
         action_bias="0.1,0.1,uniform,set,episode",
     )
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         randomizer = randomizer_of(cell)
         assert randomizer.act(np.ones(7)).tolist() == [1.0] * 7  # before any sample
@@ -347,7 +347,7 @@ def test_parameters_drawn_at_every_step(scene):
         brightness="0.5,1.5,uniform,scale,step",
     )
     runs = []
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         for _ in range(2):
             cell.build(scene)
             randomizer = randomizer_of(cell)
@@ -371,7 +371,7 @@ def test_parameters_drawn_at_every_step(scene):
 def frames_without_and_with(scene, **parameters):
     """The nominal frame of a scene, and one with these parameters drawn and all others idle."""
     config = only(**parameters)
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         nominal = cell.frame()
         randomizer_of(cell).randomize(0)
@@ -399,7 +399,7 @@ def test_field_of_view(scene):
     quarter of the pixels."""
     wide = np.degrees(2 * np.arctan(2 * np.tan(np.radians(14)))) / 28
     config = only(camera_fov=f"{wide},{wide},uniform,scale,episode")
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         nominal = (cell.frame().segmentation >= 0).sum()
         randomizer_of(cell).randomize(0)
@@ -412,7 +412,7 @@ def test_brightness_and_saturation(scene):
         brightness="0.5,0.5,uniform,scale,episode",
         saturation="1e-9,1e-9,uniform,scale,episode",
     )
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         nominal = cell.frame().rgb.astype(float)
         randomizer_of(cell).randomize(0)
@@ -424,7 +424,7 @@ def test_brightness_and_saturation(scene):
 
 def test_depth_noise_comes_and_goes(scene):
     config = only(camera_fov="1,1,uniform,scale,episode", depth_noise_share=1.0)
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         randomizer = randomizer_of(cell)
         randomizer.randomize(0)
@@ -438,7 +438,7 @@ def test_depth_noise_comes_and_goes(scene):
 
 def test_textures_stick_to_a_moved_object(scene):
     config = only(camera_fov="1,1,uniform,scale,episode", colour_share=1.0, texture_share=1.0)
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.build(scene)
         plain = cell.frame()
         randomizer = randomizer_of(cell)
@@ -603,7 +603,7 @@ def test_the_record_of_a_round_replays_its_world(tmp_path):
     append_round(tmp_path / "rounds.jsonl", record)
     (kept,) = read_rounds(tmp_path / "rounds.jsonl")
     assert kept == record and kept.randomization["physics"]["object_mass"]
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         plain = run_round(cell, scene, lambda frame: [], policy="p", objects="box", max_failures=1)
         assert plain.randomization is None
         randomizer = DomainRandomizer(cell, config.randomization, ARM, FINGERS)

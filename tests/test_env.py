@@ -235,7 +235,7 @@ def make_awake(make, monkeypatch):
 
 
 def settle_only(cell) -> bool:
-    """What `Cell.calm` does before it decides."""
+    """What `PybulletCell.calm` does before it decides."""
     settle(cell.client, cell.bodies, cell.config, looks=5)
     return False
 

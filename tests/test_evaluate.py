@@ -15,7 +15,7 @@ import trimesh
 
 import evaluate
 from envs.cell_scenes import make_scene
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.rounds import run_round
 from models.planners import make_planner
 from utils.config import run_script as end_like_a_script
@@ -168,10 +168,10 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["safety.box_lower=[0.15,-0.3,0.02]"], "leaves out [0.42, -0.48, 0.25] m"),
         (["cache_dir=/dev/null/x"], "cache_dir"),
         (
-            ["evaluate.controllers=[open_loop,ibvs]", "grasp.controller=pbvs"],
-            "grasp.controller=pbvs would be ignored: evaluate.controllers is [open_loop, ibvs]",
+            ["evaluate.controllers=[open_loop,ibvs]", "closed_loop.controller=pbvs"],
+            "closed_loop.controller=pbvs would be ignored: evaluate.controllers is [open_loop, ibvs]",
         ),
-        (["evaluate.controllers=ibvs", "grasp.controller=open_loop"], "would be ignored"),
+        (["evaluate.controllers=ibvs", "closed_loop.controller=open_loop"], "would be ignored"),
     ],
 )
 def test_bad_input_is_one_clear_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -231,7 +231,7 @@ def test_piles_of_unseen_objects_are_cleared(config):
     objects = evaluate.load_objects("random_urdfs", config)
     scenes = [make_scene("pile", objects, 700_000 + i, config) for i in range(8)]
     rates = {}
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         for policy in ("random", "heuristic", "oracle"):
             rounds = []
             for scene in scenes:

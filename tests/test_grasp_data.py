@@ -33,7 +33,7 @@ from envs.data_generation import (
 from envs.objects import ObjectError
 from envs.pybullet_appearance import Appearance, Texture, draw_camera
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import Cell, PhysicsError, camera_intrinsics
+from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, SceneGeometry, SolidObject
@@ -381,7 +381,10 @@ def test_scenes_that_cannot_be_made_are_told(config, monkeypatch):
 
     monkeypatch.setattr(data_generation, "make_scene", none)
     given = load_config(None, ["data.object_sets=primitives"])
-    with Cell(config) as cell, pytest.raises(UserError, match="none of 100 .*data.max_objects"):
+    with (
+        PybulletCell(config) as cell,
+        pytest.raises(UserError, match="none of 100 .*data.max_objects"),
+    ):
         draw_scene(given, "train", 1, object_sets(given), cell)
 
 
@@ -429,7 +432,7 @@ def test_validation_keeps_every_tenth_training_object_and_no_test_object(config)
         ("primitives", "validation"): 90,
         ("primitives", "train"): 810,
     }
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         for split, kept in (("train", False), ("validation", True)):
             for seed in range(4):
                 scene, _ = draw_scene(given, split, seed, parts, cell)
@@ -444,7 +447,7 @@ def test_validation_keeps_every_tenth_training_object_and_no_test_object(config)
 @pytest.fixture(scope="module")
 def cell_with_scene(tiny_data):
     config = load_config(None, tiny_data[1])
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         scene, _ = draw_scene(config, "train", 3, object_sets(config), cell)
         cell.load(scene)
         yield cell, scene

@@ -10,13 +10,13 @@ import pybullet
 import pytest
 
 from envs import closed_loop_tracker
-from envs.board_servo import GuardedArm
+from envs.board_servo import ServoArm
 from envs.camera_calibration import level, off, teach, true_beliefs, wrong_beliefs
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedDescent
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import GraspFailure, execute_grasp
-from envs.pybullet_cell import Cell, wrist_mount
+from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import CHALLENGES, Conveyor, Displacement, crossing, disturbed
@@ -31,7 +31,7 @@ CLOSED = ("pbvs", "ibvs", "hybrid")
 
 @pytest.fixture(scope="module")
 def cell(config):
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         teach(cell)  # empties the cell, the first time
         yield cell
 
@@ -178,7 +178,7 @@ def test_fewer_than_three_points_stop_the_arm(cell, scene, monkeypatch):
 
 
 def test_an_approach_that_does_not_end_is_stopped(cell, scene, monkeypatch):
-    short = load_config(None, ["sim.renderer=tiny", "grasp.seconds=0.3"])
+    short = load_config(None, ["sim.renderer=tiny", "closed_loop.seconds=0.3"])
     monkeypatch.setattr(cell, "config", short)
     cell.load(scene)
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "pbvs"))
@@ -298,7 +298,7 @@ def test_images_arrive_late(cell, scene):
 
 def test_the_object_is_found_by_the_real_camera(cell, scene):
     cell.load(scene)
-    descent = GuidedDescent(loop(cell, "pbvs"), GuardedArm(cell), grasp_of_box(cell))
+    descent = GuidedDescent(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
     x, y, turn = np.subtract(
         planar_part(descent.target.T_WO),
         [*cell.object_pose(0)[:2, 3], grasp_of_box(cell).angle],
@@ -311,7 +311,7 @@ def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
     """A law that wishes for nothing: what is left is the velocity of the object's point below the
     hand, v + omega x r by hand, and the goal's sinking. Ahead of the object, not behind it."""
     cell.load(scene)
-    descent = GuidedDescent(loop(cell, "pbvs"), GuardedArm(cell), grasp_of_box(cell))
+    descent = GuidedDescent(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
     state = descent.target.motion.state
     x, y = state[:2]
     state[3:] = [0.04, -0.03, 0.3]
@@ -347,7 +347,7 @@ def test_the_wrist_cameras_noise_is_the_configs_and_of_the_scene(cell, scene, mo
 def test_computing_takes_its_time(cell, scene, monkeypatch):
     """The time to work out a velocity counts as an image's age: too much and the arm stops."""
     monkeypatch.setattr(cell, "config", slow := load_config(
-        None, ["sim.renderer=tiny", "grasp.compute_seconds=0.1"]
+        None, ["sim.renderer=tiny", "closed_loop.compute_seconds=0.1"]
     ))  # fmt: skip
     assert slow.safety.watchdog == 0.1
     record = run_round(

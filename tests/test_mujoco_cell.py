@@ -14,7 +14,7 @@ from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from models.planners import make_planner
 from utils.config import load_config
@@ -25,7 +25,7 @@ from utils.transforms import look_at, position_quaternion
 
 @pytest.fixture(scope="module")
 def worlds(config):
-    with Cell(config) as bullet, MujocoCell(config) as mujoco:
+    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
         yield bullet, mujoco
 
 
@@ -211,14 +211,14 @@ def test_a_world_that_blows_up_says_so(held_box):
 def test_without_mujoco_the_error_says_what_to_do(config, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(UserError, match="pip install"):
-        make_cell(load_config(None, ["world=mujoco"]))
+        make_cell(load_config(None, ["simulator=mujoco"]))
 
 
 def test_randomisation_is_refused():
-    with pytest.raises(UserError, match="world=pybullet"):
-        make_cell(load_config(None, ["world=mujoco", "evaluate.randomise=true"]))
+    with pytest.raises(UserError, match="simulator=pybullet"):
+        make_cell(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
 
 
 def test_a_cell_of_pybullet_is_not_made_for_mujoco():
     with pytest.raises(UserError, match=r"only evaluate\.py"):
-        Cell(load_config(None, ["world=mujoco"]))
+        PybulletCell(load_config(None, ["simulator=mujoco"]))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 import evaluate
-from envs.board_servo import GuardedArm
+from envs.board_servo import ServoArm
 from envs.camera_calibration import teach, true_beliefs
 from envs.cell_layout import GRAVITY
 from envs.cell_scenes import make_scene
@@ -20,7 +20,7 @@ from envs.closed_loop import ClosedLoop, GuidedDescent
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
-from envs.pybullet_cell import Cell, wrist_mount
+from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import CHALLENGES, Conveyor, disturbed
@@ -33,7 +33,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def worlds(config):
-    with Cell(config) as bullet, MujocoCell(config) as mujoco:
+    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
         for cell in (bullet, mujoco):
             teach(cell)  # empties the cell, the first time
         yield bullet, mujoco
@@ -141,7 +141,7 @@ def test_both_wrist_cameras_find_the_object_where_it_is(worlds, scene):
         cell.load(scene)
         grasp = grasp_of_box(cell)
         loop = ClosedLoop(cell, "pbvs", cell.frame(), true_beliefs(cell), teach(cell))
-        found = GuidedDescent(loop, GuardedArm(cell), grasp).target.T_WO
+        found = GuidedDescent(loop, ServoArm(cell), grasp).target.T_WO
         x, y, turn = np.subtract(planar_part(found), [*cell.object_pose(0)[:2, 3], grasp.angle])
         assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
         assert abs(np.degrees((turn + np.pi / 2) % np.pi - np.pi / 2)) < 4
@@ -173,7 +173,7 @@ def test_evaluate_scores_closed_loops(tmp_path, monkeypatch):
     """The command of docs/sim_to_real.md, on one object."""
     monkeypatch.chdir(tmp_path)
     settings = (
-        "world=mujoco", "sim.renderer=tiny", "evaluate.object_sets=box", "evaluate.rounds=1",
+        "simulator=mujoco", "sim.renderer=tiny", "evaluate.object_sets=box", "evaluate.rounds=1",
         "evaluate.scenarios=moved", "evaluate.controllers=open_loop,hybrid", "evaluate.workers=1",
     )  # fmt: skip
     config = REPOSITORY / "configs" / "servo.yaml"

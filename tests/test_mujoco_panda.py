@@ -17,7 +17,7 @@ READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 @pytest.fixture(scope="module")
 def panda(config) -> MujocoPanda:
     dt = 1 / config.sim.frequency
-    return MujocoPanda(ArmGate(config.safety, config.robot, dt, config.grasp.floor), dt=dt)
+    return MujocoPanda(ArmGate(config.safety, config.robot, dt, config.closed_loop.floor), dt=dt)
 
 
 @pytest.fixture(scope="module")

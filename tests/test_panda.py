@@ -40,7 +40,7 @@ def robot(config):
     set_up_physics(client, config.sim)
     urdf = panda_urdf(config.cache_folder, fine=False)
     dt = 1 / config.sim.frequency
-    gate = ArmGate(config.safety, config.robot, dt, config.grasp.floor)
+    gate = ArmGate(config.safety, config.robot, dt, config.closed_loop.floor)
     robot = Panda(client, dt, urdf, config.robot.grip_force, gate)
     robot.place(HOME)
     yield robot

@@ -17,7 +17,7 @@ from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
 from envs.policy_approach import PolicyApproach, nowhere_yet
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from envs.vector_env import make_env
 from models.grasp_policy import load_policy
@@ -98,7 +98,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
     """In the cell of evaluate.py, whose own camera hangs overhead."""
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         approach, outcomes = PolicyApproach(cell, policy, policy.config), []
         for seed in range(3):
             cell.load(make_scene("isolated", objects, seed, config, cell.client))
@@ -112,7 +112,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
 def test_a_policy_that_grips_nothing_is_stopped(box, config):
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config)
         cell.load(make_scene("isolated", objects, 0, config, cell.client))
         outcome = execute_grasp(cell, nowhere_yet(cell.frame())[0], approach)
@@ -177,7 +177,7 @@ def test_an_evaluated_policy_s_actions_get_the_bias_and_noise_of_the_sample():
 
 
 def test_without_noise_an_evaluated_policy_s_actions_are_its_own(config):
-    with randomised() as cell, Cell(config) as plain:
+    with randomised() as cell, PybulletCell(config) as plain:
         told, q = driven(cell, ACTIONS)
         assert cell.on_action is not None and plain.on_action is None
         expected, q_plain = driven(plain, ACTIONS)

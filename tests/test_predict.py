@@ -23,7 +23,7 @@ from torch import nn
 import predict
 from envs.cell_scenes import Placement, Scene
 from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.studio import write_rgbd
 from models import graspnet_backbones, graspnet_inference
 from models.graspnet import GraspNet
@@ -103,7 +103,7 @@ def cell(config, box_set):
         Placement(box_set[0], np.array([*xy, 0.03]), np.array([0, 0, np.sin(a / 2), np.cos(a / 2)]))
         for xy, a in CUBES.items()
     )
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         cell.load(Scene("isolated", 0, placements))
         yield cell
 

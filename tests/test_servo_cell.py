@@ -10,11 +10,11 @@ import pytest
 from benchmarks import bench_servo_cell
 from benchmarks.bench_servo_cell import LAWS, make_task, pose
 from envs.board import Board
-from envs.board_servo import ArmStoppedError, GuardedArm, Sight, servo_arm, servo_settings, view_of
+from envs.board_servo import ArmStoppedError, ServoArm, Sight, servo_arm, servo_settings, view_of
 from envs.cell_layout import static_box
 from envs.cell_scenes import Scene
 from envs.pybullet_camera import Intrinsics, render
-from envs.pybullet_cell import Cell
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
 from utils.config import load_config
 from utils.errors import TargetLostError, UserError
@@ -29,7 +29,7 @@ INTRINSICS = Intrinsics(640, 480, 60.0)
 
 @pytest.fixture(scope="module")
 def cell(config):
-    with Cell(config) as cell:
+    with PybulletCell(config) as cell:
         yield cell
 
 
@@ -220,7 +220,7 @@ def test_nothing_to_see_is_an_error_and_no_motion(cell, config):
 
 def drive(cell, wish, seconds=3.0, carried=None):
     """The reason for which a constant wish (7,) was stopped, and E's path (k, 3)."""
-    arm, path = GuardedArm(cell, carried), []
+    arm, path = ServoArm(cell, carried), []
     with pytest.raises(ArmStoppedError) as stopped:
         for _ in range(round(seconds / cell.dt)):
             path.append(forward_kinematics(cell.robot.q)[:3, 3])

@@ -136,7 +136,7 @@ ESTIMATED = [
 def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory, looks):
     monkeypatch.chdir(tmp_path)
     whole = [*POINT, *ESTIMATED, "rl.total_steps=128", f"rl.estimate_memory={memory}",
-             f"rl.looks={looks}"]  # fmt: skip
+             f"rl.pretraining_images={looks}"]  # fmt: skip
     assert train_rl.main([*whole, "rl.name=whole"]) == 0
     (run,) = Path("runs/train_rl").glob("*-whole")
     expected = load_checkpoint(run / "last.pt", KIND)["model"]
@@ -166,7 +166,7 @@ def test_the_eyes_learn_where_the_goal_is(tmp_path, monkeypatch):
 
 def test_looks_teach_the_eyes_before_anything_is_done(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.looks=2000", "rl.estimate_memory=500",
+    settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.pretraining_images=2000", "rl.estimate_memory=500",
                 "rl.estimate_epochs=8"]  # fmt: skip
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
@@ -179,8 +179,8 @@ def test_looks_teach_the_eyes_before_anything_is_done(tmp_path, monkeypatch):
 
 
 def test_looks_without_anything_to_estimate_are_refused():
-    with pytest.raises(UserError, match="looks .* estimated_observations"):
-        load_config(None, ["rl.looks=64"])
+    with pytest.raises(UserError, match="pretraining_images .* estimated_observations"):
+        load_config(None, ["rl.pretraining_images=64"])
 
 
 def test_what_is_estimated_has_no_other_role():

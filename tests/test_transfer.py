@@ -195,7 +195,7 @@ def test_rows_on_the_same_scenes_are_one_contest():
     config = load_config(
         None,
         [f"transfer.policies={json.dumps(rows)}", "evaluate.scenarios=pile",
-         "evaluate.object_sets=box", "transfer.worlds=[outside,mujoco,cornell]"],
+         "evaluate.object_sets=box", "transfer.columns=[outside,mujoco,cornell]"],
     )  # fmt: skip
     played = evaluate.contests(config)
     told = [(one.world, str(one.scenes), [who.policy for who in one.rows]) for one in played]
@@ -211,7 +211,7 @@ def test_a_row_that_cannot_play_its_scenes_is_named():
     with pytest.raises(UserError, match="the row PPO, none is scored on pile of box; give it"):
         evaluate.main(
             ["transfer.policies=[[PPO, none, ppo, null, null]]", "evaluate.scenarios=pile",
-             "evaluate.object_sets=box", "transfer.worlds=pybullet"]
+             "evaluate.object_sets=box", "transfer.columns=pybullet"]
         )  # fmt: skip
 
 
@@ -229,7 +229,7 @@ def test_the_command_from_end_to_end(tmp_path):
     command = [
         sys.executable, REPOSITORY / "evaluate.py", "--config", REPORT, "evaluate.rounds=1",
         "evaluate.workers=1", "evaluate.scenarios=isolated", "evaluate.object_sets=primitives",
-        "transfer.worlds=pybullet,outside,cornell", "sim.renderer=tiny",
+        "transfer.columns=pybullet,outside,cornell", "sim.renderer=tiny",
         "--results", "copy.json",
     ]  # fmt: skip
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)

@@ -27,11 +27,11 @@ from pydantic import ValidationError
 from utils.config_schema import (
     AdaptationConfig,
     CameraConfig,
+    ClosedLoopConfig,
     Config,
     EnvConfig,
     EvaluateConfig,
     ExecutionConfig,
-    GraspConfig,
     ObjectsConfig,
     RobotConfig,
     SafetyConfig,
@@ -46,6 +46,16 @@ from utils.config_types import OBJECT_SETS, RandomizationConfig, Section
 from utils.errors import UserError, did_you_mean
 
 DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"
+
+
+# Old dotted keys and sections, and what they are called now.
+RENAMED_KEYS = {
+    "world": "simulator",
+    "grasp": "closed_loop",
+    "rl.looks": "rl.pretraining_images",
+    "rl.looks_lr": "rl.pretraining_lr",
+    "transfer.worlds": "transfer.columns",
+}
 
 
 class ConfigError(UserError):
@@ -153,7 +163,20 @@ def explain(error: ValidationError, layers: Sequence[Layer]) -> str:
     return message + (f" (and {more} more problem{'s' * (more > 1)})" if more else "")
 
 
+def new_name(key: str) -> str | None:
+    """What a key, or the section that it is in, was renamed to; None where it was not."""
+    parts = key.split(".")
+    for length in range(len(parts), 0, -1):
+        name = RENAMED_KEYS.get(".".join(parts[:length]))
+        if name is not None:
+            return ".".join([name, *parts[length:]])
+    return None
+
+
 def unknown_key(key: str, source: str) -> str:
+    renamed = new_name(key)
+    if renamed is not None:
+        return f"{key}: this key is now called {renamed} ({source}); use the new name"
     parent, _, leaf = key.rpartition(".")
     section = schema_at(parent) if parent else None
     if section and "properties" in section:  # a misspelt key in a known section
@@ -210,7 +233,7 @@ __all__ = [
     "EnvConfig",
     "EvaluateConfig",
     "ExecutionConfig",
-    "GraspConfig",
+    "ClosedLoopConfig",
     "ObjectsConfig",
     "RandomizationConfig",
     "RobotConfig",

@@ -133,7 +133,7 @@ class ServoConfig(Section):
     settled_frames: Count
 
 
-class GraspConfig(Section):
+class ClosedLoopConfig(Section):
     controller: Controller
     width: Pixels
     height: Pixels
@@ -153,7 +153,7 @@ class GraspConfig(Section):
     camera_turn_deg: Annotated[float, Field(ge=0, le=45)]
 
     @model_validator(mode="after")
-    def _commits_below_the_look(self) -> GraspConfig:
+    def _commits_below_the_look(self) -> ClosedLoopConfig:
         if self.commit_height > self.look_height:
             raise ValueError("commit_height must not be above look_height")
         return self
@@ -174,7 +174,7 @@ class EvaluateConfig(Section):
     name: Name | None
 
 
-TransferWorld = Literal["pybullet", "outside", "mujoco", "cornell", "cornell_as_taken"]
+TransferColumn = Literal["pybullet", "outside", "mujoco", "cornell", "cornell_as_taken"]
 
 
 class TransferPolicy(NamedTuple):
@@ -203,7 +203,7 @@ TransferRow = Annotated[
 
 class TransferConfig(Section):
     policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(no_repeats)] | None
-    worlds: Annotated[tuple[TransferWorld, ...], Several, AfterValidator(no_repeats)]
+    columns: Annotated[tuple[TransferColumn, ...], Several, AfterValidator(no_repeats)]
     cornell: Annotated[Path, Field(strict=False)] | None
 
 
@@ -324,8 +324,8 @@ class RLConfig(Section):
     estimate_lr: Positive
     estimate_memory: Annotated[int, Field(ge=0)]
     estimate_recall: Count
-    looks: Annotated[int, Field(ge=0)]
-    looks_lr: Positive
+    pretraining_images: Annotated[int, Field(ge=0)]
+    pretraining_lr: Positive
     normalise_observations: bool
     normalise_rewards: bool
     squash: bool
@@ -355,9 +355,9 @@ class RLConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _looks_teach_something(self) -> RLConfig:
-        if self.looks and not self.estimated_observations:
-            raise ValueError("looks are to learn estimates from: name estimated_observations")
+    def _pretraining_teaches_something(self) -> RLConfig:
+        if self.pretraining_images and not self.estimated_observations:
+            raise ValueError("pretraining_images teach the estimates: name estimated_observations")
         return self
 
     @model_validator(mode="after")
@@ -375,7 +375,7 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
-    world: Literal["pybullet", "mujoco"]
+    simulator: Literal["pybullet", "mujoco"]
     sim: SimConfig
     robot: RobotConfig
     camera: CameraConfig
@@ -385,7 +385,7 @@ class Config(Section):
     execution: ExecutionConfig
     safety: SafetyConfig
     servo: ServoConfig
-    grasp: GraspConfig
+    closed_loop: ClosedLoopConfig
     data: DataConfig
     train: TrainConfig
     adaptation: AdaptationConfig

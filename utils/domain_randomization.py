@@ -41,8 +41,8 @@ class World(PhysicsWorld, Protocol):
 class DomainRandomizer:
     """Draws a world for each episode, applies it to a cell, and takes it back.
 
-    Call `randomize` when the cell's scene has been built (`Cell.on_build`); in between, `act` gives
-    what becomes of each action (`Cell.on_action`). A sample is a plain dict of text, numbers, lists
+    Call `randomize` when the cell's scene has been built (`PybulletCell.on_build`); in between, `act` gives
+    what becomes of each action (`PybulletCell.on_action`). A sample is a plain dict of text, numbers, lists
     and dicts, the same after a journey through JSON; with the same scene and actions,
     `replay(sample)` gives the same episode bit for bit. It holds:
 

@@ -48,7 +48,7 @@ class Task:
 
 def contestants(config: Config) -> list[tuple[str, str]]:
     """Every planner with every controller."""
-    controllers = config.evaluate.controllers or (config.grasp.controller,)
+    controllers = config.evaluate.controllers or (config.closed_loop.controller,)
     return [
         (planner, controller) for planner in config.evaluate.policies for controller in controllers
     ]
@@ -103,14 +103,14 @@ def interruption(rounds_done: int, config: Config) -> str | None:
 
 
 def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
-    """Raise UserError for a grasp.controller that evaluate.controllers would leave unheard."""
-    several, one = config.evaluate.controllers, config.grasp.controller
-    asked = any(change.split("=")[0].strip() == "grasp.controller" for change in overrides)
+    """Raise UserError for a closed_loop.controller that evaluate.controllers would leave unheard."""
+    several, one = config.evaluate.controllers, config.closed_loop.controller
+    asked = any(change.split("=")[0].strip() == "closed_loop.controller" for change in overrides)
     if several is not None and (asked or one != OPEN_LOOP):
         raise UserError(
-            f"grasp.controller={one} would be ignored: evaluate.controllers is "
+            f"closed_loop.controller={one} would be ignored: evaluate.controllers is "
             f"[{', '.join(several)}] and says which controllers are scored; write "
-            f"evaluate.controllers={one} or, to have grasp.controller count, "
+            f"evaluate.controllers={one} or, to have closed_loop.controller count, "
             "evaluate.controllers=null"
         )
 
