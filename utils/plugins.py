@@ -1,0 +1,84 @@
+"""Plug-ins by import path: `module:name` names an object of a module outside this repository.
+
+Gymnasium names its environments in the same way. A planner, an object set, a depth noise or a reward
+term that is given as `module:name` needs no entry in a registry. The module must be importable:
+from the current folder, from `PYTHONPATH` or as an installed package. This module knows nothing
+about what is loaded.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from utils.errors import UserError, did_you_mean
+
+IMPORT_PATH = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$"
+
+
+def is_import_path(name: str) -> bool:
+    """Whether `name` has the form `module:name`; it need not exist. `ppo:model.pt` has it too."""
+    return re.fullmatch(IMPORT_PATH, name) is not None
+
+
+def load_plugin(path: str, what: str, must_be_callable: bool = True) -> Any:
+    """The object that `path`, of the form `module:name`, names.
+
+    path: dotted module, colon, name; the name may be dotted, as `module:Class.method`.
+    what: the purpose in the error message, such as the config key "evaluate.policies".
+    must_be_callable: refuse what cannot be called.
+    Raises UserError, in one sentence, for a path of another form, a module that does not exist or
+    fails while it is imported, a missing name, and an object that cannot be called.
+    """
+    if not is_import_path(path):
+        raise UserError(
+            f"{what}: got {path!r}, expected an import path module:name such as my_module:plan"
+        )
+    module_name, _, name = path.partition(":")
+    module = _import(module_name, path, what)
+    found: Any = module
+    for part in name.split("."):
+        if not hasattr(found, part):
+            public = [known for known in dir(found) if not known.startswith("_")]
+            raise UserError(
+                f"{what}: {path!r} cannot be loaded: {getattr(found, '__name__', module_name)} has "
+                f"no {part!r}{did_you_mean(part, public) or '; check the name after the colon'}"
+            )
+        found = getattr(found, part)
+    if must_be_callable and not callable(found):
+        raise UserError(
+            f"{what}: {path!r} is a {type(found).__name__}, expected something that can be called"
+        )
+    return found
+
+
+def _import(module_name: str, path: str, what: str) -> Any:
+    # A script's own folder is on sys.path, the folder that it is started from need not be.
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        missing = error.name or module_name
+        if module_name == missing or module_name.startswith(f"{missing}."):
+            raise UserError(
+                f"{what}: {path!r} cannot be loaded: there is no module {missing!r}; start in the "
+                "folder that holds it, or add that folder to PYTHONPATH"
+            ) from error
+        raise _failed(error, path, what) from error
+    except Exception as error:  # whatever the module's own code raises is its author's to mend
+        raise _failed(error, path, what) from error
+
+
+def _failed(error: Exception, path: str, what: str) -> UserError:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    reason = " ".join(str(error).split())
+    return UserError(
+        f"{what}: {path!r} cannot be loaded: its module raised {type(error).__name__}: {reason} "
+        f"({last.filename}, line {last.lineno}); mend the module"
+    )
