@@ -32,10 +32,8 @@ import argparse
 import math
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from threading import Event
 
 import numpy as np
 import torch
@@ -51,7 +49,7 @@ from models.graspnet_data import TrainingData, simulated_data
 from models.graspnet_examples import EpochBatches
 from models.graspnet_io import load_graspnet, load_initial, save_graspnet
 from models.graspnet_scores import check_graspable, draw_curves, draw_predictions
-from models.graspnet_training import Team, Trainer, team
+from models.graspnet_training import Trainer
 from models.rectangle_examples import Judged, draw_rectangles
 from models.rectangle_folds import (
     Fold,
@@ -61,6 +59,7 @@ from models.rectangle_folds import (
     real_folds,
 )
 from utils.config import Config, load_config, parse_args, run_script
+from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
@@ -86,14 +85,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         if photographs is not None:
             data = with_target(config, data, photographs)
         trainer = make_trainer(config, data, us)
-        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
+        run = options.resume or Path(us.broadcast(us.is_main and open_run(config)))
         history, losses = load_progress(trainer, run / "last.pt")
-        if us.leads:
+        if us.is_main:
             announce(config, run, data, trainer)
 
         finished = train(config, run, data, trainer, history, losses)
 
-        if us.leads:
+        if us.is_main:
             # A network that is half trained must not replace one that is not.
             save_results(run, data, history, options.weights if finished else None)
             if not finished:
@@ -135,7 +134,7 @@ def make_data(config: Config, us: Team) -> TrainingData:
     folder = generate(config, us.rank, us.ranks)
     us.wait()
     truth = label_truth(read_trials(folder))
-    if us.leads and truth.positives:
+    if us.is_main and truth.positives:
         low, high = truth.precision_ci95
         print(
             f"labels against physics: {truth.executed} executed, precision "
@@ -212,8 +211,8 @@ def train(
     the steps already taken in the epoch that history lacks.
     """
     us, steps = trainer.team, steps_per_epoch(config, data)
-    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if us.leads else None
-    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not us.leads)
+    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if us.is_main else None
+    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not us.is_main)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:
         for epoch in range(len(history), config.train.epochs):
@@ -227,7 +226,7 @@ def train(
                 if time.monotonic() - last_save > SAVE_SECONDS:
                     save_last(run, config, data, trainer, history, losses)
                     last_save = time.monotonic()
-            if us.leads:
+            if us.is_main:
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
                 row |= data.score(trainer.model)
                 history.append(row)
@@ -276,24 +275,13 @@ def save_last(
     run: Path, config: Config, data: TrainingData, trainer: Trainer,
     history: list[dict], losses: list[dict],
 ) -> None:  # fmt: skip
-    if trainer.team.leads:
+    if trainer.team.is_main:
         progress = {"history": history, "losses": losses}
         trainer.save(run / "last.pt", config, data.metres_per_pixel, **progress)
 
 
 def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-@contextmanager
-def stop_on_interrupt() -> Iterator[Event]:
-    """An event that Ctrl-C sets, so that a step is never left half done."""
-    interrupted = Event()
-    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
-    try:
-        yield interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def ignore_interrupt(worker: int) -> None:
@@ -325,21 +313,21 @@ def cross_validate(config: Config, resume: Path | None, weights: Path | None, us
     if weights is not None and config.data.fold is None:
         raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
     folds = real_folds(config)
-    run = resume or Path(us.broadcast(us.leads and open_run(config)))
+    run = resume or Path(us.broadcast(us.is_main and open_run(config)))
     judged: dict[int, list[Judged]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"
         trainer = make_trainer(config, fold.data, us)
         history, losses = load_progress(trainer, folder / "last.pt")
-        if us.leads:
+        if us.is_main:
             folder.mkdir(exist_ok=True)
             announce(config, folder, fold.data, trainer)
         us.wait()
         if not train(config, folder, fold.data, trainer, history, losses):
-            if us.leads:
+            if us.is_main:
                 print(f"stopped in fold {fold.number}; go on with --resume {run}")
             return 130
-        if us.leads:
+        if us.is_main:
             judged[fold.number] = fold.judge(trainer.model)
             save_fold(config, folder, fold, judged[fold.number], trainer, history, weights)
             print(describe_fold(fold, judged[fold.number]), flush=True)
@@ -348,7 +336,7 @@ def cross_validate(config: Config, resume: Path | None, weights: Path | None, us
                 run / "results.json", {"schema": 1, "commit": git_state().commit, **results}
             )
         us.wait()
-    if us.leads:
+    if us.is_main:
         print(describe_folds(config, judged))
         print(f"every prediction: {run / 'results.json'} and {run / 'fold*' / 'predictions.png'}")
     return 0

@@ -27,21 +27,18 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.studio import film_episode
 from envs.vector_env import VectorEnvs, WorkerError, full_difficulty, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy, policy_for, save_policy
-from models.graspnet_training import Team, choose_device, team
 from models.ppo import KIND
 from models.ppo_observations import ObservationLayout
 from models.ppo_rollouts import (
@@ -55,10 +52,10 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
-from train_graspnet import stop_on_interrupt
 from utils.adaptive_ranges import Bound
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, load_config, parse_args, run_script
+from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.runs import Stopwatch, check_writable, git_state, new_run_folder, write_json_atomic
 
@@ -81,15 +78,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train a policy by PPO.", _add_options)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume)
-    with rl_team(config) as us, vector_envs(config, envs_of(config, us)) as envs:
+    with team(config.rl.device, os.environ, "rl.device") as us, vector_envs(config, envs_of(config, us)) as envs:
         ppo = make_ppo(config, envs, us)
-        run = options.resume or Path(us.broadcast(us.leads and open_run(config)))
+        run = options.resume or Path(us.broadcast(us.is_main and open_run(config)))
         history = load_progress(ppo, envs, run / "last.pt")
         announce(config, run, envs, ppo)
 
         finished = train(config, run, envs, ppo, history)
 
-        if us.leads:
+        if us.is_main:
             # A policy that is half trained must not replace one that is not.
             save_results(run, history, options.weights if finished else None)
             film(config, run, ppo)
@@ -119,15 +116,6 @@ def check_resume(config: Config, run: Path | None) -> None:
             f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
             "for anything else, from its weights with rl.initial"
         )
-
-
-def rl_team(config: Config) -> AbstractContextManager[Team]:
-    """This process's place among those of torchrun; UserError for a device that is not there."""
-    try:
-        choose_device(config.rl.device, int(os.environ.get("LOCAL_RANK", 0)))
-    except UserError as error:
-        raise UserError(str(error).replace("train.device", "rl.device")) from None
-    return team(config.rl.device, dict(os.environ))
 
 
 def envs_of(config: Config, us: Team) -> int:
@@ -173,7 +161,7 @@ def load_progress(ppo: GraspPPO, envs: VectorEnvs, last: Path) -> list[dict]:
 
 def announce(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO) -> None:
     us, settings = ppo.team, config.rl
-    if us.leads:
+    if us.is_main:
         layout = ppo.layout
         seen = ", ".join(part.key for part in (*layout.images, *layout.state))
         hidden = ", ".join(part.key for part in layout.privileged)
@@ -201,11 +189,11 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
     collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, us.device, watch)
     per_update, total = settings.envs * settings.rollout_steps, updates(config)
     step = ppo.updates * per_update
-    writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.leads else None
+    writer = SummaryWriter(run / "tensorboard", purge_step=step) if us.is_main else None
     try:
         if config.rl.pretraining_images and not history:
             learn_to_see(config, envs, ppo, watch, writer)
-        bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.leads)
+        bar = tqdm(total=total * per_update, initial=step, unit="step", disable=not us.is_main)
         with stop_on_interrupt() as interrupted, bar:
             while True:
                 if ppo.updates % settings.evaluate_every == 0 or ppo.updates == total:
@@ -228,12 +216,12 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                 with watch(NETWORK):
                     losses = ppo.update(rollout, ppo.updates / total)
                 step += per_update
-                played = from_all(us, rollout.episodes)
+                played = all_episodes(us, rollout.episodes)
                 widen(envs, played)
                 episodes = summary(played)
                 bar.update(per_update)
                 bar.set_postfix({k: f"{v:.3g}" for k, v in episodes.items() if k != "length"})
-                if us.leads:
+                if us.is_main:
                     log(writer, step, "rollout", episodes)
                     log(writer, step, "update", losses)
                     log(writer, step, "ranges", widths(envs))
@@ -250,7 +238,7 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
         print(f"after this error, go on with --resume {run}", file=sys.stderr)
         raise
     finally:
-        if us.leads:
+        if us.is_main:
             writer.close()
             print(shares_in_words(watch), flush=True)
     return True
@@ -265,7 +253,7 @@ def learn_to_see(
     seeds: Sequence[int | None] = derived_seeds(envs.num_envs, config.seed, LOOKING, us.rank)
     ppo.generator.manual_seed(derived_seeds(1, config.seed, LOOKING, us.rank)[0])
     with envs.looking(), tqdm(
-        total=chunks * settings.envs * LOOKS, unit="look", disable=not us.leads
+        total=chunks * settings.envs * LOOKS, unit="look", disable=not us.is_main
     ) as bar:  # fmt: skip
         for chunk in range(chunks):
             with watch(SIMULATION):
@@ -278,9 +266,9 @@ def learn_to_see(
             seeds = [None] * envs.num_envs
             bar.update(settings.envs * LOOKS)
             bar.set_postfix(loss=f"{new:.3g}")
-            if us.leads:
+            if us.is_main:
                 # Before step 0, so that resuming leaves them where they are.
-                log(writer, (chunk + 1 - chunks) * settings.envs * LOOKS, "looks", {"loss": new})
+                log(writer, (chunk + 1 - chunks) * settings.envs * LOOKS, "pretraining", {"loss": new})
     ppo.memory.clear()
 
 
@@ -296,7 +284,7 @@ def evaluate(
             if own
             else []
         )
-    row = {"update": ppo.updates, "step": step, **summary(from_all(ppo.team, episodes))}
+    row = {"update": ppo.updates, "step": step, **summary(all_episodes(ppo.team, episodes))}
     return row if envs.ranges is None else row | {"range_width": envs.ranges.width}
 
 
@@ -320,13 +308,9 @@ def act_on_one(ppo: GraspPPO, observation: Any) -> np.ndarray:
     return ppo.network.action(latent)[0].cpu().numpy()
 
 
-def from_all(us: Team, episodes: list[Episode]) -> list[Episode]:
+def all_episodes(us: Team, episodes: list[Episode]) -> list[Episode]:
     """The episodes of all processes."""
-    if us.ranks == 1:
-        return episodes
-    lists = [None] * us.ranks
-    dist.all_gather_object(lists, episodes)
-    return [Episode(*episode) for part in lists for episode in part]
+    return [Episode(*episode) for episode in us.concatenate(episodes)]
 
 
 def summary(episodes: Sequence[Episode]) -> dict[str, float]:
@@ -374,7 +358,7 @@ def save_evaluation(
     writer: SummaryWriter, bar: tqdm,
 ) -> None:  # fmt: skip
     """Checkpoints, TensorBoard and a line for the last row of history."""
-    if ppo.team.leads:
+    if ppo.team.is_main:
         row = history[-1]
         progress = {"history": history}
         if envs.ranges is not None:

@@ -172,8 +172,8 @@ def whole_updates(config: Config, steps: int) -> int:
 def train_ours(env: str, seed: int, steps: int) -> Result:
     from envs.vector_env import vector_envs
     from models.ppo_rollouts import RolloutCollector, derived_seeds, evaluate_policy
-    from models.ranks import ALONE
     from train_rl import make_ppo
+    from utils.distributed import ALONE
     from utils.runs import Stopwatch
 
     config = config_of(env, seed)

@@ -28,7 +28,7 @@ from models.graspnet import DEPTH_UNIT, GraspNet, to_input
 from models.graspnet_data import TrainingData
 from models.graspnet_examples import Example, LabelledImages
 from models.graspnet_scores import predict
-from models.graspnet_training import Team, Trainer
+from models.graspnet_training import Trainer
 from models.photographs import K, frame_of, from_above
 from models.rectangle_examples import RectangleImages, View
 from models.rectangle_folds import IN_MEMORY, Changed, Chosen
@@ -47,6 +47,7 @@ from utils.adaptation import (
 from utils.augmentation import Augmentation, ColourJitter
 from utils.checkpoint import load_weights
 from utils.config import AdaptationConfig, Config, TrainConfig
+from utils.distributed import Team
 from utils.errors import UserError
 from utils.real_data import KEY, RealSample, UnlabelledImages
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses

@@ -1,4 +1,4 @@
-"""Training steps of GraspNet: precision, schedule, checkpoints that resume exactly, many processes.
+"""Training steps of GraspNet: precision, schedule, checkpoints that resume exactly.
 
 Knows neither where batches come from nor how a trained network is judged.
 """
@@ -6,13 +6,10 @@ Knows neither where batches come from nor how a trained network is judged.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -21,90 +18,10 @@ from models.graspnet_examples import Example
 from models.graspnet_io import KIND, PIXEL_SIZE
 from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
 from utils.config import Config, TrainConfig
+from utils.distributed import Team
 from utils.errors import UserError
 
 GRADIENT_LIMIT = 5.0  # of the gradient's norm; only the first steps ever reach it
-
-
-class Team(NamedTuple):
-    """The processes that train together: this one's rank, how many there are, its device."""
-
-    rank: int
-    ranks: int
-    device: torch.device
-
-    @property
-    def leads(self) -> bool:
-        """Whether this process writes files and prints."""
-        return self.rank == 0
-
-    def wait(self) -> None:
-        """Until all have come here."""
-        if self.ranks > 1:
-            dist.barrier()
-
-    def any(self, flag: bool) -> bool:
-        """Whether the flag is set in any process."""
-        if self.ranks == 1:
-            return flag
-        found = torch.tensor(float(flag), device=self.device)
-        dist.all_reduce(found, dist.ReduceOp.MAX)
-        return bool(found)
-
-    def broadcast(self, value: Any) -> Any:
-        """The first process's value, for all."""
-        holder = [value]
-        if self.ranks > 1:
-            dist.broadcast_object_list(holder, src=0)
-        return holder[0]
-
-
-@contextmanager
-def team(device: str, environment: dict[str, str]) -> Iterator[Team]:
-    """This process's place among those that `torchrun` started (its variables in `environment`),
-    or alone. device: auto | cpu | cuda | cuda:N; auto takes a GPU where there is one.
-
-    Raises UserError for a device that is not here, or one GPU for several processes.
-    """
-    ranks = int(environment.get("WORLD_SIZE", 1))
-    local = int(environment.get("LOCAL_RANK", 0))
-    if ranks > 1 and device.startswith("cuda:"):
-        raise UserError(
-            f"device {device}: {ranks} processes cannot share one GPU; choose cuda or auto, and "
-            "each takes its own"
-        )
-    chosen = choose_device(device, local)
-    if ranks == 1:
-        yield Team(0, 1, chosen)
-        return
-    if chosen.type == "cuda":  # objects are broadcast by way of the current device
-        torch.cuda.set_device(chosen)
-    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
-    try:
-        yield Team(dist.get_rank(), ranks, chosen)
-    finally:
-        dist.destroy_process_group()
-
-
-def choose_device(name: str, local_rank: int = 0) -> torch.device:
-    """The torch device of that name; UserError if it does not exist here."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = None
-    if device is None or device.type not in ("cpu", "cuda"):
-        raise UserError(f"train.device: got {name!r}, expected auto, cpu, cuda or cuda:N")
-    if device.type == "cuda":
-        count = torch.cuda.device_count()
-        index = local_rank if device.index is None else device.index
-        if index >= count:
-            raise UserError(
-                f"train.device={name}: this machine has {count} CUDA GPUs; use train.device=auto"
-            )
-        device = torch.device("cuda", index)
-    return device
 
 
 def choose_precision(name: str, device: torch.device) -> torch.dtype:

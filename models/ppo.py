@@ -19,9 +19,9 @@ from torch import nn
 
 from models.ppo_observations import ObservationLayout, Observations, RewardScaler
 from models.ppo_rollouts import NotFinite, Rollout, StepMemory, joined
-from models.ranks import ALONE, average, gather, share_weights
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import Config, RLConfig
+from utils.distributed import ALONE
 from utils.errors import UserError
 
 KIND = "grasp_policy"
@@ -82,7 +82,7 @@ class GraspPPO:
         self.generator = torch.Generator()
         # Not in a checkpoint: cleared at every one, so that going on from it is as going on.
         self.memory = StepMemory(settings.estimate_memory)
-        share_weights(team, network)
+        team.share_weights(network)
         eyes = self.network.eyes()
         theirs = {id(p) for p in eyes}
         self.weights = in_one_vector([p for p in self.network.parameters() if id(p) not in theirs])
@@ -147,7 +147,7 @@ class GraspPPO:
         # Only now, so that all of the rollout and its update saw the same normalised numbers.
         self.network.observe(self._flat(rollout), self.team)
         self.updates += 1
-        means = gather(self.team, torch.stack(watched).mean(0)).mean(0).tolist()
+        means = self.team.gather(torch.stack(watched).mean(0)).mean(0).tolist()
         return dict(zip(Losses._fields, means)) | {
             "gradient_norm": float(np.mean(norms)),
             "explained_variance": explained_variance,
@@ -171,7 +171,7 @@ class GraspPPO:
             self.eyes_optimizer.step()
             watched.append(loss.detach())
         self.memory.add(new)
-        return gather(self.team, torch.stack(watched).mean()).mean().item()
+        return self.team.gather(torch.stack(watched).mean()).mean().item()
 
     @torch.no_grad()
     def estimate_loss(self, seen: Observations) -> float:
@@ -180,7 +180,7 @@ class GraspPPO:
         for start in range(0, len(seen.state), size):
             part = seen.rows(slice(start, start + size))
             losses.append(self.network.estimate_loss(part.image(), part.state, part.privileged))
-        return gather(self.team, torch.stack(losses).mean()).mean().item()
+        return self.team.gather(torch.stack(losses).mean()).mean().item()
 
     def _new_and_remembered(self, new: Observations) -> Iterator[Observations]:
         """Minibatches of steps (B, ...), each with `estimate_recall` times as many from
@@ -196,7 +196,7 @@ class GraspPPO:
         gradient = (self.weights if weights is None else weights).grad
         gradient.zero_()
         loss.backward()
-        average(self.team, gradient)
+        self.team.average(gradient)
         norm = gradient.norm().item()
         if norm > self.settings.max_gradient_norm:
             gradient.mul_(self.settings.max_gradient_norm / norm)
@@ -295,7 +295,7 @@ class GraspPPO:
 
     def _normalised(self, advantages: torch.Tensor) -> torch.Tensor:
         """Advantages with zero mean and unit deviation over the joint minibatch."""
-        joint = gather(self.team, advantages)
+        joint = self.team.gather(advantages)
         if joint.numel() == 1:
             return advantages
         return (advantages - joint.mean()) / (joint.std() + SMALLEST_DEVIATION)
@@ -310,7 +310,7 @@ class GraspPPO:
         target = self.settings.target_kl
         if target is None:
             return False
-        return float(gather(self.team, approx_kl.detach()).mean()) > KL_SLACK * target
+        return float(self.team.gather(approx_kl.detach()).mean()) > KL_SLACK * target
 
     # --- Checkpoints ----------------------------------------------------------------------------
 

@@ -20,8 +20,7 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from models.graspnet_training import Team
-from models.ranks import ALONE, gather
+from utils.distributed import ALONE, Team
 from utils.errors import UserError, unknown_choice
 
 ALL = "observation"  # the name of an observation that is no dict
@@ -232,7 +231,7 @@ class RunningMoments(nn.Module):
         samples = samples.to(torch.float64)
         own = torch.stack([samples.mean(0), samples.var(0, correction=0)])
         size = torch.full_like(own[:1], len(samples))
-        for count, mean, variance in gather(team, torch.cat([size, own])):
+        for count, mean, variance in team.gather(torch.cat([size, own])):
             self._merge(count[0], mean, variance)
 
     def _merge(self, count: torch.Tensor, mean: torch.Tensor, variance: torch.Tensor) -> None:

@@ -20,7 +20,7 @@ from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import CHALLENGES, Conveyor, Displacement, crossing, disturbed
-from tests.box_rounds import grasp_of_box, round_with_a_box
+from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.config_types import ScoredScenario
 from utils.table_plane import planar_part, table_plane

@@ -34,19 +34,19 @@ from models.graspnet_adaptation import (
 from models.graspnet_backbones import BACKBONES
 from models.graspnet_data import TrainingData
 from models.graspnet_io import KIND, load_graspnet
-from models.graspnet_training import Team
 from models.photographs import K, frame_of
-from tests.one_step import BATCH, joint_batch
+from tests.helpers.compare import same
+from tests.helpers.one_step import BATCH, joint_batch
 from tests.test_real_training import write_cornell
-from tests.test_train_graspnet import SMALL, labelled, same
+from tests.test_train_graspnet import SMALL, labelled
 from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, select_domain
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
+from utils.distributed import ALONE, Team
 from utils.errors import UserError
 from utils.real_data import UnlabelledImages
 from utils.table_plane import DEPTHS, FROM_BASE, FROM_CAMERA, distances
 
-ALONE = Team(0, 1, torch.device("cpu"))
 NO_GRASPS = [f"train.{part}_weight=0" for part in ("quality", "angle", "width", "centre")]
 KINECT = (480, 640)  # rows, columns
 

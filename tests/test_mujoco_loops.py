@@ -24,7 +24,7 @@ from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import CHALLENGES, Conveyor, disturbed
-from tests.box_rounds import grasp_of_box, round_with_a_box
+from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.table_plane import planar_part
 from utils.transforms import top_down_pose
 

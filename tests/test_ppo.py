@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
-import tests.quick_envs  # noqa: F401, registers its environments
+import tests.helpers.quick_envs  # noqa: F401, registers its environments
 from models.grasp_policy import (
     ActionDistribution,
     GraspPolicyNetwork,
@@ -37,10 +37,10 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
-from models.ranks import ALONE
-from tests.test_train_graspnet import same
+from tests.helpers.compare import same
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
+from utils.distributed import ALONE
 from utils.errors import UserError
 from utils.runs import Stopwatch
 

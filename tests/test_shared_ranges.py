@@ -20,7 +20,7 @@ import train_rl
 from envs.grasping_env import RobotGraspingEnv
 from envs.vector_env import vector_envs
 from models.ppo import KIND
-from tests.test_train_graspnet import same
+from tests.helpers.compare import same
 from tests.test_train_rl import REPOSITORY, TORCHRUN
 from utils.adaptive_ranges import AdaptiveRanges, Bound
 from utils.checkpoint import load_checkpoint

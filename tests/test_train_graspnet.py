@@ -25,35 +25,18 @@ from models.graspnet_decoding import Peaks
 from models.graspnet_examples import AtPixelSize, EpochBatches, GraspExamples
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores, check_graspable, score_labels, score_peak
-from models.graspnet_training import (
-    Team,
-    Trainer,
-    choose_device,
-    choose_precision,
-    team,
-    warm_up_and_cosine,
-)
-from tests.one_step import joint_batch, part_of, take_steps
+from models.graspnet_training import Trainer, choose_precision, warm_up_and_cosine
+from tests.helpers.compare import same
+from tests.helpers.one_step import joint_batch, part_of, take_steps
 from utils.augmentation import Augmentation, LabelledImage
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
+from utils.distributed import ALONE, Team
 from utils.errors import UserError
 from utils.grasp_data import shard_path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-ALONE = Team(0, 1, torch.device("cpu"))
 BINS = 18
-
-
-def same(a, b) -> bool:
-    """Whether two nested containers of tensors and plain values are equal bit for bit."""
-    if isinstance(a, torch.Tensor):
-        return a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return a == b
 
 
 # --- Batches ---------------------------------------------------------------------------------
@@ -288,7 +271,7 @@ def test_checkpoints_that_do_not_fit_are_told(tmp_path, config):
 def test_two_processes_take_the_step_of_the_joint_batch(tmp_path):
     run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     done = subprocess.run(
-        [*run, "-m", "tests.one_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
+        [*run, "-m", "tests.helpers.one_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -307,46 +290,6 @@ def test_two_processes_take_the_step_of_the_joint_batch(tmp_path):
 def test_a_batch_that_cannot_be_shared_equally_is_refused():
     with pytest.raises(UserError, match="batch_size is 4, but 3 processes"):
         trainer_of(team=Team(0, 3, torch.device("cpu")))
-
-
-@pytest.mark.parametrize("name", ["gpu", "cpu0x", "meta", "mps", ""])
-def test_names_that_are_no_device(name):
-    with pytest.raises(UserError, match="expected auto, cpu, cuda"):
-        choose_device(name)
-
-
-def test_devices(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    assert choose_device("auto") == choose_device("cpu") == torch.device("cpu")
-    with pytest.raises(UserError, match="train.device=cuda: this machine has 0 CUDA GPUs"):
-        choose_device("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert choose_device("auto", local_rank=1) == torch.device("cuda", 1)
-    assert choose_device("cuda:0", local_rank=1) == torch.device("cuda", 0)
-    with pytest.raises(UserError, match="cuda:2: this machine has 2 CUDA GPUs"):
-        choose_device("cuda:2")
-
-
-def test_several_processes_do_not_share_one_gpu():
-    with (
-        pytest.raises(UserError, match="cuda:0: 2 processes cannot share one GPU.*cuda or auto"),
-        team("cuda:0", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}),
-    ):
-        pass
-
-
-def test_a_process_takes_its_gpu_before_it_talks_to_the_others(monkeypatch):
-    calls = []
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(torch.cuda, "set_device", calls.append)
-    monkeypatch.setattr(torch.distributed, "init_process_group", calls.append)
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
-    monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: None)
-    with team("cuda", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}) as us:
-        assert us == Team(1, 2, torch.device("cuda", 1))
-    assert calls == [torch.device("cuda", 1), "nccl"]
 
 
 def test_precisions():

@@ -23,18 +23,18 @@ from envs.vector_env import WorkerError, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy
 from models.ppo import KIND
 from models.ppo_rollouts import evaluate_policy
-from models.ranks import ALONE
-from tests.ppo_step import SIZE, take_step
+from tests.helpers.compare import same
+from tests.helpers.ppo_step import SIZE, take_step
 from tests.test_ppo import batch_of, ppo_of
-from tests.test_train_graspnet import same
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
+from utils.distributed import ALONE
 from utils.errors import UserError
 from utils.runs import Stopwatch
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 POINT = [
-    "rl.env_id=tests.quick_envs:QuickPoint-v0", "rl.envs=2", "rl.rollout_steps=16",
+    "rl.env_id=tests.helpers.quick_envs:QuickPoint-v0", "rl.envs=2", "rl.rollout_steps=16",
     "rl.batch_size=16", "rl.total_steps=192", "rl.evaluate_every=2", "rl.evaluation_episodes=3",
     "rl.hidden_dim=8", "rl.device=cpu", "rl.parallel=false", "rl.epochs=2",
 ]  # fmt: skip
@@ -171,7 +171,7 @@ def test_looks_teach_the_eyes_before_anything_is_done(tmp_path, monkeypatch):
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
     events = EventAccumulator(str(run / "tensorboard")).Reload()
-    looks = events.Scalars("looks/loss")
+    looks = events.Scalars("pretraining/loss")
     assert [event.step for event in looks] == list(range(-1984, 1, 64)), "whole turns of 2 x 32"
     assert looks[-1].value < looks[0].value / 2, "of images not learned from yet"
     first = events.Scalars("update/estimate_loss")[0].value
@@ -287,7 +287,7 @@ def test_a_training_can_start_from_weights(finished, tmp_path, monkeypatch):
         (["rl.env_id=no_such_module:Pendulum-v1"], "rl.env_id .*no_such_module"),
         (["rl.env_kwargs=gravity=3"], "rl.env_kwargs .*gravity"),
         (["rl.env_kwargs=gravity"], "rl.env_kwargs.*NAME=VALUE"),
-        (["rl.env_id=tests.quick_envs:QuickDiscrete-v0"], "Discrete"),
+        (["rl.env_id=tests.helpers.quick_envs:QuickDiscrete-v0"], "Discrete"),
         (["rl.env_id=CartPole-v1"], "Discrete"),
         (["rl.policy_observations=stat"], "'stat', expected one of state; did you mean state"),
         (["rl.policy_observations=name"], "info entry 'name' is no number"),
@@ -381,7 +381,7 @@ TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--np
 @pytest.mark.slow
 def test_two_processes_take_the_step_of_the_joint_minibatch(tmp_path):
     done = subprocess.run(
-        [*TORCHRUN, "-m", "tests.ppo_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
+        [*TORCHRUN, "-m", "tests.helpers.ppo_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

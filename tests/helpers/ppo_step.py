@@ -1,4 +1,4 @@
-"""Updates of a GraspPPO alone or, started by torchrun, of several: python -m tests.ppo_step FOLDER
+"""Updates of a GraspPPO alone or, started by torchrun, of several: python -m tests.helpers.ppo_step FOLDER
 
 Every process leaves its gradient of the first minibatch and its weights after it in FOLDER.
 """
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from models.graspnet_training import Team, team
 from tests.test_ppo import batch_of, ppo_of
+from utils.distributed import Team, team
 
 SIZE = 16
 

@@ -1,4 +1,4 @@
-"""Steps of a Trainer alone or, started by torchrun, of several: python -m tests.one_step FOLDER
+"""Steps of a Trainer alone or, started by torchrun, of several: python -m tests.helpers.one_step FOLDER
 
 Every process leaves its gradients of the first step and its weights after three in FOLDER.
 """
@@ -13,8 +13,9 @@ import torch
 
 from models.graspnet import create_model, targets_from_labels
 from models.graspnet_examples import Example
-from models.graspnet_training import Team, Trainer, team
+from models.graspnet_training import Trainer
 from utils.config import load_config
+from utils.distributed import Team, team
 
 BATCH = 4
 SETTINGS = ["train.precision=float32", f"train.batch_size={BATCH}", "train.lr=1e-3"]

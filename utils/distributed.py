@@ -1,0 +1,143 @@
+"""The processes of one training: which device each uses, what they exchange, and a clean Ctrl-C.
+
+`torchrun` starts the processes; without it a training is a team of one. Collective operations give
+the same result bit for bit in every process, so that all processes take the same steps. Knows no
+network and no data.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from threading import Event
+from typing import Any, NamedTuple
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+from utils.errors import UserError
+
+
+class Team(NamedTuple):
+    """This process among those that train together: its rank, the number of processes (`ranks`)
+    and its device."""
+
+    rank: int
+    ranks: int
+    device: torch.device
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this is the main process, which alone writes files and prints."""
+        return self.rank == 0
+
+    def wait(self) -> None:
+        """Block until every process has reached this call."""
+        if self.ranks > 1:
+            dist.barrier()
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in at least one process."""
+        if self.ranks == 1:
+            return flag
+        found = torch.tensor(float(flag), device=self.device)
+        dist.all_reduce(found, dist.ReduceOp.MAX)
+        return bool(found)
+
+    def broadcast(self, value: Any) -> Any:
+        """Return the main process's value in every process."""
+        holder = [value]
+        if self.ranks > 1:
+            dist.broadcast_object_list(holder, src=0)
+        return holder[0]
+
+    def concatenate(self, own: list) -> list:
+        """Return the lists of all processes behind one another, in the order of the ranks."""
+        if self.ranks == 1:
+            return own
+        lists: list[Any] = [None] * self.ranks
+        dist.all_gather_object(lists, own)
+        return [item for part in lists for item in part]
+
+    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
+        """(ranks, ...) the tensor of every process; all have the same shape."""
+        if self.ranks == 1:
+            return tensor[None]
+        parts = [torch.empty_like(tensor) for _ in range(self.ranks)]
+        dist.all_gather(parts, tensor.contiguous())
+        return torch.stack(parts)
+
+    def average(self, tensor: torch.Tensor) -> None:
+        """Replace a tensor in place by its mean over the processes."""
+        if self.ranks > 1:
+            dist.all_reduce(tensor)
+            tensor /= self.ranks
+
+    def share_weights(self, module: nn.Module) -> None:
+        """Copy the main process's weights and buffers into every process."""
+        if self.ranks > 1:
+            for value in module.state_dict().values():
+                dist.broadcast(value, src=0)
+
+
+ALONE = Team(0, 1, torch.device("cpu"))
+
+
+@contextmanager
+def team(device: str, environment: Mapping[str, str], key: str = "train.device") -> Iterator[Team]:
+    """Join the process group that `torchrun` describes in `environment`, or train alone.
+
+    device: auto | cpu | cuda | cuda:N; auto takes a GPU where there is one. key: the config key
+    that error messages name. Raises UserError for a device that this machine lacks, or for one GPU
+    that several processes would have to share.
+    """
+    ranks = int(environment.get("WORLD_SIZE", 1))
+    local = int(environment.get("LOCAL_RANK", 0))
+    if ranks > 1 and device.startswith("cuda:"):
+        raise UserError(
+            f"{key}={device}: {ranks} processes cannot share one GPU; choose cuda or auto, and "
+            "each takes its own"
+        )
+    chosen = choose_device(device, local, key)
+    if ranks == 1:
+        yield Team(0, 1, chosen)
+        return
+    if chosen.type == "cuda":  # objects are broadcast by way of the current device
+        torch.cuda.set_device(chosen)
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    try:
+        yield Team(dist.get_rank(), ranks, chosen)
+    finally:
+        dist.destroy_process_group()
+
+
+def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> torch.device:
+    """Return the torch device of that name; raise UserError if this machine does not have it."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise UserError(f"{key}: got {name!r}, expected auto, cpu, cuda or cuda:N")
+    if device.type == "cuda":
+        count = torch.cuda.device_count()
+        index = local_rank if device.index is None else device.index
+        if index >= count:
+            raise UserError(f"{key}={name}: this machine has {count} CUDA GPUs; use {key}=auto")
+        device = torch.device("cuda", index)
+    return device
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Event]:
+    """Yield an event that Ctrl-C sets, so that a training stops between two whole steps."""
+    interrupted = Event()
+    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
