@@ -51,9 +51,10 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.report import balanced, picture, write_failures, write_report
 from utils.result_records import OPEN_LOOP, contestant
 from utils.results import (
+    FREE_TO_CHANGE,
     Task,
     check_controllers,
-    check_resume,
+    check_rounds,
     compare,
     contestants,
     interruption,
@@ -65,7 +66,7 @@ from utils.results import (
     write_csv,
     write_results,
 )
-from utils.runs import check_writable, git_state, new_run_folder, write_atomic, write_json_atomic
+from utils.runs import check_resume, check_writable, new_run_folder, save_results, write_atomic
 from utils.transfer import (
     Score,
     TransferLine,
@@ -87,7 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return report_transfer(config, options.resume, options.results)
     check_policies(config)
     check_controllers(config, options.overrides)
-    check_resume(config, options.resume)
+    check_resume(config, options.resume, FREE_TO_CHANGE)
+    check_rounds(config, options.resume)
     check_writable("--results", options.results)
     check_cell(config)
     check_objects(config)
@@ -102,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print_comparisons(compare(outcome.rounds, config.seed))
     unfinished, device = interruption(len(outcome.rounds), config), device_of(config)
     for path in filter(None, [run / "results.json", options.results]):
-        write_results(path, rows, config, git_state().commit, device, unfinished is None)
+        write_results(path, rows, config, device, unfinished is None)
     write_csv(run / "results.csv", rows)
     gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(run / "report.html", rows, outcome.rounds, config, gallery, outcome.films, device)
@@ -306,7 +308,8 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
     to_play = contests(config)
     for contest in to_play:
         check_contest(contest)
-    check_resume(config, resume)
+    check_resume(config, resume, FREE_TO_CHANGE)
+    check_rounds(config, resume)
     check_writable("--results", results)
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
     run = resume or new_run_folder("evaluate", config.evaluate.name, config)
@@ -343,11 +346,11 @@ def report_transfer(config: Config, resume: Path | None, results: Path | None) -
     ]
     print(format_transfer(lines, worlds), *transfer_notes(lines, worlds), sep="\n")
     complete = error is None and not interrupted
-    content = {"schema": 1, "complete": complete, "commit": git_state().commit}
+    content = {"complete": complete}
     content |= {"device": device_of(config), "config": config.model_dump(mode="json")}
     content |= transfer_content(lines)
     for path in filter(None, [run / "results.json", results]):
-        write_json_atomic(path, content)
+        save_results(path, content)
     write_atomic(run / "transfer.png", draw_transfer(lines, worlds))
     print(f"picture: {run / 'transfer.png'}")
     if not complete:

@@ -58,22 +58,22 @@ from models.rectangle_folds import (
     describe_folds,
     real_folds,
 )
-from utils.config import Config, load_config, parse_args, run_script
+from utils.config import Config, parse_args, run_script
 from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
-from utils.runs import check_writable, git_state, new_run_folder, write_atomic, write_json_atomic
+from utils.runs import check_resume, check_writable, new_run_folder, save_results, write_atomic
 
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
 WEIGHTS_HELP = "also write graspnet.pt here, once the training has reached its end"
-FREE_TO_CHANGE = (("train", "name"), ("train", "device"), ("train", "workers"), ("data", "workers"))
+FREE_TO_CHANGE = ("train.name", "train.device", "train.workers", "data.workers")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train GraspNet.", _add_options)
     check_writable("--weights", options.weights)
-    check_resume(config, options.resume)
+    check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
     check_network(config)
     photographs = open_target(config)
     with team(config.train.device, dict(os.environ)) as us:
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         if us.is_main:
             # A network that is half trained must not replace one that is not.
-            save_results(run, data, history, options.weights if finished else None)
+            save_training(run, data, history, options.weights if finished else None)
             if not finished:
                 print(f"stopped after {trainer.step} steps; go on with --resume {run}")
     return 0 if finished else 130
@@ -102,23 +102,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS_HELP)
-
-
-def check_resume(config: Config, run: Path | None) -> None:
-    """Raise UserError if a run cannot be gone on with, or not with this config."""
-    if run is None:
-        return
-    if not (run / "last.pt").is_file() and not any(run.glob("fold*/last.pt")):
-        raise UserError(f"--resume {run}: no last.pt in there; start a new run")
-    before, now = (c.model_dump() for c in (load_config(run / "config.yaml"), config))
-    for section, key in FREE_TO_CHANGE:
-        before[section].pop(key), now[section].pop(key)
-    if before != now:
-        free = ", ".join(".".join(key) for key in FREE_TO_CHANGE)
-        raise UserError(
-            f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
-            "for anything else, from its weights with train.initial"
-        )
 
 
 def check_network(config: Config) -> None:
@@ -288,7 +271,7 @@ def ignore_interrupt(worker: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
 
 
-def save_results(run: Path, data: TrainingData, history: list[dict], weights: Path | None) -> None:
+def save_training(run: Path, data: TrainingData, history: list[dict], weights: Path | None) -> None:
     """The best network alone, its scores, and pictures of how it came about and what it does."""
     if not history:  # stopped within the first epoch
         return
@@ -296,8 +279,7 @@ def save_results(run: Path, data: TrainingData, history: list[dict], weights: Pa
     scores = best.extra["history"][-1]
     for path in filter(None, [run / "graspnet.pt", weights]):
         save_graspnet(path, best.model, best.metres_per_pixel, best.config, scores=scores)
-    results = {"schema": 1, "commit": git_state().commit, "best": scores, "history": history}
-    write_json_atomic(run / "results.json", results)
+    save_results(run / "results.json", {"best": scores, "history": history})
     draw_curves(run / "curves.png", history)
     for name, images in data.pictured().items():
         draw_predictions(run / f"{name}.png", best.model, images)
@@ -332,9 +314,7 @@ def cross_validate(config: Config, resume: Path | None, weights: Path | None, us
             save_fold(config, folder, fold, judged[fold.number], trainer, history, weights)
             print(describe_fold(fold, judged[fold.number]), flush=True)
             results = cross_validation_results(folds, judged)
-            write_json_atomic(
-                run / "results.json", {"schema": 1, "commit": git_state().commit, **results}
-            )
+            save_results(run / "results.json", results)
         us.wait()
     if us.is_main:
         print(describe_folds(config, judged))

@@ -54,19 +54,19 @@ from models.ppo_rollouts import (
 )
 from utils.adaptive_ranges import Bound
 from utils.checkpoint import load_checkpoint, load_weights
-from utils.config import Config, load_config, parse_args, run_script
+from utils.config import Config, parse_args, run_script
 from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
-from utils.runs import Stopwatch, check_writable, git_state, new_run_folder, write_json_atomic
+from utils.runs import Stopwatch, check_resume, check_writable, new_run_folder, save_results
 
 FREE_TO_CHANGE = (
-    "name",
-    "films",
-    "device",
-    "parallel",
-    "worker_timeout",
-    "target_success",
-    "target_return",
+    "rl.name",
+    "rl.films",
+    "rl.device",
+    "rl.parallel",
+    "rl.worker_timeout",
+    "rl.target_success",
+    "rl.target_return",
 )
 # Purposes of seeds, which never share any; 3 is FRESH of benchmarks.bench_policy.
 TRAINING, EVALUATION, LEARNING, LOOKING = 0, 1, 2, 4
@@ -77,8 +77,11 @@ LOOKS = 32  # of an environment, before they are learned from: two scenes
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train a policy by PPO.", _add_options)
     check_writable("--weights", options.weights)
-    check_resume(config, options.resume)
-    with team(config.rl.device, os.environ, "rl.device") as us, vector_envs(config, envs_of(config, us)) as envs:
+    check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
+    with (
+        team(config.rl.device, os.environ, "rl.device") as us,
+        vector_envs(config, envs_of(config, us)) as envs,
+    ):
         ppo = make_ppo(config, envs, us)
         run = options.resume or Path(us.broadcast(us.is_main and open_run(config)))
         history = load_progress(ppo, envs, run / "last.pt")
@@ -88,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         if us.is_main:
             # A policy that is half trained must not replace one that is not.
-            save_results(run, history, options.weights if finished else None)
+            save_training(run, history, options.weights if finished else None)
             film(config, run, ppo)
             if not finished:
                 more = "" if options.weights is None else f" --weights {options.weights}"
@@ -99,23 +102,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS_HELP)
-
-
-def check_resume(config: Config, run: Path | None) -> None:
-    """Raise UserError if a run cannot be gone on with, or not with this config."""
-    if run is None:
-        return
-    if not (run / "last.pt").is_file():
-        raise UserError(f"--resume {run}: no last.pt in there; start a new run")
-    before, now = (c.model_dump() for c in (load_config(run / "config.yaml"), config))
-    for key in FREE_TO_CHANGE:
-        before["rl"].pop(key), now["rl"].pop(key)
-    if before != now:
-        free = ", ".join(f"rl.{key}" for key in FREE_TO_CHANGE)
-        raise UserError(
-            f"--resume {run}: only {free} may differ from the run that is resumed; start a new run "
-            "for anything else, from its weights with rl.initial"
-        )
 
 
 def envs_of(config: Config, us: Team) -> int:
@@ -268,7 +254,12 @@ def learn_to_see(
             bar.set_postfix(loss=f"{new:.3g}")
             if us.is_main:
                 # Before step 0, so that resuming leaves them where they are.
-                log(writer, (chunk + 1 - chunks) * settings.envs * LOOKS, "pretraining", {"loss": new})
+                log(
+                    writer,
+                    (chunk + 1 - chunks) * settings.envs * LOOKS,
+                    "pretraining",
+                    {"loss": new},
+                )
     ppo.memory.clear()
 
 
@@ -385,12 +376,11 @@ def shares_in_words(watch: Stopwatch) -> str:
     return f"{total:.0f} s: {shares.replace(SIMULATION, 'simulation and rendering')}"
 
 
-def save_results(run: Path, history: list[dict], weights: Path | None) -> None:
+def save_training(run: Path, history: list[dict], weights: Path | None) -> None:
     if weights is not None:
         save_policy(weights, load_policy(run / "best.pt"))
     best = max(history, key=score)
-    results = {"schema": 1, "commit": git_state().commit, "best": best, "history": history}
-    write_json_atomic(run / "results.json", results)
+    save_results(run / "results.json", {"best": best, "history": history})
     print(", ".join(["best evaluation:", *(f"{name} {value:.6g}" for name, value in best.items())]))
 
 

@@ -164,13 +164,15 @@ def test_interruption():
 def test_results_json_is_strict_and_complete(tmp_path):
     path = tmp_path / "results.json"
     rows = summarise(ROUNDS, seed=0)
-    write_results(path, rows, CONFIG, "abc", "CPU", complete=True)
+    write_results(path, rows, CONFIG, "CPU", complete=True)
 
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
 
     content = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    assert (content["schema"], content["complete"], content["commit"]) == (1, True, "abc")
+    assert (content["schema"], content["complete"]) == (1, True)
+    assert content["commit"] == git_state().commit
+    assert content["versions"]["numpy"] == np.__version__
     assert content["device"] == "CPU" and content["config"]["evaluate"]["rounds"] == 2
     fields = """policy scenario objects seed rounds attempts successes objects_total
         objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
@@ -181,7 +183,7 @@ def test_results_json_is_strict_and_complete(tmp_path):
     bad = replace(rows[0], plan_ms_median=math.nan)
     before = path.read_bytes()
     with pytest.raises(ValueError):
-        write_results(path, [bad], CONFIG, "abc", "CPU", complete=True)
+        write_results(path, [bad], CONFIG, "CPU", complete=True)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 

@@ -27,11 +27,13 @@ from statistics import median
 from utils.config import Config, load_config
 from utils.errors import UserError
 from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, contestant
-from utils.runs import write_atomic, write_json_atomic
+from utils.runs import save_results, write_atomic
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
 
-# Keys of `evaluate` that may change when a run goes on: its scenes and scores stay what they are.
-_FREE = {"rounds", "workers", "name", "videos", "gallery", "film_format"}
+# Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
+FREE_TO_CHANGE = tuple(
+    f"evaluate.{key}" for key in ("rounds", "workers", "name", "videos", "gallery", "film_format")
+)
 
 
 @dataclass(frozen=True)
@@ -115,24 +117,13 @@ def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
         )
 
 
-def check_resume(config: Config, run: Path | None) -> None:
-    """Raise UserError if a resumed run would mix rounds of different experiments."""
-    if run is None:
-        return
-    before = load_config(run / "config.yaml").model_dump()
-    now = config.model_dump()
-    if now["evaluate"]["rounds"] < before["evaluate"]["rounds"]:
+def check_rounds(config: Config, run: Path | None) -> None:
+    """Raise UserError if a resumed evaluation asks for fewer rounds than it began with."""
+    before = config if run is None else load_config(run / "config.yaml")
+    if config.evaluate.rounds < before.evaluate.rounds:
         raise UserError(
-            f"--resume {run}: evaluate.rounds is {now['evaluate']['rounds']}, the run began with "
-            f"{before['evaluate']['rounds']}; it can only grow"
-        )
-    for plan in (before["evaluate"], now["evaluate"]):
-        for key in _FREE:
-            plan.pop(key)
-    if before != now:
-        raise UserError(
-            f"--resume {run}: only evaluate.{', evaluate.'.join(sorted(_FREE))} may differ from "
-            "the run that is resumed; start a new run for anything else"
+            f"--resume {run}: evaluate.rounds is {config.evaluate.rounds}, the run began with "
+            f"{before.evaluate.rounds}; it can only grow"
         )
 
 
@@ -186,9 +177,6 @@ def print_stop_reasons(stops: Iterable[StopReason]) -> None:
     ]
     if lines:
         print("\n".join(["\nwhat stopped the arm", *lines]))
-
-
-SCHEMA = 1  # version of results.json
 
 
 @dataclass(frozen=True)
@@ -319,23 +307,16 @@ def _difference(
 
 
 def write_results(
-    path: Path,
-    rows: Sequence[Row],
-    config: Config,
-    commit: str | None,
-    device: str,
-    complete: bool,
+    path: Path, rows: Sequence[Row], config: Config, device: str, complete: bool
 ) -> None:
-    """results.json: strict JSON (ValueError on a NaN), written whole or not at all."""
+    """Write results.json of an evaluation, see `utils.runs.save_results`."""
     content = {
-        "schema": SCHEMA,
         "complete": complete,
-        "commit": commit,
         "config": config.model_dump(mode="json"),
         "device": device,
         "rows": [asdict(row) for row in rows],
     }
-    write_json_atomic(path, content)
+    save_results(path, content)
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

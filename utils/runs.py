@@ -1,9 +1,7 @@
-"""Writing files so that a crash never leaves half of one.
+"""What every script leaves behind: run folders, results.json, files written whole or not at all.
 
-Where a program's time goes: seconds by name, and the rest as overhead.
-
-Run folders: runs/<script>/<time>-<name>/, each with what is needed to repeat the run.
-
+A run owns a folder runs/<script>/<time>-<name>/ with its config, the commit and the versions of
+the packages, so that it can be repeated. `Stopwatch` measures where a program spends its time.
 This module knows nothing of what a run computes.
 """
 
@@ -18,15 +16,31 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from utils.config import Config, dump_config
+from utils.config import Config, dump_config, load_config
 from utils.errors import UserError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGES = (
+    "numpy", "scipy", "torch", "torchvision", "pybullet", "mujoco", "gymnasium", "pydantic",
+)  # fmt: skip
+SCHEMA = 1  # version of results.json
+
+
+class GitState(NamedTuple):
+    """The commit's hash (None outside a repository) and whether tracked files differ from it."""
+
+    commit: str | None
+    dirty: bool | None
+
+
+# --- Files ------------------------------------------------------------------------------------
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
@@ -51,57 +65,7 @@ def write_json_atomic(path: Path, content: Mapping) -> None:
     write_atomic(path, text + "\n")
 
 
-class Stopwatch:
-    """Sums up seconds spent in `with watch("simulation"): ...`, by name; not to be nested.
-
-    Everything since `start` that is not inside such a block counts as overhead.
-    """
-
-    OVERHEAD = "overhead"
-
-    def __init__(self):
-        self.start()
-
-    def start(self) -> None:
-        """Forget everything and begin anew."""
-        self._spent: defaultdict[str, float] = defaultdict(float)
-        self._begun = time.perf_counter()
-
-    def __call__(self, name: str) -> Stopwatch:
-        self._name = name
-        return self
-
-    def __enter__(self) -> None:
-        self._since = time.perf_counter()
-
-    def __exit__(
-        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._spent[self._name] += time.perf_counter() - self._since
-
-    def seconds(self) -> dict[str, float]:
-        """Seconds by name, the overhead last; they sum up to the time since `start`."""
-        total = time.perf_counter() - self._begun
-        return dict(self._spent) | {self.OVERHEAD: total - sum(self._spent.values())}
-
-
-__all__ = [
-    "GitState",
-    "check_writable",
-    "environment",
-    "git_state",
-    "new_run_folder",
-]
-
-REPOSITORY = Path(__file__).resolve().parent.parent
-PACKAGES = ("numpy", "scipy", "torch", "torchvision", "pybullet", "gymnasium", "pydantic")
-
-
-class GitState(NamedTuple):
-    """The commit's hash (None outside a repository) and whether tracked files differ from it."""
-
-    commit: str | None
-    dirty: bool | None
+# --- Run folders ---------------------------------------------------------------------------
 
 
 def new_run_folder(
@@ -122,6 +86,41 @@ def new_run_folder(
     write_atomic(folder / "config.yaml", dump_config(config))
     write_json_atomic(folder / "environment.json", environment())
     return folder
+
+
+def check_resume(
+    config: Config, run: Path | None, free_keys: Collection[str], checkpoints: Collection[str] = ()
+) -> None:
+    """Raise UserError if `run` cannot be resumed with this config, which must be that of the run
+    but for the dotted keys in `free_keys`.
+
+    checkpoints: patterns of files such as "last.pt", of which the run must hold at least one.
+    run: None where a new run is started, which is always allowed.
+    """
+    if run is None:
+        return
+    if checkpoints and not any(any(run.glob(pattern)) for pattern in checkpoints):
+        raise UserError(f"--resume {run}: no {' or '.join(checkpoints)} in there; start a new run")
+    before, now = load_config(run / "config.yaml").model_dump(), config.model_dump()
+    for key in free_keys:
+        section, _, name = key.partition(".")
+        del before[section][name], now[section][name]
+    if before != now:
+        raise UserError(
+            f"--resume {run}: only {', '.join(sorted(free_keys))} may differ from the run that is "
+            "resumed; start a new run for anything else"
+        )
+
+
+def save_results(path: Path, content: Mapping[str, Any]) -> None:
+    """Write results.json: `content` with the commit, the versions of Python and of the packages.
+
+    Raises ValueError on NaN or infinity before touching the file.
+    """
+    facts = environment()
+    origin = {"schema": SCHEMA, "commit": facts["commit"], "dirty": facts["dirty"]}
+    origin["versions"] = {"python": facts["python"], **facts["packages"]}
+    write_json_atomic(path, origin | dict(content))
 
 
 def check_writable(option: str, path: Path | None) -> None:
@@ -182,3 +181,40 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+# --- Time -------------------------------------------------------------------------------------
+
+
+class Stopwatch:
+    """Sums up the seconds spent in `with watch("simulation"): ...` by name; blocks do not nest.
+
+    All the time since `start` that is outside such blocks counts as overhead.
+    """
+
+    OVERHEAD = "overhead"
+
+    def __init__(self):
+        self.start()
+
+    def start(self) -> None:
+        """Forget everything and begin anew."""
+        self._spent: defaultdict[str, float] = defaultdict(float)
+        self._begun = time.perf_counter()
+
+    def __call__(self, name: str) -> Stopwatch:
+        self._name = name
+        return self
+
+    def __enter__(self) -> None:
+        self._since = time.perf_counter()
+
+    def __exit__(
+        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._spent[self._name] += time.perf_counter() - self._since
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds by name, the overhead last; they sum up to the time since `start`."""
+        total = time.perf_counter() - self._begun
+        return dict(self._spent) | {self.OVERHEAD: total - sum(self._spent.values())}
