@@ -31,7 +31,7 @@ from envs.execution import GraspOutcome, check_bin
 from envs.objects import ObjectSet, load_object_set, prepare
 from envs.policy_approach import approach_by, check_learned, is_learned, nowhere_yet
 from envs.rounds import run_round
-from envs.scenarios import CHALLENGES
+from envs.scenarios import SCENARIOS
 from envs.simulators import in_world, make_cell
 from envs.studio import Film
 from models.photographs import judge_as_taken, judge_photographs, photographs
@@ -191,7 +191,7 @@ def _set_up(config: Config) -> None:
 
 def work(task: Task) -> Played:
     """Let each policy of a task work on its scene. Runs in a worker process."""
-    objects, layout = load_objects(task.objects, _config), CHALLENGES[task.scenario].layout
+    objects, layout = load_objects(task.objects, _config), SCENARIOS[task.scenario].layout
     scene = make_scene(layout, objects, task.seed, _config, _cell.client)
     played = Played()
     for planner_name, controller in task.policies:

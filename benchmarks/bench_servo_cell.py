@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.board import Board
-from envs.board_servo import BoardCamera, CarriedBoard, servo_arm, servo_settings, view_of
+from envs.board_servo import BoardCamera, CarriedBoard, servo_settings, servo_to_goal, view_of
 from envs.cell_scenes import Scene
 from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.pybullet_panda import ARM
 from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
 from utils.config import load_config
 from utils.servo_features import MOUNTINGS
-from utils.servo_loop import ServoHistory, View, VisualServo
+from utils.servo_loop import ServoHistory, ServoView, VisualServo
 from utils.transforms import inverse_pose, pose_matrix, top_down_pose
 from utils.visual_servo import (
     AdaptiveGain,
@@ -63,7 +63,7 @@ class Task:
         make, settings = LAWS[law]
         return make(**servo_settings(self.cell, self.mounting), lambda_=GAIN, **settings, **options)
 
-    def goal(self, servo: VisualServo) -> View:
+    def goal(self, servo: VisualServo) -> ServoView:
         return view_of(self.board, servo.camera, self.T_GO)
 
     def camera(self) -> BoardCamera:
@@ -71,7 +71,7 @@ class Task:
 
     def run(self, law: str) -> ServoHistory:
         servo = self.servo(law)
-        return servo_arm(self.cell, servo, self.goal(servo), self.camera(), self.carried)
+        return servo_to_goal(self.cell, servo, self.goal(servo), self.camera(), self.carried)
 
     def true_pose(self) -> np.ndarray:
         """(4, 4) T_CO as it is in the simulator."""

@@ -27,7 +27,7 @@ from models.planners import make_planner
 from utils.config import load_config, run_script
 from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
-from utils.object_tracking import ObjectTracker, grasp_frame, make_template
+from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
 from utils.table_plane import planar, planar_part
 from utils.transforms import Grasp, inverse_pose, position_quaternion
 
@@ -82,7 +82,7 @@ def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[f
             continue
         camera = WristCamera(cell)
         size = camera.intrinsics.width, camera.intrinsics.height
-        tracker = ObjectTracker(template, camera.intrinsics.K, size)
+        tracker = TemplateMatcher(template, camera.intrinsics.K, size)
         rng, T_WB = np.random.default_rng([seed, _STREAM]), cell.object_pose(0)
         for height in HEIGHTS:
             found = sightings(cell, camera, tracker, T_WB, grasps[0], height, views, rng)
@@ -98,7 +98,7 @@ def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[f
 def sightings(
     cell: PybulletCell,
     camera: WristCamera,
-    tracker: ObjectTracker,
+    tracker: TemplateMatcher,
     T_WB: np.ndarray,
     grasp: Grasp,
     height: float,

@@ -18,11 +18,11 @@ import numpy as np
 from envs.camera_calibration import teach
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop
-from envs.closed_loop_tracker import DepthSight
+from envs.closed_loop_tracker import WristImage
 from envs.execution import execute_grasp
 from envs.objects import load_object_set
 from envs.robot_kinematics import forward_kinematics
-from envs.scenarios import CHALLENGES, disturbed
+from envs.scenarios import SCENARIOS, disturbed
 from envs.simulators import make_cell
 from envs.studio import Studio
 from models.planners import make_planner
@@ -46,10 +46,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
     with make_cell(config) as cell:
-        taught, challenge = teach(cell), CHALLENGES[scenario]
-        cell.load(make_scene(challenge.layout, objects, config.seed, config))
-        beliefs, frame = challenge.beliefs(cell), cell.frame()
-        loop = ClosedLoop(cell, "ibvs", frame, beliefs, taught, challenge.latency)
+        taught, conditions = teach(cell), SCENARIOS[scenario]
+        cell.load(make_scene(conditions.layout, objects, config.seed, config))
+        calibration, frame = conditions.calibration(cell), cell.frame()
+        loop = ClosedLoop(cell, "ibvs", frame, calibration, taught, conditions.latency)
         pictures, camera, start = [], loop.camera, cell.seconds
         with Studio(cell, *_SIZE) as studio:
 
@@ -61,13 +61,13 @@ def main(argv: Sequence[str] | None = None) -> None:
                 return sight
 
             loop.camera = see
-            with disturbed(cell, challenge.motion(cell, 0)):
+            with disturbed(cell, conditions.motion(cell, 0)):
                 outcome = execute_grasp(cell, plan(frame)[0], loop)
     iio.imwrite(Path(file), np.hstack(pictures))
     print(f"{outcome.reason} {outcome.detail}; wrote {file}")
 
 
-def _both(picture: np.ndarray, sight: DepthSight, loop: ClosedLoop) -> np.ndarray:
+def _both(picture: np.ndarray, sight: WristImage, loop: ClosedLoop) -> np.ndarray:
     depth = sight.depth
     nearest, farthest = depth[depth > 0].min(), depth.max()
     grey = (255 * (farthest - depth) / max(farthest - nearest, 1e-3)).clip(0, 255).astype(np.uint8)

@@ -26,7 +26,7 @@ from utils.config import SafetyConfig, ServoConfig
 from utils.errors import ServoError, unknown_choice
 from utils.servo_control import joint_limit_avoidance
 from utils.servo_features import MOUNTINGS, ServoCamera
-from utils.servo_loop import ServoHistory, ServoStep, View, VisualServo
+from utils.servo_loop import ServoCommand, ServoHistory, ServoView, VisualServo
 from utils.transforms import inverse_pose, pose_matrix, position_quaternion, transform_points
 
 _MOUNTS = dict(zip(MOUNTINGS, ("wrist", "overhead")))
@@ -39,7 +39,7 @@ _REST_SECONDS = 0.1  # for the arm to come to rest after the last command
 class Sight(NamedTuple):
     """What was seen, and the simulated time in seconds at which the image was taken."""
 
-    view: View
+    view: ServoView
     seconds: float
 
 
@@ -77,10 +77,10 @@ def _mount(mounting: str) -> str:
     return _MOUNTS[mounting]
 
 
-def view_of(board: Board, camera: ServoCamera, T_CO: np.ndarray) -> View:
+def view_of(board: Board, camera: ServoCamera, T_CO: np.ndarray) -> ServoView:
     """What the camera sees, or should see, of a board at T_CO (4, 4)."""
     points = transform_points(T_CO, board.points)
-    return View(camera.to_pixels(points[:, :2] / points[:, 2:]), points[:, 2], T_CO)
+    return ServoView(camera.to_pixels(points[:, :2] / points[:, 2:]), points[:, 2], T_CO)
 
 
 class BoardCamera:
@@ -99,7 +99,7 @@ class BoardCamera:
         pixels = self.board.find(rgb)
         T_CO = self.board.pose(pixels, self.intrinsics.K)
         depths = transform_points(T_CO, self.board.points)[:, 2]
-        return Sight(View(pixels, depths, T_CO), self.cell.seconds)
+        return Sight(ServoView(pixels, depths, T_CO), self.cell.seconds)
 
 
 class CarriedBoard:
@@ -183,10 +183,10 @@ class ServoArm:
         self.robot.hold()
 
 
-def servo_arm(
+def servo_to_goal(
     cell: Cell,
     servo: VisualServo,
-    goal: View,
+    goal: ServoView,
     see: Callable[[], Sight | None],
     carried: CarriedBoard | None = None,
 ) -> ServoHistory:
@@ -198,8 +198,8 @@ def servo_arm(
     was seen even once.
     """
     arm, settings = ServoArm(cell, carried), cell.config.servo
-    views: list[View] = []
-    steps: list[ServoStep] = []
+    views: list[ServoView] = []
+    steps: list[ServoCommand] = []
     wish, seen, settled = np.zeros(7), cell.seconds, 0
     end = cell.seconds + settings.seconds
     converged, reason = False, f"stopped: not settled after {settings.seconds} s"

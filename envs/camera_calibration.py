@@ -27,7 +27,7 @@ _BOARD_TURN = np.diag([1.0, -1.0, -1.0])  # its face towards the camera
 
 
 @dataclass(frozen=True)
-class CameraBeliefs:
+class CameraCalibration:
     """T_WC: (4, 4) overhead camera. T_EC: (4, 4) wrist camera in the gripper. levelled: whether
     depth images are turned and lifted until the table in them lies where it is known to be."""
 
@@ -42,20 +42,20 @@ class CameraBeliefs:
         return level(frame) if self.levelled else frame
 
 
-def true_beliefs(cell: Cell) -> CameraBeliefs:
-    return CameraBeliefs(cell.camera_pose("overhead"), wrist_mount(cell.config.camera))
+def true_calibration(cell: Cell) -> CameraCalibration:
+    return CameraCalibration(cell.camera_pose("overhead"), wrist_mount(cell.config.camera))
 
 
-def wrong_beliefs(
+def wrong_calibration(
     cell: Cell, rng: np.random.Generator, distance: float, angle: float
-) -> CameraBeliefs:
+) -> CameraCalibration:
     """Both cameras believed `distance` metres and `angle` radians off, in random directions."""
-    true = true_beliefs(cell)
-    T_WC, T_EC = (off(T, rng, distance, angle) for T in (true.T_WC, true.T_EC))
-    return CameraBeliefs(T_WC, T_EC, levelled=True)
+    true = true_calibration(cell)
+    T_WC, T_EC = (displaced(T, rng, distance, angle) for T in (true.T_WC, true.T_EC))
+    return CameraCalibration(T_WC, T_EC, levelled=True)
 
 
-def off(T: np.ndarray, rng: np.random.Generator, distance: float, angle: float) -> np.ndarray:
+def displaced(T: np.ndarray, rng: np.random.Generator, distance: float, angle: float) -> np.ndarray:
     """A pose (4, 4) shifted and turned on the spot, each in a direction uniform on the sphere."""
     shift, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     wrong = T.copy()

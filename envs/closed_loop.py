@@ -21,7 +21,7 @@ near    the controller's own law, towards a goal that sinks along the grasp's ax
 blind   the rest of the way, some centimetres, without looking (`envs.closed_loop`).
 
 All velocities pass the safety gate (`ServoArm`). Reads depth images and encoders; where the
-cameras are comes from `CameraBeliefs` alone. Frames: W world, E gripper, C camera, O object on the
+cameras are comes from `CameraCalibration` alone. Frames: W world, E gripper, C camera, O object on the
 table below its grasp.
 """
 
@@ -35,10 +35,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from envs.board_servo import ServoArm, servo_period
-from envs.camera_calibration import CameraBeliefs
+from envs.camera_calibration import CameraCalibration
 from envs.cell import Cell
-from envs.closed_loop_tracker import DepthSight, SightedObject, WristCamera
-from envs.execution import HALF_TURN, Around, GraspFailure
+from envs.closed_loop_tracker import ObjectTracker, WristCamera, WristImage
+from envs.execution import HALF_TURN, ApproachResult, GraspFailure
 from envs.pybullet_camera import Intrinsics
 from envs.pybullet_panda import MAX_OPENING
 from envs.robot_kinematics import (
@@ -59,7 +59,7 @@ from utils.errors import (
 )
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
-from utils.servo_loop import View, VisualServo
+from utils.servo_loop import ServoView, VisualServo
 from utils.table_plane import planar_part
 from utils.transforms import (
     Grasp,
@@ -84,7 +84,7 @@ _BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, 
 _SLACK_SECONDS = 0.35  # beyond what the path takes, for its end
 
 
-class BlindDescent:
+class FinalApproach:
     """A path that is fixed now, in the object's motion: from `start`, down by `height` metres.
 
     start: (4, 4) T_WE above the grasp. camera: gives a sight, or None where no new image has come.
@@ -93,8 +93,8 @@ class BlindDescent:
     def __init__(
         self,
         arm: ServoArm,
-        camera: Callable[[], DepthSight | None],
-        target: SightedObject,
+        camera: Callable[[], WristImage | None],
+        target: ObjectTracker,
         start: np.ndarray,
         height: float,
     ):
@@ -138,8 +138,8 @@ class BlindDescent:
         """Follow the path for one physics step, sinking at `sink` m/s; metres off it before."""
         self._keep_watch()
         dt, now = self.cell.dt, self.cell.seconds
-        if now - self.target.found_seconds > self.settings.blind_seconds:
-            raise TargetLostError(f"not seen for {self.settings.blind_seconds} s")
+        if now - self.target.found_seconds > self.settings.final_seconds:
+            raise TargetLostError(f"not seen for {self.settings.final_seconds} s")
         self.gone = min(self.gone + sink * dt, self.height)
         path = self.target.motion.motion(self.start_seconds, now) @ self.start
         path[:3, 3] += self.gone * path[:3, 2]
@@ -151,7 +151,7 @@ class BlindDescent:
         away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, AVOIDANCE_GAIN)
         wish = joint_velocities(geometric_jacobian(q), twist, away, DAMPING)[0]
         # The object is too near to be seen: by design the wish is based on what was foreseen, for
-        # no longer than blind_seconds, and as long as the camera shows that it lives.
+        # no longer than final_seconds, and as long as the camera shows that it lives.
         self.arm.move(wish, now - self.target.image_seconds)
         return float(np.linalg.norm(error[:3]))
 
@@ -250,24 +250,24 @@ class ClosedLoop:
 
     controller: pbvs, ibvs or hybrid. frame: as it is believed to have been taken. taught_T_CE:
     (4, 4) the gripper in the wrist camera as that camera showed it (`envs.camera_calibration.teach`), from
-    which ibvs and hybrid have their goal images. camera: gives a DepthSight, or None where no new
+    which ibvs and hybrid have their goal images. camera: gives a WristImage, or None where no new
     image has come. target: the object, once it is looked for.
     """
 
-    target: SightedObject
+    target: ObjectTracker
 
     def __init__(
         self,
         cell: Cell,
         controller: str,
         frame: RGBDFrame,
-        beliefs: CameraBeliefs,
+        calibration: CameraCalibration,
         taught_T_CE: np.ndarray,
         latency: float = 0.0,
         camera=None,
     ):
         self.cell, self.controller, self.frame = cell, controller, frame
-        self.T_EC, self.latency = beliefs.T_EC, latency
+        self.T_EC, self.latency = calibration.T_EC, latency
         self.camera = camera or WristCamera(cell, latency)
         grasp = cell.config.closed_loop
         intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
@@ -279,20 +279,20 @@ class ClosedLoop:
         self.goal_T_CE = T_CE
         self.record = LoopRecord()
 
-    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+    def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
         robot, settings = cell.robot, cell.config.closed_loop
         robot.command_gripper(min(grasp.width, MAX_OPENING))
         arm = ServoArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
         with _told_as_failure(arm):
-            guided = GuidedDescent(self, arm, grasp)
+            guided = GuidedApproach(self, arm, grasp)
             end = cell.seconds + settings.seconds
             while (start := guided.look()) is None:
                 if cell.seconds > end:
                     raise ServoError(f"not at the grasp after {settings.seconds} s")
                 guided.go()
-            self.record.stage = "blind"
-            blind = BlindDescent(arm, self.camera, self.target, start, guided.height)
+            self.record.stage = "final"
+            blind = FinalApproach(arm, self.camera, self.target, start, guided.height)
             blind.go()
         self.record.stage = "closing"
 
@@ -300,7 +300,7 @@ class ClosedLoop:
             with _told_as_failure(arm):
                 blind.follow(steps)
 
-        return Around(wait, None)
+        return ApproachResult(wait, None)
 
 
 @contextlib.contextmanager
@@ -323,7 +323,7 @@ def _reason_of(error: ServoError) -> str:
     return "collision" if contact else "stopped"
 
 
-class GuidedDescent:
+class GuidedApproach:
     """The far and the near stage of one approach: what the arm does while it sees the object."""
 
     def __init__(self, loop: ClosedLoop, arm: ServoArm, grasp: Grasp):
@@ -331,7 +331,7 @@ class GuidedDescent:
         grasp is out of reach."""
         self.loop, self.cell, self.arm = loop, loop.cell, arm
         self.settings = settings = loop.cell.config.closed_loop
-        self.target = loop.target = SightedObject(
+        self.target = loop.target = ObjectTracker(
             loop.frame, grasp, loop.K, loop.size, loop.T_EC, settings.lost_seconds,
             self.cell.seconds,
         )  # fmt: skip
@@ -467,7 +467,7 @@ class GuidedDescent:
             and self.cell.seconds - self.target.found_seconds <= self.arm.gate.safety.watchdog
         )
 
-    def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[View, View]:
+    def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[ServoView, ServoView]:
         """What is seen and what should be seen: the template's points and its pose. Of the points
         those count that lie within the image; raises FeatureCountError where they are too few."""
         views = []
@@ -475,7 +475,7 @@ class GuidedDescent:
         for T in (T_CO, T_GO):
             points = transform_points(T, self.target.template.points)
             pixels = points[:, :2] / points[:, 2:] * self.loop.K[[0, 1], [0, 1]]
-            views.append(View(pixels + self.loop.K[:2, 2], points[:, 2], T))
+            views.append(ServoView(pixels + self.loop.K[:2, 2], points[:, 2], T))
         if near:
             pixels = views[0].points
             seen = (pixels > -0.5).all(axis=1) & (pixels < np.array(self.loop.size) - 0.5).all(1)
@@ -484,7 +484,7 @@ class GuidedDescent:
                     f"points: {seen.sum()} of those on the object are in the image, needed are at "
                     f"least {MIN_POINTS}"
                 )
-        return tuple(View(v.points[seen], v.depths[seen], v.T_CO) for v in views)
+        return tuple(ServoView(v.points[seen], v.depths[seen], v.T_CO) for v in views)
 
     def _joint_wish(
         self, q: np.ndarray, T_WE: np.ndarray, v_C: np.ndarray, law: VisualServo, sink: float

@@ -23,14 +23,14 @@ from envs.pybullet_camera import Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.depth import KinectNoise
 from utils.errors import TargetLostError
-from utils.object_tracking import ObjectTracker, PlanarMotion, grasp_frame, make_template
+from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
 from utils.table_plane import planar, planar_part
 from utils.transforms import Grasp, RGBDFrame, inverse_pose
 
 _NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
 
 
-class DepthSight(NamedTuple):
+class WristImage(NamedTuple):
     """A depth image (H, W), metres, the joint positions (7,) when it was taken, and that time."""
 
     depth: np.ndarray
@@ -51,19 +51,19 @@ class WristCamera:
         self.intrinsics = Intrinsics(
             grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
         )
-        self._coming: deque[DepthSight] = deque()
+        self._coming: deque[WristImage] = deque()
         self._noise = None
         if camera.depth_noise == "kinect":
             self._noise = KinectNoise(image_focal=float(self.intrinsics.K[0, 0]))
             self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
 
-    def __call__(self) -> DepthSight | None:
+    def __call__(self) -> WristImage | None:
         """Take an image now; the newest that has arrived by now, or None."""
         cell = self.cell
         depth = cell.look(self.intrinsics, cell.camera_pose("wrist")).depth
         if self._noise is not None:
             depth = self._noise(depth, self._rng)
-        self._coming.append(DepthSight(depth, cell.robot.q, cell.seconds))
+        self._coming.append(WristImage(depth, cell.robot.q, cell.seconds))
         arrived = None
         while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:
             arrived = self._coming.popleft()
@@ -74,7 +74,7 @@ _FORESIGHT = 1.5  # s, about what is left of the way in the far stage of an appr
 _TURNING_KNOWN = 0.15  # rad/s, standard deviation of a turning rate that can be relied on
 
 
-class SightedObject:
+class ObjectTracker:
     """Where the object is, as far as images tell.
 
     T_WO: (4, 4) as last seen. motion: how it moves; None until it was seen. image_seconds,
@@ -96,14 +96,14 @@ class SightedObject:
         (4, 4): of the camera that looks from now, `seconds`, on. lost_seconds: for which images may
         not show the object. Raises TargetLostError where nothing stands at the grasp."""
         self.template = make_template(frame, grasp)
-        self.tracker = ObjectTracker(self.template, K, size)
+        self.tracker = TemplateMatcher(self.template, K, size)
         self.T_EC, self.lost_seconds = T_EC, lost_seconds
         self.T_WO = grasp_frame(grasp)
         self.motion: PlanarMotion | None = None
         self.image_seconds = self.found_seconds = seconds
         self.spent = 0.0
 
-    def take_in(self, sight: DepthSight | None) -> bool:
+    def take_in(self, sight: WristImage | None) -> bool:
         """Find the object in a new image; whether there was one. Raises TargetLostError where the
         first image does not show it, or none has for too long."""
         if sight is None:

@@ -68,7 +68,7 @@ class GraspFailure(Exception):
         self.reason, self.detail = reason, detail
 
 
-class Around(NamedTuple):
+class ApproachResult(NamedTuple):
     """The open gripper is where it should close. wait: lets a number of physics steps pass while
     the fingers close. pose: (4, 4) T_WE from which to lift; None: where the arm is by then."""
 
@@ -76,7 +76,7 @@ class Around(NamedTuple):
     pose: np.ndarray | None
 
 
-def open_loop(cell: Cell, grasp: Grasp) -> Around:
+def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     """Bring the open gripper around a grasp as planned, without looking again. Raises
     ArmStoppedError on a collision and UnreachableError before anything has moved."""
     settings = cell.config.execution
@@ -89,10 +89,10 @@ def open_loop(cell: Cell, grasp: Grasp) -> Around:
     cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
     _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
     _follow(cell, approach, stop_force=settings.contact_stop)
-    return Around(cell.step, target)
+    return ApproachResult(cell.step, target)
 
 
-Approach = Callable[[Cell, Grasp], Around]
+Approach = Callable[[Cell, Grasp], ApproachResult]
 
 
 def check_bin(config: Config) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from envs.cell import Cell, PhysicsError
-from envs.execution import Around, GraspFailure
+from envs.execution import ApproachResult, GraspFailure
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
 from models.grasp_policy import SavedPolicy, load_policy
@@ -53,7 +53,7 @@ class PolicyApproach:
         self.policy = policy
         self.closed_at: Grasp | None = None
 
-    def __call__(self, cell: Cell, grasp: Grasp) -> Around:
+    def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """Raises GraspFailure when nothing is gripped in as many actions as in training."""
         self.closed_at, ended, gripped = None, False, 0
         try:
@@ -72,7 +72,7 @@ class PolicyApproach:
         if not info["grasped"]:
             self.closed_at = None
             raise GraspFailure("stopped", detail=f"gripped nothing ({info['reason']})")
-        return Around(cell.step, None)
+        return ApproachResult(cell.step, None)
 
 
 def nowhere_yet(frame: RGBDFrame) -> list[Grasp]:

@@ -14,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from envs.camera_calibration import CameraBeliefs, teach
+from envs.camera_calibration import CameraCalibration, teach
 from envs.cell import Cell, PhysicsError
 from envs.cell_scenes import Scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
 from envs.policy_approach import PolicyApproach
 from envs.robot_kinematics import forward_kinematics
-from envs.scenarios import CHALLENGES, disturbed
+from envs.scenarios import SCENARIOS, disturbed
 from utils.errors import TargetLostError
 from utils.result_records import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
@@ -48,23 +48,23 @@ def run_round(
 ) -> RoundRecord:
     """Load a scene and let a planner work on it; the record of what happened.
 
-    policy, objects: names for the record. scenario: a key of CHALLENGES, what happens besides;
+    policy, objects: names for the record. scenario: a key of SCENARIOS, what happens besides;
     None: the scene's layout. controller: how the arm gets to the grasps. with_truth: the planner is
     privileged. on_attempt is called after every executed grasp with the frame it was planned on
     (for pictures). approach_by: a policy that finds its grasps on the way, whatever is planned.
     """
     scenario = scenario or scene.layout
-    challenge = CHALLENGES[scenario]
+    conditions = SCENARIOS[scenario]
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
-    beliefs = challenge.beliefs(cell)
+    calibration = conditions.calibration(cell)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
     stops: list[float | None] = []  # of these, where something under the palm stopped them
     plan_seconds, ended = 0.0, "cleared"
     try:
         while cell.remaining and len(failed) < max_failures:
-            frame = believed(cell, beliefs, cell.frame(with_truth))
+            frame = calibrated(cell, calibration, cell.frame(with_truth))
             start = time.perf_counter()
             grasps = plan(frame if with_truth else frame.without_truth())
             plan_seconds = time.perf_counter() - start
@@ -77,11 +77,11 @@ def run_round(
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
                 # What is worked out of an image late is what a late image would have been worth.
-                late = challenge.latency + cell.config.closed_loop.compute_seconds
-                approach = ClosedLoop(cell, controller, seen, beliefs, taught, late)
+                late = conditions.latency + cell.config.closed_loop.compute_seconds
+                approach = ClosedLoop(cell, controller, seen, calibration, taught, late)
             elif approach_by is not None:
                 approach = approach_by
-            with disturbed(cell, challenge.motion(cell, len(attempts))):
+            with disturbed(cell, conditions.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
             if approach_by is not None and approach_by.closed_at is not None:
                 grasp = approach_by.closed_at
@@ -116,14 +116,14 @@ def run_round(
     )  # fmt: skip
 
 
-def believed(cell: Cell, beliefs: CameraBeliefs, frame: RGBDFrame) -> RGBDFrame:
-    """A frame of the cell's camera, taken now, with the camera where it is believed to be. An image
+def calibrated(cell: Cell, calibration: CameraCalibration, frame: RGBDFrame) -> RGBDFrame:
+    """A frame of the camera, taken now, with the camera pose of the calibration. An image
     in which no table is found cannot be levelled."""
     mount, T_WE = cell.config.camera.mount, forward_kinematics(cell.robot.q)
     try:
-        return beliefs.frame(frame, mount, T_WE)
+        return calibration.frame(frame, mount, T_WE)
     except TargetLostError:
-        return replace(beliefs, levelled=False).frame(frame, mount, T_WE)
+        return replace(calibration, levelled=False).frame(frame, mount, T_WE)
 
 
 def _name_of(scene: Scene, index: int | None) -> str | None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.camera_calibration import CameraBeliefs, true_beliefs, wrong_beliefs
+from envs.camera_calibration import CameraCalibration, true_calibration, wrong_calibration
 from envs.cell import Cell
 from utils.table_plane import planar
 from utils.transforms import inverse_pose
@@ -120,7 +120,7 @@ _STREAM = 7  # keeps these draws apart from the scene's of the same seed
 
 
 @dataclass(frozen=True)
-class Challenge:
+class Scenario:
     """moved: objects are displaced during the approach. speed: m/s of a conveyor. turning: whether
     it goes round a corner. crossing: whether it goes through the middle of the workspace, in
     whatever direction that is, instead of sideways. miscalibrated: whether the cameras' believed
@@ -149,13 +149,13 @@ class Challenge:
             return conveyor(rng, place, centre, self.speed, self.turning)
         return None
 
-    def beliefs(self, cell: Cell) -> CameraBeliefs:
-        """Where the cameras are believed to be, in every attempt of a round."""
+    def calibration(self, cell: Cell) -> CameraCalibration:
+        """The calibration that the round assumes, the same in each of its attempts."""
         if not self.miscalibrated:
-            return true_beliefs(cell)
+            return true_calibration(cell)
         off = cell.config.closed_loop
         rng = self._rng(cell, -1)
-        return wrong_beliefs(cell, rng, off.camera_shift, np.radians(off.camera_turn_deg))
+        return wrong_calibration(cell, rng, off.camera_shift, np.radians(off.camera_turn_deg))
 
     def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
         return np.random.default_rng([cell.scene.seed, attempt + 1, _STREAM])
@@ -194,17 +194,17 @@ def crossing(
     return Conveyor(speed, float(np.arctan2(y, x)) + rng.uniform(-np.pi / 6, np.pi / 6))
 
 
-CHALLENGES = {
-    "isolated": Challenge("isolated"),
-    "packed": Challenge("packed"),
-    "pile": Challenge("pile"),
-    "static": Challenge("isolated"),
-    "moved": Challenge("isolated", moved=True),
-    "moving_5cm": Challenge("isolated", speed=0.05),
-    "moving_10cm": Challenge("isolated", speed=0.10),
-    "turning_5cm": Challenge("isolated", speed=0.05, turning=True),
-    "turning_10cm": Challenge("isolated", speed=0.10, turning=True),
-    "crossing_5cm": Challenge("isolated", speed=0.05, crossing=True),
-    "miscalibrated": Challenge("isolated", miscalibrated=True),
-    "latency": Challenge("isolated", speed=0.05, latency=0.1),
+SCENARIOS = {
+    "isolated": Scenario("isolated"),
+    "packed": Scenario("packed"),
+    "pile": Scenario("pile"),
+    "static": Scenario("isolated"),
+    "moved": Scenario("isolated", moved=True),
+    "moving_5cm": Scenario("isolated", speed=0.05),
+    "moving_10cm": Scenario("isolated", speed=0.10),
+    "turning_5cm": Scenario("isolated", speed=0.05, turning=True),
+    "turning_10cm": Scenario("isolated", speed=0.10, turning=True),
+    "crossing_5cm": Scenario("isolated", speed=0.05, crossing=True),
+    "miscalibrated": Scenario("isolated", miscalibrated=True),
+    "latency": Scenario("isolated", speed=0.05, latency=0.1),
 }

@@ -11,15 +11,15 @@ import pytest
 
 from envs import closed_loop_tracker
 from envs.board_servo import ServoArm
-from envs.camera_calibration import level, off, teach, true_beliefs, wrong_beliefs
+from envs.camera_calibration import displaced, level, teach, true_calibration, wrong_calibration
 from envs.cell_scenes import make_scene
-from envs.closed_loop import ClosedLoop, GuidedDescent
+from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import GraspFailure, execute_grasp
 from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
-from envs.scenarios import CHALLENGES, Conveyor, Displacement, crossing, disturbed
+from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbed
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.config_types import ScoredScenario
@@ -42,8 +42,8 @@ def scene(config, box_set):
 
 
 def loop(cell, controller, latency=0.0, camera=None):
-    beliefs = true_beliefs(cell)
-    return ClosedLoop(cell, controller, cell.frame(), beliefs, teach(cell), latency, camera)
+    calibration = true_calibration(cell)
+    return ClosedLoop(cell, controller, cell.frame(), calibration, teach(cell), latency, camera)
 
 
 # Who grasps
@@ -98,7 +98,7 @@ def test_a_frozen_camera_stops_the_arm(cell, scene, images):
     assert images * 8 + 20 < cell.steps < images * 8 + 24 + 8 + 30
 
 
-@pytest.mark.parametrize("stage", ["near", "blind", "closing"])
+@pytest.mark.parametrize("stage", ["near", "final", "closing"])
 def test_a_camera_that_freezes_later_stops_the_arm(cell, scene, stage):
     cell.load(scene)
     camera = WristCamera(cell)
@@ -114,10 +114,10 @@ def test_a_camera_that_freezes_later_stops_the_arm(cell, scene, stage):
 def test_a_frozen_camera_stops_the_arm_whose_camera_is_tilted(cell, scene):
     """Two degrees and a centimetre off: the loop is fed wrong poses, and then none."""
     cell.load(scene)
-    beliefs = wrong_beliefs(cell, np.random.default_rng(1), 0.01, np.radians(2))
-    frame = beliefs.frame(cell.frame(), "overhead", np.eye(4))
+    calibration = wrong_calibration(cell, np.random.default_rng(1), 0.01, np.radians(2))
+    frame = calibration.frame(cell.frame(), "overhead", np.eye(4))
     camera = frozen_after(WristCamera(cell), 20)
-    approach = ClosedLoop(cell, "ibvs", frame, beliefs, teach(cell), camera=camera)
+    approach = ClosedLoop(cell, "ibvs", frame, calibration, teach(cell), camera=camera)
     outcome = execute_grasp(cell, grasp_of_box(cell), approach)
     assert outcome.reason == "stopped" and "the watchdog allows 100 ms" in outcome.detail
     assert approach.record.stage in ("far", "near")
@@ -188,8 +188,8 @@ def test_an_approach_that_does_not_end_is_stopped(cell, scene, monkeypatch):
 # What disturbs
 
 
-def test_every_scored_scenario_has_its_challenge():
-    assert set(get_args(ScoredScenario)) == set(CHALLENGES)
+def test_every_scored_scenario_is_in_the_registry():
+    assert set(get_args(ScoredScenario)) == set(SCENARIOS)
 
 
 def test_a_displacement_ends_where_it_says(cell, scene):
@@ -254,13 +254,13 @@ def test_a_miscalibration_is_as_large_as_it_says(cell, scene):
     T = cell.camera_pose("overhead")
     rng = np.random.default_rng(3)
     for _ in range(5):
-        wrong = off(T, rng, 0.01, np.radians(2))
+        wrong = displaced(T, rng, 0.01, np.radians(2))
         assert np.linalg.norm(wrong[:3, 3] - T[:3, 3]) == pytest.approx(0.01)
         cosine = (np.trace(wrong[:3, :3] @ T[:3, :3].T) - 1) / 2
         assert np.degrees(np.arccos(cosine)) == pytest.approx(2.0, abs=1e-6)
     cell.load(scene)
-    challenge = CHALLENGES["miscalibrated"]
-    first, again = challenge.beliefs(cell), challenge.beliefs(cell)
+    scenario = SCENARIOS["miscalibrated"]
+    first, again = scenario.calibration(cell), scenario.calibration(cell)
     np.testing.assert_array_equal(first.T_WC, again.T_WC)
     for T, true in zip((first.T_WC, first.T_EC), (cell.camera_pose(), wrist_mount(CONFIG))):
         assert np.linalg.norm(T[:3, 3] - true[:3, 3]) == pytest.approx(0.01)
@@ -272,7 +272,7 @@ CONFIG = load_config().camera
 def test_levelling_finds_the_table_and_leaves_the_place(cell, scene):
     cell.load(scene)
     frame = cell.frame()
-    wrong = wrong_beliefs(cell, np.random.default_rng(0), 0.01, np.radians(2)).T_WC
+    wrong = wrong_calibration(cell, np.random.default_rng(0), 0.01, np.radians(2)).T_WC
     levelled = level(replace(frame, T_WC=wrong))
     normal, offset = table_plane(frame.depth, frame.K, inverse_pose(levelled.T_WC))
     np.testing.assert_allclose(levelled.T_WC[:3, :3] @ normal, [0, 0, 1], atol=1e-9)
@@ -298,7 +298,7 @@ def test_images_arrive_late(cell, scene):
 
 def test_the_object_is_found_by_the_real_camera(cell, scene):
     cell.load(scene)
-    descent = GuidedDescent(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
+    descent = GuidedApproach(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
     x, y, turn = np.subtract(
         planar_part(descent.target.T_WO),
         [*cell.object_pose(0)[:2, 3], grasp_of_box(cell).angle],
@@ -311,7 +311,7 @@ def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
     """A law that wishes for nothing: what is left is the velocity of the object's point below the
     hand, v + omega x r by hand, and the goal's sinking. Ahead of the object, not behind it."""
     cell.load(scene)
-    descent = GuidedDescent(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
+    descent = GuidedApproach(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
     state = descent.target.motion.state
     x, y = state[:2]
     state[3:] = [0.04, -0.03, 0.3]

@@ -13,17 +13,17 @@ pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3
 
 import evaluate
 from envs.board_servo import ServoArm
-from envs.camera_calibration import teach, true_beliefs
+from envs.camera_calibration import teach, true_calibration
 from envs.cell_layout import GRAVITY
 from envs.cell_scenes import make_scene
-from envs.closed_loop import ClosedLoop, GuidedDescent
+from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
 from envs.pybullet_cell import PybulletCell, wrist_mount
 from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
-from envs.scenarios import CHALLENGES, Conveyor, disturbed
+from envs.scenarios import SCENARIOS, Conveyor, disturbed
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.table_plane import planar_part
 from utils.transforms import top_down_pose
@@ -98,7 +98,7 @@ def test_both_worlds_move_an_object_the_same_way(worlds, scene, scenario):
     for cell in worlds:
         cell.load(scene)
         before = cell.object_pose(0)
-        motion = CHALLENGES[scenario].motion(cell, 0)
+        motion = SCENARIOS[scenario].motion(cell, 0)
         with disturbed(cell, motion):
             cell.step(360)
         after = cell.object_pose(0)
@@ -140,8 +140,8 @@ def test_both_wrist_cameras_find_the_object_where_it_is(worlds, scene):
     for cell in worlds:
         cell.load(scene)
         grasp = grasp_of_box(cell)
-        loop = ClosedLoop(cell, "pbvs", cell.frame(), true_beliefs(cell), teach(cell))
-        found = GuidedDescent(loop, ServoArm(cell), grasp).target.T_WO
+        loop = ClosedLoop(cell, "pbvs", cell.frame(), true_calibration(cell), teach(cell))
+        found = GuidedApproach(loop, ServoArm(cell), grasp).target.T_WO
         x, y, turn = np.subtract(planar_part(found), [*cell.object_pose(0)[:2, 3], grasp.angle])
         assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
         assert abs(np.degrees((turn + np.pi / 2) % np.pi - np.pi / 2)) < 4
@@ -191,7 +191,7 @@ def test_a_frozen_camera_stops_the_arm(cell):
         left[0] -= 1
         return camera() if left[0] >= 0 else None
 
-    loop = ClosedLoop(cell, "ibvs", cell.frame(), true_beliefs(cell), teach(cell), camera=see)
+    loop = ClosedLoop(cell, "ibvs", cell.frame(), true_calibration(cell), teach(cell), camera=see)
     speeds = []
     cell.on_step = lambda cell: speeds.append(np.abs(cell.robot.joint_state()[1]).max())
     outcome = execute_grasp(cell, grasp_of_box(cell), loop)
@@ -204,10 +204,10 @@ def test_a_frozen_camera_stops_the_arm(cell):
 def test_a_push_in_the_last_centimetres_is_told_by_the_contact(cell):
     """The cube jumps under the closed fingers' way: what presses on them stops the arm."""
     grasp = grasp_of_box(cell)
-    loop = ClosedLoop(cell, "pbvs", cell.frame(), true_beliefs(cell), teach(cell))
+    loop = ClosedLoop(cell, "pbvs", cell.frame(), true_calibration(cell), teach(cell))
 
     def aside(cell):
-        if loop.record.stage == "blind" and cell.before_step is not None:
+        if loop.record.stage == "final" and cell.before_step is not None:
             T = cell.object_pose(0)
             T[:2, 3] += 0.04 * np.array([np.cos(grasp.angle), np.sin(grasp.angle)])
             cell.carry(0, T, np.zeros(3), 0.0)

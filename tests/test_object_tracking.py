@@ -7,7 +7,7 @@ import pytest
 
 from envs.pybullet_camera import Intrinsics
 from utils.errors import TargetLostError
-from utils.object_tracking import ObjectTracker, PlanarMotion, grasp_frame, make_template
+from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
 from utils.table_plane import planar, planar_part, table_plane
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, look_at, project
 
@@ -40,7 +40,7 @@ def block():
     frame = RGBDFrame(None, depth_of_block(OVERHEAD, FROM_ABOVE, T_WB), OVERHEAD.K, FROM_ABOVE)
     grasp = Grasp(np.array([0.525, 0.043, 0.02]), 0.5 + np.pi / 2, 0.05, 1.0)
     template = make_template(frame, grasp)
-    return T_WB, grasp, ObjectTracker(template, WRIST.K, (WRIST.width, WRIST.height))
+    return T_WB, grasp, TemplateMatcher(template, WRIST.K, (WRIST.width, WRIST.height))
 
 
 def test_what_is_round_is_so_wherever_it_is_grasped(block):
@@ -58,7 +58,7 @@ def test_what_is_round_is_so_wherever_it_is_grasped(block):
     for beside in (0.0, 0.03):
         grasp = Grasp(np.array([0.5 + beside, 0.0, 0.02]), 0.4, 0.05, 1.0)
         template = make_template(frame, grasp)
-        assert ObjectTracker(template, WRIST.K, (WRIST.width, WRIST.height)).round
+        assert TemplateMatcher(template, WRIST.K, (WRIST.width, WRIST.height)).round
     assert not block[2].round
 
 

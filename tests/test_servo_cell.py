@@ -10,7 +10,14 @@ import pytest
 from benchmarks import bench_servo_cell
 from benchmarks.bench_servo_cell import LAWS, make_task, pose
 from envs.board import Board
-from envs.board_servo import ArmStoppedError, ServoArm, Sight, servo_arm, servo_settings, view_of
+from envs.board_servo import (
+    ArmStoppedError,
+    ServoArm,
+    Sight,
+    servo_settings,
+    servo_to_goal,
+    view_of,
+)
 from envs.cell_layout import static_box
 from envs.cell_scenes import Scene
 from envs.pybullet_camera import Intrinsics, render
@@ -156,7 +163,7 @@ def test_a_covered_marker_stops_the_arm(cell, config, mounting):
             static_box(cell.client, [0.02, 0.02, 0.001], marker, (0.5, 0.5, 0.5, 1))
         return camera()
 
-    history = servo_arm(cell, servo, task.goal(servo), see, task.carried)
+    history = servo_to_goal(cell, servo, task.goal(servo), see, task.carried)
     assert not history.converged and history.iterations == 5
     assert history.reason == "stopped: target lost: of its 4 markers not seen: 3"
     stopped = forward_kinematics(cell.robot.q)
@@ -182,7 +189,7 @@ def test_stale_perception_means_zero_velocity(cell, config, frozen):
         speeds.append((cell.seconds, float(abs(cell.robot.joint_state()[1]).max())))
 
     cell.on_step = record
-    history = servo_arm(cell, servo, task.goal(servo), see)
+    history = servo_to_goal(cell, servo, task.goal(servo), see)
     cell.on_step = None
     assert "ms old, the watchdog allows 100 ms" in history.reason and not history.converged
     seen = sights[-1].seconds
@@ -202,7 +209,7 @@ def test_late_images_are_still_good_enough(cell, config):
         sights.append(look())
         return sights[max(0, len(sights) - 3)]  # 67 ms old
 
-    history = servo_arm(cell, servo, task.goal(servo), see, task.carried)
+    history = servo_to_goal(cell, servo, task.goal(servo), see, task.carried)
     assert history.converged and max(task.errors()) < 0.5
 
 
@@ -212,9 +219,9 @@ def test_nothing_to_see_is_an_error_and_no_motion(cell, config):
     cell.robot.place(cell.home + [1.5, 0, 0, 0, 0, 0, 0])
     before, servo = cell.robot.q, task.servo("image_based")
     with pytest.raises(TargetLostError):
-        servo_arm(cell, servo, task.goal(servo), task.camera())
+        servo_to_goal(cell, servo, task.goal(servo), task.camera())
     with pytest.raises(ArmStoppedError, match="watchdog"):
-        servo_arm(cell, servo, task.goal(servo), lambda: None)
+        servo_to_goal(cell, servo, task.goal(servo), lambda: None)
     np.testing.assert_allclose(cell.robot.q, before, atol=1e-4)
 
 

@@ -64,9 +64,9 @@ from utils.visual_servo import (
     PoseError,
     PositionBasedVisualServo,
     ServoError,
+    ServoView,
     SingularMatrixError,
     TwistLimits,
-    View,
     joint_limit_avoidance,
     scale_joint_velocities,
 )
@@ -381,7 +381,7 @@ def test_adaptive_gain_by_hand():
 
 def test_smooth_start_grows_from_zero():
     servo = ImageBasedVisualServo(CAMERA, smooth_start=4.0)
-    view, goal = View(CORNERS + 20, 1.0), View(CORNERS, 1.0)
+    view, goal = ServoView(CORNERS + 20, 1.0), ServoView(CORNERS, 1.0)
     full = ImageBasedVisualServo(CAMERA).step(view, goal).velocity
     speeds = [servo.step(view, goal).velocity for _ in range(26)]
     np.testing.assert_allclose(speeds[0], 0, atol=1e-15)
@@ -538,7 +538,7 @@ def test_arm_servoes_to_the_goal(panda, config, law):
     def look(T_WE):
         T_CO = inverse_pose(T_WE @ T_EC) @ T_WO if in_hand else inverse_pose(T_WC) @ T_WE @ T_EO
         p = transform_points(T_CO, SQUARE)
-        return View(servo.camera.to_pixels(p[:, :2] / p[:, 2:]), p[:, 2], T_CO)
+        return ServoView(servo.camera.to_pixels(p[:, :2] / p[:, 2:]), p[:, 2], T_CO)
 
     goal_pose = panda.pose(q_goal)
     ahead = object_pose([0, 0, 0.5], [15, -10, 30])  # of the object in the camera at the goal
@@ -658,7 +658,7 @@ def test_what_is_no_camera_matrix_is_refused(matrix, words):
 def test_impossible_depths_are_refused(depth):
     for servo in LAWS[0], LAWS[3]:
         with pytest.raises(DepthError, match="in front of the camera"):
-            servo.step(View(CORNERS, depth, START), View(CORNERS + 5, 1.0, GOAL))
+            servo.step(ServoView(CORNERS, depth, START), ServoView(CORNERS + 5, 1.0, GOAL))
 
 
 def test_missing_depths_are_refused_and_never_assumed():
@@ -684,7 +684,7 @@ def test_impossible_points_are_refused(seen, wanted, error):
     sized = CAMERA | {"width": 640, "height": 480}
     for servo in ImageBasedVisualServo(sized), HybridVisualServo(sized, scheme="2.5d"):
         with pytest.raises(error, match="points"):
-            servo.step(View(seen, 1.0, START), View(wanted, 1.0, GOAL))
+            servo.step(ServoView(seen, 1.0, START), ServoView(wanted, 1.0, GOAL))
 
 
 def test_counts_of_depths_must_match():
@@ -752,10 +752,10 @@ def test_every_servo_error_is_a_user_error():
 
 @pytest.mark.parametrize("servo", LAWS, ids=LAW_NAMES)
 def test_last_command_is_zero_however_it_ends(servo):
-    views = [View(CORNERS + 9, 1.0, START)] * 3
-    goal = View(CORNERS, 1.0, GOAL)
+    views = [ServoView(CORNERS + 9, 1.0, START)] * 3
+    goal = ServoView(CORNERS, 1.0, GOAL)
     sent = []
-    lost = iter([*views, View(CORNERS[:2], 1.0, None)])
+    lost = iter([*views, ServoView(CORNERS[:2], 1.0, None)])
     history = servo.run(lambda: next(lost), sent.append, goal)
     assert history.reason.startswith("stopped by ")
     assert history.iterations == 3 and not history.converged
@@ -763,7 +763,7 @@ def test_last_command_is_zero_however_it_ends(servo):
     np.testing.assert_array_equal(sent[-1], np.zeros(6))
     sent.clear()
     with pytest.raises(ServoError):  # nothing was ever seen: bad input, not a lost feature
-        servo.run(lambda: View(CORNERS[:2], 1.0, None), sent.append, goal)
+        servo.run(lambda: ServoView(CORNERS[:2], 1.0, None), sent.append, goal)
     np.testing.assert_array_equal(sent, [np.zeros(6)])
 
 
@@ -779,12 +779,12 @@ def test_features_that_leave_the_image_stop_the_camera():
 def test_an_error_that_no_motion_reduces_ends_the_run():
     # The goal's square is larger on one diagonal: no pose shows it. Desired L, frozen view.
     servo = ImageBasedVisualServo(CAMERA, truncation=0.9, interaction="desired")
-    goal = View(CORNERS, 1.0)
+    goal = ServoView(CORNERS, 1.0)
     xy = servo.camera.normalise(CORNERS)
     L = interaction_matrix(xy, np.ones(4))
     U = np.linalg.svd(L)[0]
     seen = servo.camera.to_pixels(xy + 1e-2 * U[:, 7].reshape(4, 2))
-    history = servo.run(lambda: View(seen, 1.0), lambda v: None, goal)
+    history = servo.run(lambda: ServoView(seen, 1.0), lambda v: None, goal)
     assert not history.converged
     assert "no motion" in history.reason
 
@@ -818,8 +818,10 @@ def test_condition_number_is_that_of_the_interaction_matrix():
 
 
 def test_history_without_poses_or_points_still_draws(tmp_path):
-    by_image = LAWS[0].run(lambda: View(CORNERS + 5, 1.0), lambda v: None, View(CORNERS, 1.0), 3)
-    by_pose = LAWS[1].run(lambda: View(T_CO=START), lambda v: None, View(T_CO=GOAL), 3)
+    by_image = LAWS[0].run(
+        lambda: ServoView(CORNERS + 5, 1.0), lambda v: None, ServoView(CORNERS, 1.0), 3
+    )
+    by_pose = LAWS[1].run(lambda: ServoView(T_CO=START), lambda v: None, ServoView(T_CO=GOAL), 3)
     for history in by_image, by_pose:
         history.plot(tmp_path / "servo.png")
 

@@ -55,6 +55,7 @@ RENAMED_KEYS = {
     "rl.looks": "rl.pretraining_images",
     "rl.looks_lr": "rl.pretraining_lr",
     "transfer.worlds": "transfer.columns",
+    "closed_loop.blind_seconds": "closed_loop.final_seconds",
 }
 
 

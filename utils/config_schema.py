@@ -147,7 +147,7 @@ class ClosedLoopConfig(Section):
     floor: Annotated[float, Field(ge=0)]
     compute_seconds: Annotated[float, Field(ge=0)]
     lost_seconds: Positive
-    blind_seconds: Positive
+    final_seconds: Positive
     seconds: Positive
     camera_shift: Annotated[float, Field(ge=0)]
     camera_turn_deg: Annotated[float, Field(ge=0, le=45)]

@@ -172,7 +172,7 @@ def _window(depth, K, T_OC, reach: float) -> tuple[tuple[slice, slice] | None, f
     return (slice(low[1], high[1]), slice(low[0], high[0])), float(far.max())
 
 
-class ObjectTracker:
+class TemplateMatcher:
     """Finds one template in depth images from a camera with the matrix K (3, 3)."""
 
     def __init__(self, template: ObjectTemplate, K: np.ndarray, size: tuple[int, int]):

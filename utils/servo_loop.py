@@ -184,7 +184,7 @@ class ServoHistory:
 STALLED = 1e-12  # a correction this small (m, rad) will never move a camera
 
 
-class View(NamedTuple):
+class ServoView(NamedTuple):
     """What a camera saw, or should see. What a law does not use may be None.
 
     points: (n, 2) pixels. depths: (n,) or one for all, metres along the optical axis.
@@ -196,7 +196,7 @@ class View(NamedTuple):
     T_CO: np.ndarray | None = None
 
 
-class ServoStep(NamedTuple):
+class ServoCommand(NamedTuple):
     """velocity: (6,) v_C. error: (m,) in the law's units. gain: 1/s.
 
     correction: (6,) minus the way still to go, metres and radians in C; velocity is -gain times
@@ -263,7 +263,7 @@ class VisualServo(ABC):
         self._first_correction: np.ndarray | None = None
         self._velocity = np.zeros(6)
 
-    def step(self, view: View, goal: View) -> ServoStep:
+    def step(self, view: ServoView, goal: ServoView) -> ServoCommand:
         """The twist that brings `view` towards `goal`. Raises a ServoError on bad input."""
         error, correction, condition = self._correct(view, goal)
         gain = self.lambda_
@@ -280,25 +280,25 @@ class VisualServo(ABC):
         self._time += self.dt
         self._velocity = velocity
         self._stalled = correction @ correction < STALLED**2
-        return ServoStep(velocity, error, condition, gain, correction)
+        return ServoCommand(velocity, error, condition, gain, correction)
 
     def run(
         self,
-        see: Callable[[], View],
+        see: Callable[[], ServoView],
         move: Callable[[np.ndarray], object],
-        goal: View,
+        goal: ServoView,
         max_iterations: int = 3000,
         tolerance: float = 1e-5,
     ) -> ServoHistory:
         """See and move until the error's norm is under `tolerance`.
 
-        see() returns the present View; move(v_C) has the camera move with v_C until the next call.
+        see() returns the present ServoView; move(v_C) has the camera move with v_C until the next call.
         However it ends, the last command is zero. Bad input in the first view raises; later on, a
         lost feature set ends the run with the reason in the history.
         """
         self.reset()
-        views: list[View] = []
-        steps: list[ServoStep] = []
+        views: list[ServoView] = []
+        steps: list[ServoCommand] = []
         converged, reason = False, f"stopped after {max_iterations} iterations"
         try:
             while len(steps) < max_iterations:
@@ -376,7 +376,7 @@ class VisualServo(ABC):
         return points_from_depths(xy, check_depths(Z, 1))[0]
 
     @abstractmethod
-    def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
+    def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         """Error (m,), L^+ error (6,), condition number of L."""
 
     def _goal_xy(self, points) -> np.ndarray:
@@ -389,7 +389,12 @@ class VisualServo(ABC):
         return self._goal[1]
 
     def history(
-        self, views: list[View], steps: list[ServoStep], goal: View, converged: bool, reason: str
+        self,
+        views: list[ServoView],
+        steps: list[ServoCommand],
+        goal: ServoView,
+        converged: bool,
+        reason: str,
     ) -> ServoHistory:
         """What a run that saw `views` and answered with `steps`, one each, leaves behind."""
         unknown = np.full((4, 4), np.nan)
@@ -423,7 +428,7 @@ class _SimulatedCamera:
         self.depth_factor, self.pixel_noise, self.rng = depth_factor, pixel_noise, rng
         self.poses: list[np.ndarray] = []
 
-    def see(self) -> View:
+    def see(self) -> ServoView:
         T_CO = self.T_CO
         self.poses.append(T_CO)
         points_C = self.points_O @ T_CO[:3, :3].T + T_CO[:3, 3]
@@ -436,7 +441,7 @@ class _SimulatedCamera:
             xy = self.camera.normalise_unchecked(pixels)
             T_CO = pose_from_points(points_from_depths(xy, depths), self.points_O)
         told = None if self.depth_factor is None else depths * self.depth_factor
-        return View(pixels, told, T_CO)
+        return ServoView(pixels, told, T_CO)
 
     def move(self, velocity: np.ndarray) -> None:
         self.T_CO = pose_exp(-self.dt * velocity) @ self.T_CO

@@ -1,6 +1,6 @@
 """Visual servoing: move a camera until it sees what it should see.
 
-Three laws with one face. A `View` is what a camera saw; `step(view, goal)` turns the difference of
+Three laws with one face. A `ServoView` is what a camera saw; `step(view, goal)` turns the difference of
 two views into a twist of the camera; `run` closes the loop around any camera and robot, `simulate`
 around an ideal one. The tutorial's methods (`compute_velocity` and the like) are thin doors to the
 same laws.
@@ -50,7 +50,7 @@ from utils.servo_features import (
     pose_from_points,
     rotation_interaction,
 )
-from utils.servo_loop import ServoHistory, ServoStep, View, VisualServo
+from utils.servo_loop import ServoCommand, ServoHistory, ServoView, VisualServo
 from utils.transforms import inverse_pose, rotation_log, transform_points
 
 __all__ = [
@@ -67,10 +67,10 @@ __all__ = [
     "PositionBasedVisualServo",
     "ServoError",
     "ServoHistory",
-    "ServoStep",
+    "ServoCommand",
     "SingularMatrixError",
     "TwistLimits",
-    "View",
+    "ServoView",
     "joint_limit_avoidance",
     "scale_joint_velocities",
 ]
@@ -119,9 +119,11 @@ class ImageBasedVisualServo(VisualServo):
         desired_Z is used by the desired and mean interaction matrix only; without it, Z is.
         """
         desired_Z = Z if desired_Z is None else desired_Z
-        return self.step(View(current_points, Z), View(desired_points, desired_Z)).velocity
+        return self.step(
+            ServoView(current_points, Z), ServoView(desired_points, desired_Z)
+        ).velocity
 
-    def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
+    def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         if view.points is None or goal.points is None:
             raise FeatureCountError("points: needed in the view and in the goal, got None")
         xy, xy_goal = self.camera.normalise(view.points), self._goal_xy(goal.points)
@@ -166,9 +168,9 @@ class PositionBasedVisualServo(VisualServo):
 
     def compute_end_effector_velocity(self, current_pose, target_pose) -> np.ndarray:
         """(6,) v_C from the object's pose T_CO (4, 4) seen and wanted. All six components."""
-        return self.step(View(T_CO=current_pose), View(T_CO=target_pose)).velocity
+        return self.step(ServoView(T_CO=current_pose), ServoView(T_CO=target_pose)).velocity
 
-    def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
+    def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         T_GC = relative_pose(view, goal)
         turn = rotation_log(T_GC[:3, :3])
         error = np.concatenate([T_GC[:3, 3], turn])
@@ -225,12 +227,12 @@ class HybridVisualServo(VisualServo):
         The depths at the goal follow from those seen now and both poses.
         """
         xy = self.camera.normalise(current_pixels)
-        view = View(current_pixels, depths_from_image(current_pixels, depth_map), current_pose)
-        T_GC = relative_pose(view, View(T_CO=target_pose))
+        view = ServoView(current_pixels, depths_from_image(current_pixels, depth_map), current_pose)
+        T_GC = relative_pose(view, ServoView(T_CO=target_pose))
         goal_depths = transform_points(T_GC, points_from_depths(xy, view.depths))[:, 2]
-        return self.step(view, View(target_pixels, goal_depths, target_pose)).velocity
+        return self.step(view, ServoView(target_pixels, goal_depths, target_pose)).velocity
 
-    def _correct(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
+    def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         if self.scheme == "2.5d":
             return self._correct_extended(view, goal)
         pose_error, by_pose, pose_condition = self.position_controller._correct(view, goal)
@@ -239,7 +241,9 @@ class HybridVisualServo(VisualServo):
         condition = max(pose_condition, image_condition)
         return np.concatenate([image_error, pose_error]), correction, condition
 
-    def _correct_extended(self, view: View, goal: View) -> tuple[np.ndarray, np.ndarray, float]:
+    def _correct_extended(
+        self, view: ServoView, goal: ServoView
+    ) -> tuple[np.ndarray, np.ndarray, float]:
         turn = rotation_log(relative_pose(view, goal)[:3, :3])
         # The centre of the points in space, not of their images, is a fixed point of the object.
         if view.points is None or goal.points is None:
@@ -266,7 +270,7 @@ def centre_of(xy: np.ndarray, depths) -> np.ndarray:
     return points_from_depths(xy, check_depths(depths, len(xy))).mean(axis=0)
 
 
-def relative_pose(view: View, goal: View) -> np.ndarray:
+def relative_pose(view: ServoView, goal: ServoView) -> np.ndarray:
     """(4, 4) T_GC, the camera seen from its goal."""
     T_CO, T_GO = check_pose("view.T_CO", view.T_CO), check_pose("goal.T_CO", goal.T_CO)
     return T_GO @ inverse_pose(T_CO)
