@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run quick test test-fast lint bench clean
+.PHONY: run quick test test-fast lint bench results clean
 
 run: $(VENV)/.installed
 	$(BIN)/python evaluate.py $(ARGS)
@@ -25,6 +25,10 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.bench_env $(ARGS)
+
+# Every table of README and docs/results.md: make results PARTS=scoreboard,servo SCALE=0.1
+results: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(CORNELL),--cornell $(CORNELL)) $(ARGS)
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

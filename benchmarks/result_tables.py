@@ -1,0 +1,299 @@
+"""The tables of README and docs, written from docs/results/*.json: nothing is typed by hand.
+
+A page says where a table stands by two comments, `<!-- results:NAME -->` and `<!-- /results -->`;
+NAME is a key of TABLES. Pages whose name has `zh` in it get their words in Chinese. A table names
+the commit, the seed and the command that it was measured by.
+
+This module formats what `benchmarks.results` measured and measures nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from utils.runs import write_atomic
+from utils.statistics import wilson_interval
+
+PAGES = ("README.md", "README.zh-CN.md", "docs/results.md")
+_BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
+
+Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
+Say = Callable[[str], str]  # a word in the page's language
+
+# Success per attempt and objects removed, as published; none of these systems moves a whole arm in
+# simulation, and each has objects, sensors and a protocol of its own.
+PUBLISHED = (
+    ("VGN", "5 objects, noisy side view, floating hand", "59 %", "44 %", "arXiv 2507.18847"),
+    ("EquiIGD-HR", "the same, one view from any side", "91 %", "95 %", "arXiv 2507.18847"),
+    ("OrbitGrasp", "the same", "97 %", "98 %", "arXiv 2410.02531"),
+    ("AnyGrasp", "real bins of 300 unseen objects", "93 %", "-", "arXiv 2212.08333"),
+)  # fmt: skip
+
+CHINESE = {
+    "planner": "规划器",
+    "5 objects: success": "5 个物体:成功率",
+    "cleared": "清空率",
+    "15 objects: success": "15 个物体:成功率",
+    "objects": "物体",
+    "scenario": "场景",
+    "success": "成功率",
+    "measured at commit": "测量于提交",
+    "seed": "种子",
+    "not measured yet": "尚未测量",
+    "On 15 objects GraspNet's success is {} points from the heuristic's.": (
+        "15 个物体时,GraspNet 的成功率与启发式规划器之差为 {} 个百分点。"
+    ),
+    "rounds each": "轮",
+    "published system": "已发表的系统",
+    "task": "任务",
+    "source": "来源",
+    "5 objects, noisy side view, floating hand": "5 个物体,带噪声的侧视图,浮动的手",
+    "the same, one view from any side": "同上,任意方向的单视图",
+    "the same": "同上",
+    "real bins of 300 unseen objects": "真实料箱,300 个没见过的物体",
+}
+
+
+def write_tables(folder: Path, pages: Sequence[str] = PAGES) -> list[Path]:
+    """Write every table of the pages anew from the figures in a folder; the pages."""
+    written = []
+    for page in map(Path, pages):
+        write_atomic(page, with_tables(page.read_text(encoding="utf-8"), folder, "zh" in page.name))
+        written.append(page)
+    return written
+
+
+def with_tables(text: str, folder: Path, chinese: bool = False) -> str:
+    """A page's text with its tables written anew. Raises KeyError for an unknown table."""
+    say: Say = (lambda word: CHINESE.get(word, word)) if chinese else (lambda word: word)
+
+    def block(match: re.Match[str]) -> str:
+        parts, draw = TABLES[match[2]]
+        files = [folder / f"{part}.json" for part in parts]
+        if all(file.exists() for file in files):
+            body = draw(say, *(json.loads(file.read_text()) for file in files))
+        else:
+            body = f"*{say('not measured yet')}: `make results PARTS={','.join(parts)}`*"
+        return f"{match[1]}{body}\n{match[3]}"
+
+    return _BLOCK.sub(block, text)
+
+
+# --- Cells ------------------------------------------------------------------------------------
+
+
+def rate(successes: int, trials: int) -> str:
+    """'97 % [95, 98] (488/502)', with the 95 % Wilson interval; '-' of nothing."""
+    if trials == 0:
+        return "-"
+    low, high = (100 * bound for bound in wilson_interval(successes, trials))
+    return f"{100 * successes / trials:.0f} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
+
+
+def success(row: Figures) -> str:
+    return rate(row["successes"], row["attempts"])
+
+
+def cleared(row: Figures) -> str:
+    return rate(row["objects_cleared"], row["objects_total"])
+
+
+def points(difference: Figures | None) -> str:
+    """'+1.5 [+0.7, +2.2]' percentage points."""
+    if difference is None:
+        return "-"
+    value, low, high = (100 * difference[key] for key in ("value", "low", "high"))
+    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    rows = [header, ["---"] * len(header), *lines]
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+
+
+def origin(say: Say, *parts: Figures) -> str:
+    """The line under a table: commit, seed and commands."""
+    said = []
+    for part in parts:
+        commands = "; ".join(f"`{one['command']}`" for one in part["commands"].values())
+        said.append(
+            f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']}), "
+            f"{say('seed')} {part['seed']}: {commands}</sub>"
+        )
+    return "\n".join(said)
+
+
+def rows_of(part: Figures, command: str | None = None) -> list[Figures]:
+    """The rows of a part's command, the first one by default."""
+    commands = part["commands"]
+    return commands[command or next(iter(commands))]["rows"]
+
+
+# --- Tables -----------------------------------------------------------------------------------
+
+
+def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
+    """The README's: four planners on piles of 5 and of 15 objects."""
+    few = {row["policy"]: row for row in rows_of(scoreboard) if _is(row, "pile", "random_urdfs")}
+    many = {row["policy"]: row for row in rows_of(clutter)}
+    header = ["planner", "5 objects: success", "cleared", "15 objects: success", "cleared"]
+    lines = [
+        [f"`{name}`", success(few[name]), cleared(few[name]), success(row), cleared(row)]
+        for name, row in many.items()
+    ]
+    ahead = points(_pair(clutter, "graspnet", "heuristic")["success"])
+    sentence = say("On 15 objects GraspNet's success is {} points from the heuristic's.")
+    return "\n\n".join(
+        [table(list(map(say, header)), lines), sentence.format(ahead), _short(say, scoreboard)]
+    )
+
+
+def published(say: Say) -> str:
+    """What the best published systems reach on tasks of their own."""
+    header = ["published system", "task", "success", "cleared", "source"]
+    lines = [[name, say(task), *rest] for name, task, *rest in PUBLISHED]
+    return table(list(map(say, header)), lines)
+
+
+def scoreboard(say: Say, part: Figures) -> str:
+    header = ["objects", "scenario", "planner", "success", "cleared", "plan", "picks an hour"]
+    lines = [[f"`{row['objects']}`", row["scenario"], *_planner_cells(row)]
+             for row in rows_of(part)]  # fmt: skip
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def differences(say: Say, part: Figures) -> str:
+    """GraspNet against the heuristic, paired by scene."""
+    lines = [
+        [f"`{pair['objects']}`", pair["scenario"], points(pair["success"]), points(pair["cleared"])]
+        for command in part["commands"].values()
+        for pair in command["comparisons"]
+        if (pair["first"], pair["second"]) == ("graspnet", "heuristic")
+    ]
+    header = ["objects", "scenario", "success, points", "cleared, points"]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def clutter15(say: Say, part: Figures) -> str:
+    header = ["planner", "success", "cleared", "plan", "picks an hour"]
+    lines = [_planner_cells(row) for row in rows_of(part)]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
+    """With a Kinect's noise beside the scoreboard's rows of the same scenes without it."""
+    lines = []
+    for row in rows_of(part):
+        same = [one for one in rows_of(scoreboard) if _key(one) == _key(row)]
+        lines.append([f"`{row['objects']}`", row["scenario"], f"`{row['policy']}`", success(row),
+                      success(same[0]) if same else "-"])  # fmt: skip
+    header = ["objects", "scenario", "planner", "success with noise", "without"]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def servo(say: Say, part: Figures) -> str:
+    """Scenarios by controllers, both object sets together."""
+    counts: dict[str, dict[str, list[int]]] = {}
+    for row in rows_of(part):
+        cell = counts.setdefault(row["scenario"], {}).setdefault(row["controller"], [0, 0])
+        cell[0] += row["successes"]
+        cell[1] += row["attempts"]
+    names = list(next(iter(counts.values())))
+    lines = [[f"`{name}`", *(rate(*cells[one]) for one in names)] for name, cells in counts.items()]
+    return "\n\n".join([table(["scenario", *map(str, names)], lines), origin(say, part)])
+
+
+def mujoco(say: Say, part: Figures) -> str:
+    ours, theirs = (
+        {row["policy"]: row for row in rows_of(part, name)} for name in ("pybullet", "mujoco")
+    )
+    lines = [[f"`{name}`", success(row), success(theirs[name])] for name, row in ours.items()]
+    return "\n\n".join([table(["planner", "PyBullet", "MuJoCo"], lines), origin(say, part)])
+
+
+def ppo(say: Say, part: Figures) -> str:
+    lines = []
+    for command in part["commands"].values():
+        for row in command["rows"]:
+            policy = row["policy"].removeprefix("ppo:checkpoints/")
+            lines.append([f"`{row['objects']}`", f"`{policy}`", success(row), cleared(row)])
+    header = ["objects", "policy", "success", "cleared"]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def cornell(say: Say, part: Figures) -> str:
+    lines = []
+    for row in rows_of(part, "simulated"):
+        worlds = row["worlds"]
+        if not worlds:
+            continue
+        cells = [worlds.get(name) for name in ("cornell", "cornell_as_taken")]
+        lines.append([row["policy"], row["training"], *(
+            "-" if one is None else rate(one["successes"], one["trials"]) for one in cells
+        )])  # fmt: skip
+    folds = part["commands"]["folds"]
+    lines.append(["GraspNet, five folds by object", "taught by the other folds' labels", "-",
+                  rate(folds["correct"], folds["images"])])  # fmt: skip
+    header = ["policy", "training", "seen from above", "as taken"]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+def speed(say: Say, part: Figures) -> str:
+    lines = [
+        [f"`{name}`", f"{one['value']:.3g} {one['unit']}", one["target"] or "-",
+         {True: "yes", False: "no", None: "-"}[one["holds"]]]
+        for name, one in part["commands"]["environment"]["metrics"].items()
+    ]  # fmt: skip
+    header = ["what", "measured", "aim", "reached"]
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
+# Name of a table: the parts that it needs, and what writes it.
+TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
+    "planners": (("scoreboard", "clutter15"), planners),
+    "published": ((), published),
+    "scoreboard": (("scoreboard",), scoreboard),
+    "differences": (("scoreboard",), differences),
+    "clutter15": (("clutter15",), clutter15),
+    "differences15": (("clutter15",), differences),
+    "noise": (("noise", "scoreboard"), noise),
+    "servo": (("servo",), servo),
+    "mujoco": (("mujoco",), mujoco),
+    "ppo": (("ppo",), ppo),
+    "cornell": (("cornell",), cornell),
+    "speed": (("speed",), speed),
+}
+
+
+def _planner_cells(row: Figures) -> list[str]:
+    plan, an_hour = row["plan_ms_median"], row["picks_per_hour"]
+    return [
+        f"`{row['policy']}`", success(row), cleared(row),
+        "-" if plan is None else f"{plan:.0f} ms", "-" if an_hour is None else f"{an_hour:.0f}",
+    ]  # fmt: skip
+
+
+def _short(say: Say, part: Figures) -> str:
+    return (
+        f"<sub>{say('measured at commit')} `{part['commit'][:10]}`, {say('seed')} {part['seed']}, "
+        "95 % Wilson; [docs/results.md](docs/results.md)</sub>"
+    )
+
+
+def _pair(part: Figures, first: str, second: str) -> Figures:
+    command = next(iter(part["commands"].values()))
+    pairs = command["comparisons"]
+    return next(one for one in pairs if (one["first"], one["second"]) == (first, second))
+
+
+def _is(row: Figures, scenario: str, objects: str) -> bool:
+    return (row["scenario"], row["objects"]) == (scenario, objects)
+
+
+def _key(row: Figures) -> tuple[str, str, str]:
+    return row["policy"], row["scenario"], row["objects"]

@@ -1,0 +1,306 @@
+"""Every table of README and docs/results.md, measured and written there: make results
+
+    make results                                  # all parts, about three hours on two cores
+    make results PARTS=scoreboard,servo           # some of them
+    make results PARTS=cornell CORNELL=path/to/cornell
+    python -m benchmarks.results --list           # the parts, their commands and how long they take
+    python -m benchmarks.results --write          # only write the tables from docs/results/*.json
+
+A part is a list of commands that anyone can run alone. The parts that stop early (Ctrl-C) go on
+with the next call: finished commands lie in runs/results/<commit>/, unfinished ones are resumed.
+A finished part leaves its figures in docs/results/<part>.json and the first rounds of each row in
+docs/results/<part>-<command>.jsonl; the tables are written from these files alone.
+
+The seed is one that no choice was made on; docs/results.md lists those of the development.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from benchmarks.result_tables import write_tables
+from utils.config import run_script
+from utils.errors import UserError
+from utils.result_records import read_rounds
+from utils.results import compare
+from utils.runs import environment, write_atomic, write_json_atomic
+
+SEED = 2027
+REPOSITORY = Path(__file__).resolve().parent.parent
+FIGURES = Path("docs/results")  # what the tables are written from
+RUNS = Path("runs/results")
+# Files on which a figure depends: a commit that touches none of them changes no table.
+CODE = ("envs", "models", "utils", "configs", "checkpoints", "*.py", "benchmarks/bench_*.py",
+        "benchmarks/metrics.py", "requirements.txt")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Command:
+    """One program run, whose results.json makes rows of a table.
+
+    rounds: of each row, None for what has no rounds. kept: rounds of each row that stay in the
+    repository, so that a reader can check them in minutes.
+    """
+
+    name: str
+    program: str  # a script, or a module of benchmarks with --json
+    arguments: str
+    rounds: int | None = None
+    kept: int = 10
+
+    def scaled(self, scale: float) -> int | None:
+        return None if self.rounds is None else max(1, round(self.rounds * scale))
+
+    def line(self, rounds: int | None, cornell: Path | None = None) -> str:
+        """The command as a reader would type it."""
+        start = self.program if self.program.endswith(".py") else f"-m benchmarks.{self.program}"
+        parts = [f"python {start}"]
+        if self.program.endswith(".py"):
+            parts.append(f"seed={SEED}")
+        parts += [self.arguments] if self.arguments else []
+        if rounds is not None:
+            parts.append(f"evaluate.rounds={rounds}")
+        return " ".join(parts).replace("CORNELL", str(cornell or "path/to/cornell"))
+
+
+@dataclass(frozen=True)
+class Part:
+    """Tables that are measured together. minutes: on two cores, all rounds."""
+
+    name: str
+    about: str
+    minutes: int
+    commands: tuple[Command, ...]
+    needs_cornell: bool = False
+
+
+EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
+
+
+def _evaluation(name: str, rounds: int, arguments: str, kept: int = 10) -> Command:
+    return Command(name, EVALUATE, f"{arguments} evaluate.videos=0", rounds, kept)
+
+
+def _policy(objects: str, file: str) -> Command:
+    policies = f"evaluate.policies=ppo:checkpoints/{file},heuristic"
+    where = f"evaluate.scenarios=isolated evaluate.object_sets={objects}"
+    return _evaluation(objects, 100, f"{policies} {where}", kept=3)
+
+
+PARTS = (
+    Part("scoreboard", "four planners on single objects, packed scenes and piles", 85, (
+        _evaluation("scoreboard", 100, f"evaluate.policies={ALL} "
+                    "evaluate.scenarios=isolated,packed,pile "
+                    "evaluate.object_sets=random_urdfs,primitives"),
+    )),
+    Part("clutter15", "four planners on piles of 15 objects", 35, (
+        _evaluation("clutter15", 60, f"scene.count=15 evaluate.policies={ALL} "
+                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs"),
+    )),
+    Part("noise", "the depth image of a first Kinect", 20, (
+        _evaluation("kinect", 100, "camera.depth_noise=kinect evaluate.policies=heuristic,graspnet "
+                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs,primitives", kept=3),
+    )),
+    Part("servo", "closed loops on objects that move", 30, (
+        _evaluation("servo", 10, "--config configs/servo.yaml", kept=1),
+    )),
+    Part("mujoco", "piles in both simulators", 25, tuple(
+        _evaluation(simulator, 50, f"simulator={simulator} evaluate.policies=heuristic,graspnet,"
+                    "oracle evaluate.scenarios=pile evaluate.object_sets=random_urdfs", kept=3)
+        for simulator in ("pybullet", "mujoco")
+    )),
+    Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
+        _policy("box", "ppo_box.pt"),
+        _policy("random_urdfs", "ppo_random_urdfs.pt"),
+        _policy("primitives", "ppo_primitives.pt"),
+    )),
+    Part("cornell", "Cornell's photographs", 15, (
+        Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="
+                "cornell,cornell_as_taken transfer.cornell=CORNELL"),
+        Command("folds", "train_graspnet.py", "--config configs/cornell.yaml data.root=CORNELL"),
+    ), needs_cornell=True),
+    Part("speed", "the environment against panda-gym and PyBullet's stock objects", 5, (
+        Command("environment", "bench_env", ""),
+    )),
+)  # fmt: skip
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = _parser().parse_args(argv)
+    parts = chosen_parts(options.parts)
+    if options.list:
+        print_parts(parts, options.scale)
+        return 0
+    if not options.write:
+        commit = code_commit()
+        for part in parts:
+            if part.needs_cornell and options.cornell is None:
+                print(f"{part.name}: skipped, because no --cornell names a folder of photographs")
+                continue
+            measure(part, commit, options.scale, options.cornell)
+            print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}", flush=True)
+    else:
+        print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description="Measure and write the tables of the docs.")
+    parser.add_argument("--parts", help="names with commas between; default: all")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the rounds; 0.05 for a test")
+    parser.add_argument("--cornell", type=Path, help="folder of Cornell's photographs")
+    parser.add_argument("--list", action="store_true", help="print the parts and measure nothing")
+    parser.add_argument("--write", action="store_true", help="only write the tables again")
+    return parser
+
+
+def chosen_parts(names: str | None) -> list[Part]:
+    """The parts of a list such as 'scoreboard,servo'. Raises UserError for an unknown name."""
+    known = {part.name: part for part in PARTS}
+    wanted = list(known) if not names else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise UserError(f"--parts: {name!r} is no part; choose among {', '.join(known)}")
+    return [known[name] for name in wanted]
+
+
+def print_parts(parts: Sequence[Part], scale: float) -> None:
+    for part in parts:
+        print(f"{part.name}: {part.about}; about {max(1, round(part.minutes * scale))} minutes")
+        for command in part.commands:
+            print(f"    {command.line(command.scaled(scale))}")
+    total = sum(part.minutes for part in parts) * scale
+    print(f"about {total / 60:.1f} hours on two cores")
+
+
+def code_commit() -> str:
+    """The last commit that changed what figures depend on. Raises UserError where files differ
+    from it: a table names the commit that it was measured at."""
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", *CODE)
+    if changed:
+        raise UserError(f"results: commit these first, tables name their commit: {changed.split()}")
+    return _git("log", "-1", "--format=%H", "--", *CODE)
+
+
+def _git(*arguments: str) -> str:
+    try:
+        command = ["git", "-C", str(REPOSITORY), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise UserError(f"results: needs git and the repository's history ({error})") from None
+
+
+# --- Measuring --------------------------------------------------------------------------------
+
+
+def measure(part: Part, commit: str, scale: float, cornell: Path | None) -> None:
+    """Run a part's commands that are not finished yet, and write docs/results/<part>.json."""
+    measured: dict[str, Any] = {}
+    for command in part.commands:
+        file = RUNS / commit / f"{run_name(part, command, command.scaled(scale), commit)}.json"
+        if not file.exists():
+            write_json_atomic(file, run_command(part, command, scale, commit, cornell))
+        measured[command.name] = json.loads(file.read_text())
+        if "run" in measured[command.name]:
+            keep_rounds(part, command, Path(measured[command.name].pop("run")))
+    content = {"part": part.name, "commit": commit, "seed": SEED, "date": str(date.today())}
+    write_json_atomic(FIGURES / f"{part.name}.json", content | {"commands": measured})
+
+
+def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> str:
+    return "-".join(["results", part.name, command.name, str(rounds or "all"), commit[:10]])
+
+
+def run_command(
+    part: Part, command: Command, scale: float, commit: str, cornell: Path | None
+) -> dict[str, Any]:
+    """Run a command to its end, going on where an earlier call stopped; its figures."""
+    rounds, start = command.scaled(scale), time.perf_counter()
+    name = run_name(part, command, rounds, commit)
+    line = command.line(rounds, cornell)
+    if not command.program.endswith(".py"):
+        output = RUNS / commit / f"{name}.metrics.json"
+        run_program([*shlex.split(line), "--json", str(output)])
+        figures: dict[str, Any] = {"metrics": json.loads(output.read_text())}
+    else:
+        script = Path(command.program).stem
+        run = latest_run(script, name)
+        if run is not None:
+            run_program(["python", command.program, "--resume", str(run)])
+        else:
+            key = "evaluate" if script == "evaluate" else "train"
+            run_program([*shlex.split(line), f"{key}.name={name}"])
+            run = latest_run(script, name)
+        if run is None:
+            raise UserError(f"results: {line} left no folder runs/{script}/*-{name}")
+        figures = figures_of(run)
+    environment_of = environment()
+    return {
+        "command": command.line(rounds),
+        "rounds": rounds,
+        "minutes": round((time.perf_counter() - start) / 60, 1),
+        "device": f"{platform.machine()}, {environment_of['cpu_count']} cores",
+        "versions": {"python": environment_of["python"]} | environment_of["packages"],
+    } | figures
+
+
+def latest_run(script: str, name: str) -> Path | None:
+    """The newest run folder with that name that can be gone on with."""
+    runs = sorted(Path("runs", script).glob(f"*-{name}/config.yaml"))
+    return runs[-1].parent if runs else None
+
+
+def run_program(arguments: Sequence[str]) -> None:
+    """Run a Python program and wait for it, after Ctrl-C too: it saves what it has.
+    Raises KeyboardInterrupt where it was interrupted, UserError where it failed."""
+    print(f"$ {shlex.join(arguments)}", flush=True)
+    process = subprocess.Popen([sys.executable, *arguments[1:]])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        process.wait()
+        raise
+    if status == 130:
+        raise KeyboardInterrupt
+    if status != 0:
+        raise UserError(f"results: {shlex.join(arguments)} ended with status {status}")
+
+
+def figures_of(run: Path) -> dict[str, Any]:
+    """What a table needs of a run's results.json, and paired differences of its policies."""
+    results = json.loads((run / "results.json").read_text())
+    if "folds" in results:
+        return {key: results[key] for key in ("correct", "images", "accuracy_ci95")}
+    figures: dict[str, Any] = {"rows": results["rows"]}
+    if (run / "rounds.jsonl").exists():
+        comparisons = compare(read_rounds(run / "rounds.jsonl"), SEED)
+        figures |= {"comparisons": [asdict(pair) for pair in comparisons], "run": str(run)}
+    return figures
+
+
+def keep_rounds(part: Part, command: Command, run: Path) -> None:
+    """Copy the first rounds of each row of a run's journal to docs/results."""
+    kept = []
+    for line in (run / "rounds.jsonl").read_text().splitlines():
+        if json.loads(line)["seed"] - SEED * 100_000 < command.kept:
+            kept.append(line)
+    kept.sort(key=lambda line: [json.loads(line)[key] for key in _ROW])
+    write_atomic(FIGURES / f"{part.name}-{command.name}.jsonl", "\n".join(kept) + "\n")
+
+
+_ROW = ("objects", "scenario", "policy", "seed")
+
+
+if __name__ == "__main__":
+    run_script(main)
