@@ -29,7 +29,7 @@ Say = Callable[[str], str]  # a word in the page's language
 PUBLISHED = (
     ("VGN", "5 objects, noisy side view, floating hand", "59 %", "44 %", "arXiv 2507.18847"),
     ("EquiIGD-HR", "the same, one view from any side", "91 %", "95 %", "arXiv 2507.18847"),
-    ("OrbitGrasp", "the same", "97 %", "98 %", "arXiv 2410.02531"),
+    ("OrbitGrasp", "the same", "97 %", "98 %", "arXiv 2507.18847"),
     ("AnyGrasp", "real bins of 300 unseen objects", "93 %", "-", "arXiv 2212.08333"),
 )  # fmt: skip
 
