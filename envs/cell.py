@@ -20,7 +20,7 @@ from envs.pybullet_camera import Image, Intrinsics
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.robot_safety import ArmGate
 from utils.config import CameraConfig, Config
-from utils.depth import KinectNoise
+from utils.depth import make_depth_noise
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.transforms import RGBDFrame, look_at
@@ -194,9 +194,10 @@ class Cell(ABC):
         """
         camera = self.config.camera
         frame = self.look(camera_intrinsics(camera), self.camera_pose(), with_truth)
-        if camera.depth_noise == "kinect":
+        focal = float(frame.K[0, 0])
+        noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
+        if noise is not None:
             rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
-            noise = KinectNoise(image_focal=float(frame.K[0, 0]))
             frame = replace(frame, depth=noise(frame.depth, rng))
         self.frames += 1
         return frame

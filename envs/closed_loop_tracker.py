@@ -21,7 +21,7 @@ import numpy as np
 from envs.cell import Cell
 from envs.pybullet_camera import Intrinsics
 from envs.robot_kinematics import forward_kinematics
-from utils.depth import KinectNoise
+from utils.depth import make_depth_noise
 from utils.errors import TargetLostError
 from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
 from utils.table_plane import planar, planar_part
@@ -52,10 +52,9 @@ class WristCamera:
             grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
         )
         self._coming: deque[WristImage] = deque()
-        self._noise = None
-        if camera.depth_noise == "kinect":
-            self._noise = KinectNoise(image_focal=float(self.intrinsics.K[0, 0]))
-            self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
+        focal = float(self.intrinsics.K[0, 0])
+        self._noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
+        self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
 
     def __call__(self) -> WristImage | None:
         """Take an image now; the newest that has arrived by now, or None."""

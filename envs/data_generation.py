@@ -56,7 +56,8 @@ def _content(config: Config) -> str:
     """What one shard depends on, as YAML; how many shards there are does not belong to it."""
     everything = config.model_dump(mode="json")
     chosen = {key: everything[key] for key in ("seed", "sim", "camera", "workspace", "scene")}
-    chosen["camera"].pop("depth_noise")  # images are stored clean
+    for key in ("depth_noise", "depth_noise_args"):  # images are stored clean
+        chosen["camera"].pop(key)
     chosen["objects"] = everything["objects"] | {"split": "train"}
     data = everything["data"]
     chosen["data"] = {

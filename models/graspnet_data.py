@@ -19,7 +19,7 @@ from models.graspnet_examples import AtPixelSize, GraspExamples, LabelledImages
 from models.graspnet_scores import centre_error, score_labels
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
-from utils.depth import KinectNoise
+from utils.depth import DepthNoise, KinectNoise, make_depth_noise
 from utils.grasp_data import SimulatedDataset
 from utils.grasp_labels import ANGLE_BINS
 
@@ -65,12 +65,16 @@ def simulated_data(config: Config, folder: Path, focal: float, distance: float) 
             ("validation", config.data.validation_frames),
         )
     )
+    camera = config.camera
+    # Training meets noise even where the cell's own cameras have none.
+    noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
+    noise = noise or KinectNoise(image_focal=focal)
     augmentation = Augmentation(
         turn_step=np.pi / ANGLE_BINS,  # whole bins are quick; the cameras' own turns fill the gaps
         colour=ColourJitter(hue=0.0),  # the scenes have every hue
         max_shift=0.0,  # the crop shifts
         scale=(0.97, 1.03),
-        depth_noise=NoisyShare(config.train.depth_noise_share, KinectNoise(image_focal=focal)),
+        depth_noise=NoisyShare(config.train.depth_noise_share, noise),
     )
     settings = config.train
     examples = GraspExamples(train, config.seed, settings.graspable_from, augmentation, CROP)
@@ -94,11 +98,12 @@ def score_simulated(model: GraspNet, validation: LabelledImages) -> dict[str, fl
 
 @dataclass(frozen=True)
 class NoisyShare:
-    """Depth noise of a structured-light camera on a share of the images."""
+    """A camera's depth noise on a share of the images."""
 
     share: float
-    noise: KinectNoise
+    noise: DepthNoise
 
     def __call__(self, depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-        noisy = rng.random() < self.share
-        return self.noise.on_tensor(depth, rng) if noisy else depth
+        if rng.random() >= self.share:
+            return depth
+        return depth.new_tensor(self.noise(depth.cpu().numpy(), rng))

@@ -296,7 +296,7 @@ def changed_keys(config: Config) -> list[str]:
 
     def changes(values: dict[str, Any], below: dict[str, Any], prefix: str) -> Iterator[str]:
         for name, value in values.items():
-            if isinstance(value, dict):
+            if isinstance(value, dict) and below[name]:  # an empty one takes keys of any name
                 yield from changes(value, below[name], f"{prefix}{name}.")
             elif value != below[name]:
                 yield f"{prefix}{name}={json.dumps(value, ensure_ascii=False)}"  # JSON is YAML

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -34,6 +34,7 @@ from utils.config_types import (
     Vector3,
     no_repeats,
 )
+from utils.depth import DEPTH_NOISES, make_depth_noise
 from utils.errors import UserError
 from utils.transforms import look_at
 
@@ -61,7 +62,12 @@ class CameraConfig(Section):
     up: Vector3
     near: Positive
     far: Positive
-    depth_noise: Literal["none", "kinect"]
+    depth_noise: Annotated[
+        str, Field(description=f"one of none, {', '.join(DEPTH_NOISES)}, or an import path module:name")
+    ]
+    depth_noise_args: Annotated[
+        dict[str, Any], Field(description="the noise's parameters, such as {noise: 0.3}")
+    ]
     wrist_position: Vector3
     wrist_fov_deg: Annotated[float, Field(ge=1, le=170)]
 
@@ -70,6 +76,7 @@ class CameraConfig(Section):
         if self.near >= self.far:
             raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
         look_at(self.position, self.target, self.up)  # raises ValueError where that is undefined
+        make_depth_noise(self.depth_noise, float(self.height), self.depth_noise_args)  # as well
         return self
 
 

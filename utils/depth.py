@@ -1,55 +1,60 @@
-"""Depth as a structured-light camera such as the first Kinect measures it, from a clean rendering.
+"""Depth images: the noise that real cameras add, and what unmeasured pixels may show.
 
-Four effects, after Handa et al., "A benchmark for RGB-D visual odometry, 3D reconstruction and
-SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single RGB-D image" (CVPR
-2013), and Bohg et al., "Robot arm pose estimation through pixel-wise part classification" (ICRA
-2014), whose window of projected dots makes the holes. Knows no camera but what its parameters say,
-no simulator and no network.
+A depth noise is a callable `noise(depth, rng) -> depth` that turns a clean depth image into a
+measured one. `DEPTH_NOISES` lists the known ones; `make_depth_noise` makes one of them, or one of
+your own, for all that measure depth: the cell's cameras, the closed loop, the environments, the
+randomisation and the training.
 
-Pixels whose depth a camera did not measure: what they may show.
+`KinectNoise` has four effects, after Handa et al., "A benchmark for RGB-D visual odometry, 3D
+reconstruction and SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single
+RGB-D image" (CVPR 2013), and Bohg et al., "Robot arm pose estimation through pixel-wise part
+classification" (ICRA 2014), whose window of projected dots makes the holes.
 
-Depth cameras lose pixels at the edges of whatever stands up, in its shadow, and thin parts whole.
-This module knows no grasps and no network.
+Holes (pixels without a depth) lie at the edges of whatever stands up, in its shadow, and cover thin
+parts. `near_side`, `table_in_holes` and `fill_holes` fill them, each for another purpose. This
+module knows no simulator, no network and no grasps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from utils.errors import UserError, unknown_choice
+from utils.plugins import is_import_path, load_plugin
 from utils.transforms import RGBDFrame, deproject, known_depth
 
-if TYPE_CHECKING:
-    import torch
+# (H, W) float32 metres and a generator for the draws -> (H, W) float32 metres, 0 where unknown.
+DepthNoise = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
-
-_PATTERN_SEED = 1975  # the projector's pattern is the same for ever; any number would do
+_PATTERN_SEED = 1975  # the projector's pattern never changes; any number would do
 _DOT_CELL = 3  # sensor pixels: the pattern has one dot in each square of this side
 _INLIER_GROWTH = 1.2**2  # Bohg et al.: far from the centre, disparities may differ by this x r^2
 
 
 @dataclass(frozen=True)
 class KinectNoise:
-    """A noisy measurement of a clean depth image: `noise(depth, rng)`.
+    """A structured-light camera such as the first Kinect: steps, noise and holes.
 
-    image_focal: pixels, focal length of the images that are given. focal, baseline: pixels and
-    metres, of the sensor (480 px at 640 x 480). Lengths below are the sensor's pixels, and become
-    image_focal / focal as many of the image's, so that the same sensor can be seen at any
+    image_focal: pixels, focal length of the images that the noise is applied to. focal, baseline:
+    pixels and metres, of the sensor (480 px at 640 x 480). The lengths below are in the sensor's
+    pixels; image_focal / focal converts them to the image's, so that one sensor fits every
     resolution.
-    shift: standard deviation, pixels, by which each pixel looks beside its place.
-    step: pixels, in which disparities are counted. noise: standard deviation of a disparity in
-    steps. Barron and Malik's formula 35130 / round(35130 / z + N(0, 1/6) + 0.5), z in centimetres,
+    shift: standard deviation, pixels, of the offset at which each pixel reads the disparity.
+    step: pixels, the unit in which disparities are counted. noise: standard deviation of a
+    disparity in steps. Barron and Malik's formula 35130 / round(35130 / z + N(0, 1/6) + 0.5), z in centimetres,
     counts 35130 cm = 585.5 px x 7.5 cm x 8, hence eighths of a pixel: their 1/6 is 1/6 of a step.
     (Of a pixel, it would be 3 mm at 0.8 m, three times what Khoshelham and Elberink, Sensors 2012,
-    measured.) Their 0.5 undoes a truncation that is not made here.
+    measured.) Their 0.5 undoes a truncation that this code does not make.
     window: pixels, odd; side of the square in which dots are matched. tolerance: pixels, by which a
-    dot one pixel from the centre may differ from the window's mean. support: a match needs more
-    than this share of the window's dots.
+    dot one pixel from the centre may differ from the window's mean. support: share of the window's
+    dots that a match has to exceed.
     """
 
     image_focal: float = 480.0
@@ -85,15 +90,11 @@ class KinectNoise:
                 f"either way, got {depth.shape}"
             )
         draws = rng.standard_normal((3, *depth.shape), dtype=np.float32)
-        disparity = self._matched(self._looked_up(depth, draws[0], draws[1]))
+        disparity = self._matched(self._shifted(depth, draws[0], draws[1]))
         steps = np.rint(disparity / self.step + self.noise * draws[2])
         with np.errstate(divide="ignore"):
             measured = np.float32(self.focal * self.baseline / self.step) / steps
         return np.where((disparity > 0) & (steps > 0), measured, np.float32(0))
-
-    def on_tensor(self, depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-        """The same for a tensor (H, W): `Augmentation(depth_noise=KinectNoise().on_tensor)`."""
-        return depth.new_tensor(self(depth.cpu().numpy(), rng))
 
     @cached_property
     def matching(self) -> Matching:
@@ -110,10 +111,11 @@ class KinectNoise:
             allowed=allowed.astype(np.float32),
         )
 
-    def _looked_up(self, depth: np.ndarray, du: np.ndarray, dv: np.ndarray) -> np.ndarray:
-        """(H, W) disparities a little beside each pixel; 0 where one that is needed is unknown.
+    def _shifted(self, depth: np.ndarray, du: np.ndarray, dv: np.ndarray) -> np.ndarray:
+        """(H, W) disparities read a random shift beside each pixel; 0 where a neighbour that the
+        interpolation needs is unknown.
 
-        Disparities, not depths, are interpolated: those of a plane are linear in the image.
+        The interpolation is of disparities, not depths: a plane's are linear in the image.
         """
         height, width = depth.shape
         known = depth > 0
@@ -126,11 +128,11 @@ class KinectNoise:
         return np.nan_to_num(found, copy=False, nan=0.0)
 
     def _matched(self, disparity: np.ndarray) -> np.ndarray:
-        """(H, W) disparities where the pattern is recognised, 0 elsewhere.
+        """(H, W) disparities where the sensor recognises the pattern, 0 elsewhere.
 
-        A dot is recognised if enough of the dots around it have its window's mean disparity. A
-        pixel takes over the nearest recognised dot within reach; of equally near ones the upper,
-        then the left one.
+        The sensor recognises a dot if enough of the dots around it have the window's mean
+        disparity. A pixel takes the disparity of the nearest recognised dot within reach; of
+        equally near dots it takes the upper one, then the left one.
         """
         matching = self.matching
         size = (matching.window, matching.window)
@@ -139,7 +141,7 @@ class KinectNoise:
         kernel = np.ones(size, np.uint8)
         spread = cv2.dilate(disparity, kernel) - cv2.erode(disparity, kernel)
         recognised = disparity[rows, cols] > 0
-        # Where nothing differs by the least tolerance every dot agrees; look at the others only.
+        # Every dot agrees where nothing differs by the least tolerance; only the others need a test.
         doubtful = np.flatnonzero(recognised & (spread[rows, cols] >= self.tolerance))
         centre = rows[doubtful], cols[doubtful]
         total, count = (
@@ -164,8 +166,8 @@ class KinectNoise:
 
 
 class Matching(NamedTuple):
-    """window: pixels, odd. cell: pixels, side of the square with one dot. reach: pixels, radius
-    that a dot speaks for. allowed: (window, window) pixels of disparity."""
+    """window: pixels, odd. cell: pixels, side of the square with one dot. reach: pixels, radius of
+    the disc that takes a dot's disparity. allowed: (window, window) pixels of disparity."""
 
     window: int
     cell: int
@@ -207,11 +209,46 @@ def _farthest_first(reach: int) -> tuple[tuple[int, int], ...]:
     return tuple(sorted(disc, key=lambda offset: (-(offset[0] ** 2) - offset[1] ** 2, *offset)))
 
 
+# A noise is made by a call with the image's focal length in pixels (image_focal) and its own
+# parameters as keyword arguments. A new noise is one more entry; "none" is no noise.
+DEPTH_NOISES: dict[str, Callable[..., DepthNoise]] = {"kinect": KinectNoise}
+
+
+def make_depth_noise(
+    name: str, image_focal: float, arguments: Mapping[str, Any] | None = None
+) -> DepthNoise | None:
+    """The depth noise of that name, or of the import path `module:name`; None for "none".
+
+    image_focal: focal length, pixels, of the images that the noise is applied to. arguments: the
+    noise's own parameters, as in `camera.depth_noise_args`. Raises UserError for an unknown name
+    and for parameters that the noise refuses.
+    """
+    if name == "none":
+        if arguments:
+            raise UserError("camera.depth_noise_args: 'none' has no parameters; name a depth noise")
+        return None
+    if name in DEPTH_NOISES:
+        make = DEPTH_NOISES[name]
+    elif is_import_path(name):
+        make = load_plugin(name, "camera.depth_noise")
+    else:
+        raise unknown_choice("camera.depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
+    try:
+        noise = make(image_focal=image_focal, **(arguments or {}))
+    except (TypeError, ValueError) as error:
+        raise UserError(f"camera.depth_noise_args: {name!r} refuses them: {error}") from error
+    if not callable(noise):
+        raise UserError(f"camera.depth_noise: {name!r} made no callable noise(depth, rng)")
+    return noise
+
+
+# --- Holes ----------------------------------------------------------------------------------
+
 HOLE_REACH = 0.03  # m from a hole's rim to its middle, up to which it can be filled
 TABLE_FLATNESS = 0.006  # m over the table, up to which a measured point is the table
 SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
-# Colours, 0..255 in three channels: most that one may differ from the table's beside it, and so
-# many times as much it has to differ from that of the nearest object.
+# A hole becomes table if its colour (three channels, 0..255) differs from the table's beside it by
+# less than LIKE_TABLE, and UNLIKE_OBJECT times as much from the nearest object's.
 LIKE_TABLE = 30.0
 UNLIKE_OBJECT = 2.0
 
@@ -224,7 +261,10 @@ def fill_holes(depth: np.ndarray) -> np.ndarray:
 
 
 def nearest_values(values: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(H, W, ...) at each pixel the value of the nearest pixel `of` (H, W) bool, which has some."""
+    """(H, W, ...) at each pixel the value of the nearest pixel in the mask `of` (H, W) bool.
+
+    The mask has to hold at least one pixel.
+    """
     _, label = cv2.distanceTransformWithLabels(
         (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -238,8 +278,8 @@ def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
     pixels away through the hole.
 
     Depth cameras lose pixels at the edges of whatever stands up, and thin parts whole; a finger
-    that took such a hole for table would come down on them. Wider holes, whose middle is out of
-    reach, stay 0: a black thing may fill them.
+    that took such a hole for table would collide with them. Wider holes, whose middle is out of
+    reach, stay 0: a black object may fill them.
     """
     unknown = ~known_depth(depth)
     if not unknown.any():
@@ -258,7 +298,7 @@ def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
 
 
 def reach_in_pixels(frame: RGBDFrame, metres: float) -> int:
-    """How many pixels span so many metres at the median known depth; at least 1."""
+    """The number of pixels that span `metres` at the median known depth; at least 1."""
     known = known_depth(frame.depth)
     depth = float(np.median(frame.depth[known])) if known.any() else np.inf
     return max(1, round(metres * (frame.K[0, 0] + frame.K[1, 1]) / 2 / depth))
@@ -267,9 +307,10 @@ def reach_in_pixels(frame: RGBDFrame, metres: float) -> int:
 def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     """The frame with the table's depth in those holes that have its colour.
 
-    A hole beside an object is its shadow or a part of it: by depth alone nobody can tell, by colour
-    often. What looks like the table beside it and unlike the nearest object becomes table; all
-    else stays unknown, and so do wide holes, which may be a thing of that colour, or of glass.
+    A hole beside an object is its shadow or a part of it: depth alone cannot tell, colour often
+    can. A pixel that has the colour of the table beside it and not that of the nearest object
+    becomes table. All others stay unknown, and so do wide holes, which an object of the table's
+    colour, or of glass, may fill.
     """
     known = known_depth(frame.depth)
     if known.all() or not known.any():
@@ -280,18 +321,18 @@ def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     smooth = cv2.medianBlur(frame.rgb, 3)
     holes = ~known & ~_wide(~known, reach_in_pixels(frame, HOLE_REACH))
     colours = frame.rgb[holes].astype(float)
-    table, thing = (
+    table, item = (
         np.linalg.norm(colours - nearest_values(smooth, of)[holes], axis=-1) if of.any() else np.inf
         for of in (known & ~high, inside)
     )
     depth = frame.depth.copy()
-    like_table = (table < LIKE_TABLE) & (UNLIKE_OBJECT * table < thing)
+    like_table = (table < LIKE_TABLE) & (UNLIKE_OBJECT * table < item)
     depth[holes] = np.where(like_table, depth_of_plane(frame, table_height)[holes], depth[holes])
     return replace(frame, depth=depth)
 
 
 def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
-    """A mask (H, W) without its rim; pieces of which nothing would be left stay whole."""
+    """A mask (H, W) without its rim; pieces that would vanish stay whole."""
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     inside = cv2.erode(mask.astype(np.uint8), window) > 0
     count, piece = cv2.connectedComponents(mask.astype(np.uint8))
@@ -301,8 +342,8 @@ def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
 
 
 def depth_of_plane(frame: RGBDFrame, height: float) -> np.ndarray:
-    """(H, W) depth at which each pixel's ray meets the plane z = height; infinite or negative where
-    it does not."""
+    """(H, W) depth at which each pixel's ray meets the plane z = height in W; infinite or negative
+    where it does not."""
     v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
     along = deproject(np.stack([u, v], axis=-1), np.ones(u.shape), frame.K, frame.T_WC)
     with np.errstate(divide="ignore"):
