@@ -17,7 +17,7 @@ from benchmarks.digits import load_digits_of
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.grasping_env import RobotGraspingEnv
 from envs.randomized_env import RandomizedGraspingEnv
-from tests.test_depth_noise import by_loops, steps_and_slopes
+from tests.test_depth import by_loops, steps_and_slopes
 from utils.adaptation import (
     SOURCE,
     TARGET,

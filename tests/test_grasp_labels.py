@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.test_geometry import CORNERS, T_WC, K, boxes_frame, yaw_pose
+from tests.helpers.box_frames import CORNERS, T_WC, K, boxes_frame, yaw_pose
 from utils.geometry import (
     ConvexSolid,
     GripperGeometry,

@@ -6,7 +6,7 @@ import torch
 
 from models.graspnet_io import SavedGraspNet
 from models.planner_graspnet import GraspNetPlanner, quality_between
-from tests.test_geometry import boxes_frame
+from tests.helpers.box_frames import boxes_frame
 from tests.test_instances import TOUCHING, true_offset
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import RGBDFrame, angle_difference, project

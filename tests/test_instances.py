@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.planner_graspnet import labelled_by_centres, vote_centres
-from tests.test_geometry import boxes_frame
+from tests.helpers.box_frames import boxes_frame
 from utils.geometry import Workspace
 from utils.height_map import height_map_from_frame
 from utils.images import PixelScaling

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.planners import PLANNERS, make_planner
-from tests.test_geometry import boxes_frame
+from tests.helpers.box_frames import boxes_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import angle_difference
 

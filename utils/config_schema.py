@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -19,6 +19,7 @@ from utils.config_types import (
     Controller,
     Count,
     JointVector,
+    KeywordArguments,
     Mount,
     Name,
     ObjectSet,
@@ -63,10 +64,11 @@ class CameraConfig(Section):
     near: Positive
     far: Positive
     depth_noise: Annotated[
-        str, Field(description=f"one of none, {', '.join(DEPTH_NOISES)}, or an import path module:name")
+        str,
+        Field(description=f"one of none, {', '.join(DEPTH_NOISES)}, or an import path module:name"),
     ]
     depth_noise_args: Annotated[
-        dict[str, Any], Field(description="the noise's parameters, such as {noise: 0.3}")
+        KeywordArguments, Field(description="the noise's parameters, such as {noise: 0.3}")
     ]
     wrist_position: Vector3
     wrist_fov_deg: Annotated[float, Field(ge=1, le=170)]

@@ -7,8 +7,9 @@ The schema of the section `randomization`: what differs from episode to episode,
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -28,6 +29,14 @@ def no_repeats(values: tuple) -> tuple:
     return values
 
 
+class Arguments(dict):
+    """Keyword arguments from YAML, hashable as all that a config holds; nobody changes them."""
+
+    def __hash__(self) -> int:
+        return hash(json.dumps(self, sort_keys=True, default=str))
+
+
+KeywordArguments = Annotated[dict[str, Any], AfterValidator(Arguments)]
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, le=1)]

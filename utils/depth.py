@@ -220,25 +220,26 @@ def make_depth_noise(
     """The depth noise of that name, or of the import path `module:name`; None for "none".
 
     image_focal: focal length, pixels, of the images that the noise is applied to. arguments: the
-    noise's own parameters, as in `camera.depth_noise_args`. Raises UserError for an unknown name
-    and for parameters that the noise refuses.
+    noise's own parameters (`camera.depth_noise_args`); "none" ignores them. Raises UserError for
+    an unknown name and for parameters that the noise refuses.
     """
     if name == "none":
-        if arguments:
-            raise UserError("camera.depth_noise_args: 'none' has no parameters; name a depth noise")
         return None
     if name in DEPTH_NOISES:
         make = DEPTH_NOISES[name]
     elif is_import_path(name):
-        make = load_plugin(name, "camera.depth_noise")
+        make = load_plugin(name, "depth_noise")
     else:
-        raise unknown_choice("camera.depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
+        raise unknown_choice("depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
     try:
         noise = make(image_focal=image_focal, **(arguments or {}))
     except (TypeError, ValueError) as error:
-        raise UserError(f"camera.depth_noise_args: {name!r} refuses them: {error}") from error
+        raise UserError(f"depth_noise_args: {name!r} does not take them: {error}") from error
     if not callable(noise):
-        raise UserError(f"camera.depth_noise: {name!r} made no callable noise(depth, rng)")
+        raise UserError(
+            f"depth_noise: {name!r} returned a {type(noise).__name__}, expected a callable "
+            "noise(depth, rng)"
+        )
     return noise
 
 

@@ -1,4 +1,5 @@
-"""The depth camera's noise: against loops over pixels, closed forms, and in the cell."""
+"""Depth images: noises against loops over pixels, closed forms and in the cell; holes on made-up
+images and on a box whose outline is known."""
 
 import time
 from dataclasses import replace
@@ -11,9 +12,20 @@ import torch
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
-from utils.augmentation import Augmentation, LabelledImage
-from utils.config import ConfigError, load_config, with_settings
-from utils.depth import KinectNoise, dot_pattern
+from models.graspnet_data import NoisyShare
+from tests.helpers.box_frames import boxes_frame
+from utils.config import ConfigError, changed_keys, load_config, with_settings
+from utils.depth import (
+    DEPTH_NOISES,
+    KinectNoise,
+    depth_of_plane,
+    dot_pattern,
+    make_depth_noise,
+    near_side,
+    table_in_holes,
+)
+from utils.errors import UserError
+from utils.transforms import RGBDFrame
 
 FB = 480 * 0.075  # pixels x metres: disparity x depth
 
@@ -215,24 +227,58 @@ def test_wrong_shapes_are_refused(shape):
         KinectNoise()(np.ones(shape), np.random.default_rng(0))
 
 
-def test_as_an_augmentation():
+def test_a_share_of_the_training_images_is_measured():
+    """Alike whether the noise is applied to an array or to a tensor of the training."""
     noise, depth = KinectNoise(), torch.from_numpy(steps_and_slopes(64))
-    labels = torch.zeros(18, 64, 64)
-    image = LabelledImage(
-        torch.zeros(3, 64, 64, dtype=torch.uint8), depth, labels, labels,
-        torch.ones(64, 64, dtype=torch.bool),
-    )  # fmt: skip
-    still = Augmentation(max_turn=0, max_shift=0, scale=(1, 1), mirror=0, colour=None)
-    changed = replace(still, depth_noise=noise.on_tensor)(image, np.random.default_rng(0))
     rng = np.random.default_rng(0)
-    still.draw(rng, (64, 64))
-    np.testing.assert_array_equal(changed.depth.numpy(), noise(depth.numpy(), rng))
-    assert changed.depth.dtype == torch.float32 and (depth == 0).any()
+    measured = NoisyShare(1.0, noise)(depth, rng)
+    rng = np.random.default_rng(0)
+    rng.random()  # whether this image is one of the share
+    np.testing.assert_array_equal(measured.numpy(), noise(depth.numpy(), rng))
+    assert measured.dtype == torch.float32 and (depth == 0).any()
+    assert NoisyShare(0.0, noise)(depth, rng) is depth
 
 
-def test_wrong_config_value_names_the_choices():
-    with pytest.raises(ConfigError, match=r"camera.depth_noise.*kinec.*none.*kinect"):
+def gaussian(image_focal: float, sigma: float = 0.001):
+    """A depth noise of one's own, as a user writes it in a module of theirs."""
+    return lambda depth, rng: depth + sigma * rng.standard_normal(depth.shape, np.float32)
+
+
+def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
+    assert make_depth_noise("none", 480.0, {"ignored": 1}) is None
+    assert make_depth_noise("kinect", 390.0, {"step": 0.25}) == KinectNoise(390.0, step=0.25)
+    assert set(DEPTH_NOISES) == {"kinect"}
+    own = make_depth_noise("tests.test_depth:gaussian", 480.0, {"sigma": 0.1})
+    assert own(plane(0.8), np.random.default_rng(0)).std() == pytest.approx(0.1, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("kinec", {}, "expected one of kinect, module:name, none; did you mean kinect"),
+        ("kinect", {"nois": 1}, "depth_noise_args: 'kinect' does not take them.*'nois'"),
+        ("kinect", {"noise": -1}, "KinectNoise.noise must be >= 0"),
+        ("tests.test_depth:nothing", {}, "has no 'nothing'"),
+        ("tests.test_depth:test_a_plane_has_holes_at_the_image_border_only", {}, "does not take"),
+        ("builtins:dict", {}, "returned a dict, expected a callable"),
+    ],
+)
+def test_what_makes_no_noise_is_refused_in_one_sentence(name, arguments, message):
+    with pytest.raises(UserError, match=message):
+        make_depth_noise(name, 480.0, arguments)
+
+
+def test_the_configs_noise_is_checked_when_it_is_read():
+    chosen = ["camera.depth_noise=kinect", "camera.depth_noise_args={noise: 0.3}"]
+    config = load_config(None, chosen)
+    assert config.camera.depth_noise_args == {"noise": 0.3}
+    assert load_config(None, changed_keys(config)) == config and hash(config)
+    with pytest.raises(ConfigError, match=r"camera: depth_noise: got 'kinec', .*kinect"):
         load_config(None, ["camera.depth_noise=kinec"])
+    with pytest.raises(ConfigError, match=r"camera: depth_noise_args.*nois"):
+        load_config(None, [chosen[0], "camera.depth_noise_args={nois: 0.3}"])
+    with pytest.raises(ConfigError, match=r"camera.depth_noise_args: got 3 .*expected"):
+        load_config(None, ["camera.depth_noise_args=3"])
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +286,7 @@ def frames(config):
     """Two frames of a scene with and without noise, and again after other work."""
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
     noisy = with_settings(config, "camera", {"depth_noise": "kinect"})
+    own = {"depth_noise": "tests.test_depth:gaussian", "depth_noise_args": {"sigma": 0.01}}
     scene, other = (make_scene("pile", objects, seed, config) for seed in (1, 2))
     with PybulletCell(config) as cell:
         cell.load(scene)
@@ -251,11 +298,14 @@ def frames(config):
         cell.frame()
         cell.load(scene)
         again = [cell.frame(), cell.frame()]
-    return clean, first, again
+    with PybulletCell(with_settings(config, "camera", own)) as cell:
+        cell.load(scene)
+        spread = [cell.frame()]
+    return clean, first, again, spread
 
 
 def test_cell_measures_with_noise(frames):
-    clean, noisy, _ = frames
+    clean, noisy, _, _ = frames
     np.testing.assert_array_equal(clean[0].depth, clean[1].depth)
     for a, b in zip(clean, noisy):
         np.testing.assert_array_equal(a.rgb, b.rgb)
@@ -269,7 +319,127 @@ def test_cell_measures_with_noise(frames):
 
 
 def test_cells_noise_depends_on_seed_and_frame_alone(frames):
-    _, noisy, again = frames
+    _, noisy, again, _ = frames
     assert (noisy[0].depth != noisy[1].depth).any()
     for a, b in zip(noisy, again):
         np.testing.assert_array_equal(a.depth, b.depth)
+
+
+def test_cell_measures_with_a_noise_of_ones_own(frames):
+    clean, _, _, own = frames
+    assert (own[0].depth - clean[0].depth).std() == pytest.approx(0.01, rel=0.02)
+
+
+# --- Holes ----------------------------------------------------------------------------------
+
+TABLE, ITEM = (158, 152, 142), (30, 160, 60)
+BOX = ((0.04, 0.06, 0.05), 0.4, (0.5, 0.0))
+
+
+def with_a_hole() -> tuple[RGBDFrame, np.ndarray, np.ndarray]:
+    """A green box on a grey table whose depth is lost on and around one of its edges; the clean
+    depth; where it is lost."""
+    frame = boxes_frame([BOX])
+    on_box = frame.points()[..., 2] > 0.001
+    rgb = np.where(on_box[..., None], ITEM, TABLE).astype(np.uint8)
+    v, u = np.argwhere(on_box).T
+    lost = np.zeros(on_box.shape, bool)
+    lost[v.min() - 8 : v.min() + 8, u.min() : u.max() + 12] = True
+    assert (lost & on_box).sum() > 50 and (lost & ~on_box).sum() > 50
+    return replace(frame, rgb=rgb, depth=np.where(lost, 0, frame.depth)), frame.depth, lost
+
+
+def test_holes_count_as_the_near_surface_beside_them() -> None:
+    depth = np.full((20, 20), 0.8, np.float32)
+    depth[:, 10:] = 0.7
+    depth[5:8, 8:12] = 0.0  # over the edge
+    depth[15, 2] = np.nan  # within the table
+    filled = near_side(depth, 16)
+    assert (filled[5:8, 8:12] == np.float32(0.7)).all()
+    assert filled[15, 2] == np.float32(0.8)
+    known = depth > 0
+    np.testing.assert_array_equal(filled[known], depth[known])
+    depth[5:8] = 0.0  # a hole takes the nearest surface around it as far as it reaches
+    depth[5:8, 19] = 0.6
+    assert (near_side(depth, reach=9)[5:8, 10:19] == np.float32(0.6)).all()
+    assert near_side(depth, reach=9)[6, 5] == np.float32(0.7)
+    assert (near_side(np.zeros((20, 20), np.float32), 16) == 0).all()
+    clean = np.full((4, 4), 0.5, np.float32)
+    assert near_side(clean, 16) is clean
+
+
+def test_what_has_the_tables_colour_is_table_and_nothing_else() -> None:
+    frame, clean, lost = with_a_hole()
+    found = table_in_holes(frame, 0.0).depth
+    on_box = (frame.rgb == ITEM).all(axis=-1)
+    assert (found[lost & on_box] == 0).all(), "a part of the box stays unknown"
+    np.testing.assert_allclose(found[lost & ~on_box], clean[lost & ~on_box], atol=1e-5)
+    np.testing.assert_array_equal(found[~lost], frame.depth[~lost])
+
+
+def test_an_object_of_the_tables_colour_stays_unknown() -> None:
+    frame, _, lost = with_a_hole()
+    grey = replace(frame, rgb=np.full_like(frame.rgb, 150))
+    assert (table_in_holes(grey, 0.0).depth[lost] == 0).all()
+
+
+def test_colours_beyond_the_smeared_rim_count() -> None:
+    """Two pixels of table around the box are measured as box, as by a camera that matches
+    windows: they must not make the table's colour that of an object."""
+    frame, clean, lost = with_a_hole()
+    near = clean.min()
+    for _ in range(2):
+        rim = near_side(np.where(clean < near + 0.002, clean, 0).astype(np.float32), 2)
+        frame = replace(
+            frame, depth=np.where(~lost & (rim > 0) & (rim < near + 0.002), rim, frame.depth)
+        )
+    found = table_in_holes(frame, 0.0).depth
+    on_box = (frame.rgb == ITEM).all(axis=-1)
+    np.testing.assert_allclose(found[lost & ~on_box], clean[lost & ~on_box], atol=1e-5)
+
+
+def test_a_thin_post_of_the_tables_colour_stays_unknown() -> None:
+    """Thinner than the smeared rim that is left out of an object's colour."""
+    frame = boxes_frame([((0.006, 0.006, 0.06), 0.0, (0.5, 0.03)), BOX])
+    post = (frame.points()[..., 2] > 0.01) & (frame.points()[..., 1] > 0.02)
+    green = (frame.points()[..., 2] > 0.001) & ~post
+    rgb = np.where(green[..., None], ITEM, TABLE).astype(np.uint8)
+    lost = post & (np.arange(224) % 2 == 0)
+    assert lost.sum() >= 4
+    frame = replace(frame, rgb=rgb, depth=np.where(lost, 0, frame.depth))
+    assert (table_in_holes(frame, 0.0).depth[lost] == 0).all()
+
+
+def test_a_wide_hole_of_the_tables_colour_stays_unknown() -> None:
+    """Glass shows the table."""
+    frame, clean, _ = with_a_hole()
+    lost = np.zeros(clean.shape, bool)
+    lost[150:200, 20:70] = True
+    found = table_in_holes(replace(frame, depth=np.where(lost, 0, clean)), 0.0).depth
+    assert (found[155:195, 25:65] == 0).all()
+
+
+@pytest.mark.parametrize("noise", [4, 8])
+def test_noisy_colours_are_told_apart(noise: int) -> None:
+    frame, clean, lost = with_a_hole()
+    on_box = (frame.rgb == ITEM).all(axis=-1)
+    rng = np.random.default_rng(0)
+    rgb = np.clip(frame.rgb + rng.normal(0, noise, frame.rgb.shape), 0, 255).astype(np.uint8)
+    found = table_in_holes(replace(frame, rgb=rgb), 0.0).depth
+    assert (found[lost & on_box] == 0).mean() > 0.99
+    # The colours of the box's rim are smoothed into the table's.
+    assert (np.abs(found - clean)[lost & ~on_box] < 1e-5).mean() > 0.85
+
+
+def test_images_without_holes_or_without_depth_are_left_alone() -> None:
+    frame = boxes_frame([BOX])
+    assert table_in_holes(frame, 0.0) is frame
+    nothing = replace(frame, depth=np.zeros_like(frame.depth))
+    assert table_in_holes(nothing, 0.0) is nothing
+
+
+@pytest.mark.parametrize("height", [0.0, 0.05])
+def test_rays_meet_a_plane_where_they_should(height: float) -> None:
+    frame = boxes_frame([])
+    points = replace(frame, depth=depth_of_plane(frame, height)).points()
+    np.testing.assert_allclose(points[..., 2], height, atol=1e-9)

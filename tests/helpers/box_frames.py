@@ -1,0 +1,42 @@
+"""Frames of boxes on the table, rendered by a closed form; many tests know what is in them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from utils.geometry import ConvexSolid, SceneGeometry, SolidObject
+from utils.transforms import RGBDFrame, look_at, pose_matrix
+
+CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+K = np.array([[390.6, 0, 111.5], [0, 390.6, 111.5], [0, 0, 1.0]])  # 224 px, 32 degrees
+T_WC = look_at((0.5, 0, 0.8), (0.5, 0, 0), up=(1, 0, 0))
+
+
+def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
+    return pose_matrix((x, y, z), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)))
+
+
+def boxes_frame(
+    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]],
+) -> RGBDFrame:
+    """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula."""
+    v, u = np.mgrid[0:224, 0:224]
+    rays = (
+        np.stack([(u - 111.5) / 390.6, (v - 111.5) / 390.6, np.ones_like(u)], axis=-1)
+        @ T_WC[:3, :3].T
+    )
+    eye = T_WC[:3, 3]
+    depth = -eye[2] / rays[..., 2]
+    objects = []
+    for size, yaw, (x, y) in boxes:
+        half = np.array(size) / 2
+        T = yaw_pose(x, y, half[2], yaw)
+        local_eye, local_rays = (eye - T[:3, 3]) @ T[:3, :3], rays @ T[:3, :3]
+        with np.errstate(divide="ignore"):
+            slabs = np.sort([(s * half - local_eye) / local_rays for s in (-1, 1)], axis=0)
+        near, far = slabs[0].max(axis=-1), slabs[1].min(axis=-1)
+        depth = np.where((near < far) & (near < depth), near, depth)
+        solid = ConvexSolid.from_vertices(CORNERS * half).transformed(T)
+        objects.append(SolidObject((solid,), T[:3, 3], 0.7))
+    rgb = np.zeros((224, 224, 3), np.uint8)
+    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=SceneGeometry(tuple(objects)))

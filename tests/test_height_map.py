@@ -1,0 +1,133 @@
+"""Height maps of known boxes; local maxima against a definition that looks at every pair of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import hypothesis.extra.numpy as arrays
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.planners import HeuristicPlanner
+from tests.helpers.box_frames import boxes_frame
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import (
+    HOLE_RISE,
+    height_map_from_frame,
+    height_map_from_scene,
+    local_maxima,
+)
+from utils.transforms import project
+
+IMAGES = arrays.arrays(
+    np.float32,
+    arrays.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9),
+    elements=st.integers(0, 5).map(float),
+)
+
+
+@given(IMAGES, st.integers(1, 3))
+def test_maxima_are_the_highest_of_their_windows_apart_and_ranked(image, radius) -> None:
+    rows, columns = local_maxima(image, radius, above=0.5)
+    places = list(zip(rows, columns))
+    values = [image[place] for place in places]
+    assert values == sorted(values, reverse=True)
+    for row, column in places:
+        window = image[max(row - radius, 0) : row + radius + 1]
+        window = window[:, max(column - radius, 0) : column + radius + 1]
+        assert image[row, column] == window.max() > 0.5
+    for i, (row, column) in enumerate(places):
+        assert all(max(abs(row - r), abs(column - c)) > radius for r, c in places[:i])
+    # Every highest pixel is one of them, or within reach of one that is as high.
+    for row, column in np.argwhere(image == image.max()):
+        if image.max() > 0.5:
+            assert any(
+                max(abs(row - r), abs(column - c)) <= radius and image[r, c] == image.max()
+                for r, c in places
+            )
+
+
+def test_a_plateau_counts_once_and_the_count_ends_the_list() -> None:
+    image = np.zeros((9, 20), np.float32)
+    image[4, 3:5] = 2.0  # two equal pixels side by side
+    image[4, 10], image[4, 16] = 3.0, 1.0
+    rows, columns = local_maxima(image, 2, above=0.5)
+    assert list(zip(rows, columns)) == [(4, 10), (4, 3), (4, 16)]
+    assert len(local_maxima(image, 2, above=0.5, count=2)[0]) == 2
+    assert len(local_maxima(image, 2, above=3.0)[0]) == 0
+
+
+def test_height_maps_of_a_known_box() -> None:
+    frame = boxes_frame([((0.06, 0.08, 0.05), 0.4, (0.47, 0.03))])
+    for heights in (
+        height_map_from_frame(frame, Workspace()),
+        height_map_from_scene(frame.truth, Workspace()),
+    ):
+        box = frame.truth.objects[0].centre_of_mass[:2]
+        c, s = np.cos(0.4), np.sin(0.4)
+        rows, cols = np.mgrid[0 : heights.height.shape[0], 0 : heights.height.shape[1]]
+        xy = heights.origin + heights.cell * np.stack([cols, rows], axis=-1) - box
+        excess = np.abs(xy @ np.array([[c, -s], [s, c]])) - (0.03, 0.04)
+        inside, outside = (excess < -0.002).all(axis=-1), (excess > 0.003).any(axis=-1)
+        np.testing.assert_allclose(heights.height[inside], 0.05, atol=1e-4)
+        np.testing.assert_allclose(heights.height[outside], 0.0, atol=1e-4)
+        assert set(heights.label[inside]) == {0} and set(heights.label[outside]) == {-1}
+        np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None:
+    # Outer face at x = 0.62, 0.05 high: the camera, 0.75 over its edge, hides
+    # 0.12 * 0.05 / 0.75 = 8 mm of the table behind it.
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.0, (0.60, 0.0))])
+    heights = height_map_from_frame(frame, Workspace())
+    rows, cols = np.nonzero(heights.ceiling > heights.height + 0.003)
+    x = heights.origin[0] + heights.cell * cols
+    assert len(x) and x.min() > 0.579 and x.max() < 0.631
+    centre_row = heights.index(np.array([0.6, 0.0]))[0]
+    assert x[rows == centre_row].min() > 0.618 and x[rows == centre_row].max() > 0.624
+
+
+def test_a_hole_at_an_edge_does_not_lower_the_map() -> None:
+    """A box 5 cm high, the pixels around its outline lost as a depth camera loses them."""
+    frame = boxes_frame([((0.04, 0.06, 0.05), 0.0, (0.5, 0.0))])
+    on_box = frame.depth < frame.depth.max() - 0.02
+    edge = cv2.dilate(on_box.astype(np.uint8), np.ones((5, 5))) > cv2.erode(
+        on_box.astype(np.uint8), np.ones((5, 5))
+    )
+    lossy = replace(frame, depth=np.where(edge, 0, frame.depth).astype(np.float32))
+    whole, holed = (height_map_from_frame(f, Workspace()).height for f in (frame, lossy))
+    assert edge.sum() > 200
+    assert (holed >= whole - 1e-3).all()
+
+
+def test_what_is_in_a_hole_may_be_higher_than_what_is_beside_it() -> None:
+    frame = boxes_frame([((0.06, 0.06, 0.05), 0.0, (0.5, 0.0))])
+    depth = frame.depth.copy()
+    (u, v), _ = project(np.array([0.5, 0.0, 0.05]), frame.K, frame.T_WC)
+    rows, columns = np.s_[int(v) - 3 : int(v) + 4], np.s_[int(u) - 3 : int(u) + 4]
+    depth[rows, columns] = 0
+    clean = height_map_from_frame(frame, Workspace())
+    holed = height_map_from_frame(replace(frame, depth=depth), Workspace())
+    np.testing.assert_allclose(holed.height, clean.height, atol=1e-4)
+    raised = holed.ceiling - clean.ceiling
+    assert raised.max() == pytest.approx(HOLE_RISE, abs=1e-4)
+    at = np.argwhere(raised > 1e-3) * holed.cell + holed.origin[::-1]
+    assert np.abs(at - (0.0, 0.5)).max() < 0.012
+
+
+def test_an_object_that_the_camera_did_not_measure_is_a_wall() -> None:
+    """A black box, say: all of its pixels are holes."""
+    small, black = ((0.03, 0.03, 0.04), 0.0, (0.45, 0.0)), ((0.10, 0.16, 0.10), 0.0, (0.56, 0.0))
+    frame = boxes_frame([small, black])
+    depth = np.where(frame.depth < boxes_frame([small]).depth - 1e-4, 0, frame.depth)
+    heights = height_map_from_frame(replace(frame, depth=depth), Workspace())
+    x, y = np.meshgrid(np.arange(0.53, 0.59, 0.01), np.arange(-0.05, 0.06, 0.01))
+    inside = heights.index(np.stack([x, y], axis=-1))
+    assert heights.height[inside].min() > 0.08 and set(heights.label[inside].ravel()) == {-1}
+    for grasp in HeuristicPlanner(GripperGeometry(), Workspace())(replace(frame, depth=depth)):
+        for side in (-1, 1):
+            finger = grasp.position + side * (grasp.width / 2 + 0.007) * grasp.closing_direction
+            assert not (abs(finger[0] - 0.56) < 0.04 and abs(finger[1]) < 0.07)
