@@ -52,7 +52,6 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
-from utils.adaptive_ranges import Bound
 from utils.checkpoint import load_checkpoint, load_weights
 from utils.config import Config, parse_args, run_script
 from utils.distributed import Team, stop_on_interrupt, team
@@ -134,15 +133,7 @@ def load_progress(ppo: GraspPPO, envs: VectorEnvs, last: Path) -> list[dict]:
     """Go on from a checkpoint, if there is one; the evaluations so far."""
     if not last.is_file():
         return []
-    extra = ppo.load(last)
-    if envs.ranges is not None:
-        if "ranges" not in extra:
-            raise UserError(
-                f"{last}: holds no automatic ranges, as before environments shared them; start a "
-                "new run, from its weights with rl.initial"
-            )
-        envs.ranges.load_state(extra["ranges"])
-    return extra["history"]
+    return ppo.load(last)["history"]
 
 
 def announce(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO) -> None:
@@ -202,15 +193,12 @@ def train(config: Config, run: Path, envs: VectorEnvs, ppo: GraspPPO, history: l
                 with watch(NETWORK):
                     losses = ppo.update(rollout, ppo.updates / total)
                 step += per_update
-                played = all_episodes(us, rollout.episodes)
-                widen(envs, played)
-                episodes = summary(played)
+                episodes = summary(all_episodes(us, rollout.episodes))
                 bar.update(per_update)
                 bar.set_postfix({k: f"{v:.3g}" for k, v in episodes.items() if k != "length"})
                 if us.is_main:
                     log(writer, step, "rollout", episodes)
                     log(writer, step, "update", losses)
-                    log(writer, step, "ranges", widths(envs))
                     rate = per_update / (time.perf_counter() - begun)
                     log(writer, step, "time", {"steps_per_second": rate})
                 if us.any(interrupted.is_set()):
@@ -275,8 +263,7 @@ def evaluate(
             if own
             else []
         )
-    row = {"update": ppo.updates, "step": step, **summary(all_episodes(ppo.team, episodes))}
-    return row if envs.ranges is None else row | {"range_width": envs.ranges.width}
+    return {"update": ppo.updates, "step": step, **summary(all_episodes(ppo.team, episodes))}
 
 
 def film(config: Config, run: Path, ppo: GraspPPO) -> None:
@@ -316,21 +303,6 @@ def summary(episodes: Sequence[Episode]) -> dict[str, float]:
     return means | ({"success": float(np.mean(told))} if told else {})
 
 
-def widen(envs: VectorEnvs, episodes: Sequence[Episode]) -> None:
-    """Let automatic ranges learn from the episodes of all environments of all processes. Every
-    process counts the same ones, so that all go on with the same ranges."""
-    if envs.ranges is not None:
-        tried = [(episode.bound, episode.success) for episode in episodes if episode.bound]
-        envs.ranges.record_all(
-            (Bound(name, side), value, success) for (name, side, value), success in tried
-        )
-
-
-def widths(envs: VectorEnvs) -> dict[str, float]:
-    """How far automatic ranges are on the way to their limits: on average, and each bound."""
-    return {} if envs.ranges is None else {"width": envs.ranges.width, **envs.ranges.shares}
-
-
 def score(row: dict[str, Any]) -> tuple[float, float]:
     """What the best evaluation is chosen by: success first, where it is told, then the return."""
     return row.get("success", 0.0), row["return"]
@@ -352,8 +324,6 @@ def save_evaluation(
     if ppo.team.is_main:
         row = history[-1]
         progress = {"history": history}
-        if envs.ranges is not None:
-            progress["ranges"] = envs.ranges.state()
         if score(row) == max(map(score, history)):
             ppo.save(run / "best.pt", config, **progress)
         ppo.save(run / "last.pt", config, **progress)

@@ -15,9 +15,7 @@ import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
 from envs.pybullet_panda import ARM, FINGERS
-from utils.adaptive_ranges import WIDEST
 from utils.domain_randomization import DomainRandomizer
-from utils.errors import UserError
 
 
 class RandomizedGraspingEnv(RobotGraspingEnv):
@@ -26,12 +24,6 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     info at reset has the episode's sample as `randomization`.
     `reset(options={"randomization": sample})` replays it; together with the scene's seed, the
     `start` and the same actions that gives the same episode bit for bit.
-
-    Automatic ranges (`randomization.adaptive`) are the environment's own, and learn from how its
-    episodes end. With the option "ranges" they are somebody else's from then on, who shares them
-    with more environments: either `AdaptiveRanges.shares`, or "widest" for an episode of the task
-    itself, which tries out no bound. The last info of an episode has the `bound` that it tried out,
-    [parameter, "low" or "high", value], if any.
 
     journal: file to which every episode that ends adds a line of JSON, None for none: `is_success`,
     and the options that repeat it, `scene_seed`, `start` and `randomization`.
@@ -42,7 +34,6 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         self.randomizer = DomainRandomizer(self.cell, self.config.randomization, ARM, FINGERS)
         self._recorded: Mapping[str, Any] | None = None
         self.journal: Path | None = None
-        self._shared = False  # whether the ranges are somebody else's
         self.cell.on_build = self._change_world
         self.cell.on_action = self.randomizer.act
 
@@ -57,40 +48,15 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         options = dict(options or {})
         self._recorded = options.pop("randomization", None)
-        self._take_ranges(options.pop("ranges", None))
         observation, info = super().reset(seed=seed, options=options)
         return observation, info | {"randomization": self.randomizer.sample}
-
-    def _take_ranges(self, ranges: Mapping[str, float] | str | None) -> None:
-        self.randomizer.at_limits = ranges == WIDEST
-        if ranges is None or ranges == WIDEST:
-            return
-        if self.randomizer.adaptive is None:
-            raise UserError(
-                "reset: the option 'ranges' shares automatic ranges, which are off; set "
-                f"randomization.adaptive.enabled=true, or ask for {WIDEST!r}"
-            )
-        try:
-            self.randomizer.adaptive.take_over(ranges)
-        except ValueError as error:
-            raise UserError(
-                f"reset: the option 'ranges' must be {WIDEST!r} or the shares of ranges of the "
-                "same parameters as the section randomization.physics"
-            ) from error
-        self._shared = True
 
     def step(
         self, action: np.ndarray
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
-        if terminated or truncated:
-            bound = self.randomizer.sample["bound"]
-            if bound is not None:
-                info["bound"] = bound
-            if not self._shared:
-                self.randomizer.record_result(info["is_success"])
-            if self.journal is not None:
-                self._write_down(info)
+        if (terminated or truncated) and self.journal is not None:
+            self._write_down(info)
         return observation, reward, terminated, truncated, info
 
     def _write_down(self, info: Mapping[str, Any]) -> None:

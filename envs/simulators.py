@@ -20,7 +20,6 @@ def make_cell(config: Config) -> Cell:
     cell = SIMULATORS[config.simulator](config)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
-        randomizer.at_limits = True
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
         cell.on_action = randomizer.act
     return cell

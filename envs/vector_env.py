@@ -26,7 +26,6 @@ import yaml
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from utils.adaptive_ranges import WIDEST, adaptive_ranges
 from utils.config import Config
 from utils.errors import UserError
 
@@ -60,23 +59,19 @@ def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
 
 def full_difficulty(env_id: str) -> dict[str, Any]:
     """Options of a reset for an episode of the task itself, whatever makes training easier."""
-    options = {"start": "home"} if env_id in OWN_ENVS else {}
-    return options | ({"ranges": WIDEST} if env_id == RANDOMIZED else {})
+    return {"start": "home"} if env_id in OWN_ENVS else {}
 
 
 class VectorEnvs:
     """See `models.ppo_rollouts.VectorEnvs` for the methods that stepping takes.
 
-    observation_space, action_space: of a single environment. ranges: automatic ones, None without:
-    those of all environments, which are told of a change when they next begin an episode.
+    observation_space, action_space: of a single environment.
     """
 
     def __init__(self, config: Config, count: int):
         self.num_envs = count
         self._options: dict[str, Any] = {}
         self._id = config.rl.env_id
-        randomized = self._id == RANDOMIZED
-        self.ranges = adaptive_ranges(config.randomization) if randomized else None
         self._timeout = config.rl.worker_timeout
         makers = [partial(make_env, config, index) for index in range(count)]
         self._parallel = config.rl.parallel and count > 1
@@ -93,8 +88,7 @@ class VectorEnvs:
         self.action_space = self._envs.single_action_space
 
     def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
-        options = {} if self.ranges is None else {"ranges": self.ranges.shares}
-        options |= self._options | ({} if which is None else {"reset_mask": which})
+        options = self._options | ({} if which is None else {"reset_mask": which})
         with _told(self._died):
             if not self._parallel:
                 return self._envs.reset(seed=list(seeds), options=options or None)[0]

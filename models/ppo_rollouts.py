@@ -56,7 +56,6 @@ class StepMemory:
 
 SIMULATION, NETWORK = "simulation", "network"  # what the stopwatch tells apart
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
-BOUND = "bound"  # entry of the last info of `envs.randomized_env`
 
 
 class VectorEnvs(Protocol):
@@ -81,13 +80,11 @@ class NotFinite(UserError):
 
 
 class Episode(NamedTuple):
-    """total: undiscounted sum of rewards; success: None where the environment does not tell. bound:
-    end of an automatic range that was tried out, [parameter, "low" or "high", value], or None."""
+    """total: undiscounted sum of rewards. success: None where the environment does not say."""
 
     total: float
     length: int
     success: bool | None
-    bound: list[str | float] | None = None
 
 
 @dataclass
@@ -228,16 +225,15 @@ class Tally:
         self._lengths += 1
         if not ended.any():
             return []
-        nobody = np.zeros(len(ended), bool)
-        told, tried = (infos.get(f"_{name}", nobody) for name in (SUCCESS, BOUND))
+        reported = infos.get(f"_{SUCCESS}", np.zeros(len(ended), bool))
         done = [
             Episode(
-                float(self._totals[i]), int(self._lengths[i]),
-                bool(infos[SUCCESS][i]) if told[i] else None,
-                infos[BOUND][i] if tried[i] else None,
+                float(self._totals[i]),
+                int(self._lengths[i]),
+                bool(infos[SUCCESS][i]) if reported[i] else None,
             )
             for i in np.flatnonzero(ended)
-        ]  # fmt: skip
+        ]
         self._totals[ended] = 0
         self._lengths[ended] = 0
         return done

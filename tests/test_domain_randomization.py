@@ -543,24 +543,6 @@ def test_env_keeps_gymnasiums_rules(env):
     check_env(env.unwrapped, skip_render_check=True)
 
 
-def test_automatic_ranges_learn_from_episodes():
-    config = load_config(
-        None,
-        ["sim.renderer=tiny", "randomization.adaptive.enabled=true",
-         "randomization.adaptive.boundary_share=1", "randomization.adaptive.episodes=1"],
-    )  # fmt: skip
-    env = gymnasium.make(
-        "RandomizedGrasping-v0", config=config, observations=["state"], control="ee_planar",
-        max_steps=1,
-    )  # fmt: skip
-    adaptive = env.unwrapped.randomizer.adaptive
-    width = adaptive.width
-    _, info, last = episode(env, seed=0, steps=1)
-    assert info["randomization"]["bound"] is not None
-    assert not last["is_success"] and adaptive.width < width
-    env.close()
-
-
 def test_parts_are_drawn_alone(wild, cell):
     """What is not varied is as it is; what is varied is what it would be with everything."""
     settings = wild.randomization

@@ -1,4 +1,4 @@
-"""Ranges against closed forms, automatic ranges against hand-played episodes, textures."""
+"""Ranges against closed forms, and textures."""
 
 import json
 
@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from utils.adaptive_ranges import AdaptiveRanges, Bound
 from utils.config import ConfigError, UserError, load_config
 from utils.config_types import Range
-from utils.random_ranges import changed, draw, neutral
+from utils.random_ranges import changed, draw
 from utils.random_view import TextureRandomizer
 
 
@@ -45,13 +44,9 @@ def test_draws_stay_in_range(low, width, distribution, seed):
     assert draw(range_, np.random.default_rng(seed)) == value
 
 
-def test_operations_and_neutral_values():
+def test_operations():
     assert changed("scale", 3.0, 2.0) == 6 and changed("add", 3.0, 2.0) == 5
     assert changed("set", 3.0, 2.0) == 2
-    assert neutral(spec(0.5, 2.0, operation="scale")) == 1
-    assert neutral(spec(-0.5, 2.0)) == 0
-    assert neutral(spec(0.2, 0.4)) == 0.2  # 0 is not within
-    assert neutral(spec(0.2, 0.4, operation="set")) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(
@@ -73,71 +68,6 @@ def test_wrong_ranges_are_told(value, words):
 def test_a_negative_latency_is_refused():
     with pytest.raises(ConfigError, match="must not be negative"):
         load_config(None, ["randomization.physics.latency=-1,1,uniform,set,episode"])
-
-
-# --- Automatic ranges -------------------------------------------------------------------------
-
-
-def adaptive(**overrides) -> AdaptiveRanges:
-    chosen = {"initial": 0.2, "step": 0.1, "episodes": 4, "boundary_share": 1.0} | overrides
-    keys = [f"randomization.adaptive.{key}={value}" for key, value in chosen.items()]
-    limits = {"mass": spec(0.5, 2.0, operation="scale"), "noise": spec(0.0, 1.0)}
-    return AdaptiveRanges(limits, load_config(None, keys).randomization.adaptive)
-
-
-def play(ranges: AdaptiveRanges, bound: Bound, *successes: bool) -> None:
-    for success in successes:
-        ranges.record(bound, success)
-
-
-def test_ranges_start_around_nominal():
-    ranges = adaptive().ranges
-    assert (ranges["mass"].low, ranges["mass"].high) == pytest.approx((0.9, 1.2))
-    assert (ranges["noise"].low, ranges["noise"].high) == pytest.approx((0.0, 0.2))
-
-
-def test_success_at_a_bound_widens_and_failure_narrows():
-    ranges, bound = adaptive(), Bound("mass", "high")
-    play(ranges, bound, True, True, True)
-    assert ranges.ranges["mass"].high == pytest.approx(1.2)  # three of four episodes
-    play(ranges, bound, True)
-    assert ranges.ranges["mass"].high == pytest.approx(1.3)
-    assert ranges.ranges["mass"].low == pytest.approx(0.9)  # the other end knows nothing of it
-    play(ranges, bound, True, False, True, False)  # 0.5: neither 0.8 nor 0.4
-    assert ranges.ranges["mass"].high == pytest.approx(1.3)
-    play(ranges, bound, *[False] * 8)
-    assert ranges.ranges["mass"].high == pytest.approx(1.1)
-
-
-def test_ranges_end_at_nominal_and_at_their_limits():
-    ranges, low, high = adaptive(), Bound("mass", "low"), Bound("mass", "high")
-    play(ranges, low, *[False] * 40)
-    play(ranges, high, *[True] * 80)
-    assert (ranges.ranges["mass"].low, ranges.ranges["mass"].high) == (1.0, 2.0)
-    assert 0 < ranges.width < 1
-
-
-def test_episodes_are_played_at_bounds():
-    ranges, rng = adaptive(boundary_share=0.25), np.random.default_rng(0)
-    found = [ranges.draw_bound(rng) for _ in range(2000)]
-    bounds = [f for f in found if f is not None]
-    # 3.3 standard deviations of a binomial
-    assert len(bounds) == pytest.approx(500, abs=3.3 * np.sqrt(2000 * 0.25 * 0.75))
-    # noise has no room below its nominal 0, so it has one bound only.
-    assert dict(bounds) == pytest.approx(
-        {Bound("mass", "low"): 0.9, Bound("mass", "high"): 1.2, Bound("noise", "high"): 0.2}
-    )
-
-
-def test_state_goes_on_where_it_was():
-    first, second = adaptive(), adaptive()
-    play(first, Bound("mass", "high"), *[True] * 6)
-    second.load_state(json.loads(json.dumps(first.state())))
-    for ranges in (first, second):
-        play(ranges, Bound("mass", "high"), True, True)
-    assert first.ranges == second.ranges and first.ranges["mass"].high == pytest.approx(1.4)
-    with pytest.raises(ValueError, match="other parameters"):
-        first.load_state({})
 
 
 # --- Textures ---------------------------------------------------------------------------------

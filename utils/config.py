@@ -58,6 +58,11 @@ RENAMED_KEYS = {
     "closed_loop.blind_seconds": "closed_loop.final_seconds",
 }
 
+# Old dotted keys and sections that are gone, and what to do instead.
+REMOVED_KEYS = {
+    "randomization.adaptive": "write the ranges themselves under randomization.physics",
+}
+
 
 class ConfigError(UserError):
     """A config that cannot be used: the message holds key, value, what is allowed, nearest key."""
@@ -174,7 +179,16 @@ def new_name(key: str) -> str | None:
     return None
 
 
+def _removed(key: str) -> str | None:
+    """What to do instead of setting a key that was removed; None for any other key."""
+    found = (REMOVED_KEYS[old] for old in REMOVED_KEYS if f"{key}.".startswith(f"{old}."))
+    return next(found, None)
+
+
 def unknown_key(key: str, source: str) -> str:
+    instead = _removed(key)
+    if instead is not None:
+        return f"{key}: this key was removed ({source}); {instead}"
     renamed = new_name(key)
     if renamed is not None:
         return f"{key}: this key is now called {renamed} ({source}); use the new name"

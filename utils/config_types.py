@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 OBJECT_SETS = ("box", "primitives", "random_urdfs")
 
@@ -155,24 +155,6 @@ class VisionRangesConfig(Section):
     depth_step: RangeOf
 
 
-class AdaptiveConfig(Section):
-    enabled: bool
-    initial: Fraction
-    step: Share
-    boundary_share: Share
-    episodes: Count
-    widen_at: Share
-    narrow_at: Fraction
-
-    @model_validator(mode="after")
-    def _narrow_below_widen(self) -> AdaptiveConfig:
-        if self.narrow_at >= self.widen_at:
-            raise ValueError(
-                f"narrow_at ({self.narrow_at}) must be smaller than widen_at ({self.widen_at})"
-            )
-        return self
-
-
 class RandomizationConfig(Section):
     parts: Annotated[tuple[Literal["physics", "vision"], ...], Several, AfterValidator(no_repeats)]
     physics: PhysicsRangesConfig
@@ -182,10 +164,3 @@ class RandomizationConfig(Section):
     texture_folder: Annotated[Path, Field(strict=False)] | None
     shadow_share: Fraction
     depth_noise_share: Fraction
-    adaptive: AdaptiveConfig
-
-    @model_validator(mode="after")
-    def _adaptive_ranges_are_of_physics(self) -> RandomizationConfig:
-        if self.adaptive.enabled and "physics" not in self.parts:
-            raise ValueError("adaptive ranges are those of physics: add it to parts")
-        return self

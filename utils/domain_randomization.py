@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 import pybullet
 
-from utils.adaptive_ranges import Bound, adaptive_ranges
 from utils.config_types import RandomizationConfig, Range
 from utils.errors import UserError
 from utils.random_physics import RandomPhysics
@@ -51,11 +50,9 @@ class DomainRandomizer:
         each_step: by parameter its Range, where it is drawn anew
         colours: RGB for the table and each object, or None. textures: likewise, each None or a
             description by `TextureRandomizer.draw`. shadow: 0 or 1. depth_noise: true or false
-        bound: None, or [parameter, "low" or "high", value] that automatic randomisation tries out
 
     world: of PyBullet; UserError for another. arm, fingers: link numbers of the robot. seed: of
     what `randomize` draws when it is given none.
-    at_limits: draw from the widest ranges, automatic or not: the task itself, as evaluations ask.
     """
 
     def __init__(
@@ -75,10 +72,8 @@ class DomainRandomizer:
         self._seeds = np.random.default_rng(seed)
         self.textures = TextureRandomizer(settings.texture_folder)
         self._varies_view = "vision" in settings.parts
-        self._limits = ranges_of(settings.physics) if "physics" in settings.parts else {}
+        self._physics_ranges = ranges_of(settings.physics) if "physics" in settings.parts else {}
         self._vision = ranges_of(settings.vision) if self._varies_view else {}
-        self.adaptive = adaptive_ranges(settings)
-        self.at_limits = False
         self._built: object = None  # the robot of the build that `_physics` belongs to
 
     @property
@@ -141,22 +136,11 @@ class DomainRandomizer:
         noisy = action + bias + deviation * rng.standard_normal(len(action))
         return np.clip(noisy, -1.0, 1.0).astype(np.asarray(action).dtype)
 
-    def record_result(self, success: bool) -> None:
-        """How the episode ended: automatic randomisation, where enabled, learns from it."""
-        if self.adaptive is not None and self.sample is not None and self.sample["bound"]:
-            name, side, value = self.sample["bound"]
-            self.adaptive.record_all([(Bound(name, side), value, success)])
-
     # --- Drawing ------------------------------------------------------------------------------
 
     def _draw(self, seed: int) -> dict[str, Any]:
         settings, rng = self._settings, np.random.default_rng(seed)
-        physics, bound = dict(self._limits), None
-        if self.adaptive is not None and not self.at_limits:
-            physics = self.adaptive.ranges
-            if found := self.adaptive.draw_bound(rng):
-                bound, value = found
-                physics[bound.name] = physics[bound.name]._replace(low=value, high=value)
+        physics = self._physics_ranges
         sizes = self._sizes()
         count = len(self._world.bodies)
         coloured = bool(rng.random() < settings.colour_share)
@@ -171,7 +155,6 @@ class DomainRandomizer:
         return {
             "version": _VERSION,
             "seed": seed,
-            "bound": None if bound is None else [*bound, value],
             "colours": colours if coloured else None,
             "textures": textures,
             "shadow": int(shadow),

@@ -1,9 +1,9 @@
 """Plug-ins by import path: `module:name` names an object of a module outside this repository.
 
-Gymnasium names its environments in the same way. A planner, an object set, a depth noise or a reward
-term that is given as `module:name` needs no entry in a registry. The module must be importable:
-from the current folder, from `PYTHONPATH` or as an installed package. This module knows nothing
-about what is loaded.
+Gymnasium names its environments in the same way. A planner, an object set, a depth noise or a
+reward term that is given as `module:name` needs no entry in a registry. The module must be
+importable: from the current folder, from `PYTHONPATH` or as an installed package. This module knows
+nothing about what is loaded.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ import numpy as np
 from utils.config_types import Range
 
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
-NEUTRAL = {"scale": 1.0, "add": 0.0}  # changes nothing
 
 
 def ranges_of(section: Any) -> dict[str, Range]:
@@ -36,12 +35,6 @@ def changed(operation: str, nominal: float, value: float) -> float:
     if operation == "scale":
         return nominal * value
     return nominal + value if operation == "add" else value
-
-
-def neutral(spec: Range) -> float:
-    """The value within the range that changes least; for `set` its middle."""
-    middle = (spec.low + spec.high) / 2
-    return min(max(NEUTRAL.get(spec.operation, middle), spec.low), spec.high)
 
 
 def _draw_one(spec: Range, rng: np.random.Generator) -> float:
