@@ -20,8 +20,11 @@ test: $(VENV)/.installed-dev
 test-fast: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -m "not slow" $(ARGS)
 
+# Style, and who imports whom (pyproject.toml, tests/test_layers.py).
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache --no-logo
+	$(BIN)/python -m pytest -q tests/test_layers.py
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.bench_env $(ARGS)

@@ -1,0 +1,94 @@
+"""Who may import whom, as docs/architecture.md draws it, over the modules' real import graph.
+
+The layers are contracts of import-linter in pyproject.toml; what its contracts cannot say (a rule
+by the first word of a file's name, circles between single modules, scripts) is checked here with
+grimp, the graph that import-linter stands on. An import inside a function counts too.
+"""
+
+from __future__ import annotations
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import grimp
+import pytest
+from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl")
+# A simulator's package: the beginning of the names of the only modules that may import it.
+SIMULATORS = {
+    "pybullet": "envs.pybullet_",
+    "pybullet_data": "envs.pybullet_",
+    "pybullet_utils": "envs.pybullet_",
+    "mujoco": "envs.mujoco_",
+}
+STILL_TO_BE_MOVED = {
+    ("envs.board", "pybullet"),
+    ("envs.board_servo", "pybullet"),
+    ("envs.cell_layout", "pybullet"),
+    ("envs.cell_scenes", "pybullet"),
+    ("envs.mujoco_panda", "pybullet_data"),
+    ("envs.objects", "pybullet"),
+    ("envs.objects", "pybullet_data"),
+    ("envs.studio", "pybullet"),
+    ("utils.domain_randomization", "pybullet"),
+    ("utils.random_physics", "pybullet"),
+    ("utils.servo_reference", "utils.visual_servo"),
+}
+
+
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """The modules that each module of the product imports, other packages' included."""
+    graph = grimp.build_graph(
+        "envs", "models", "utils", include_external_packages=True, cache_dir=None
+    )
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_contracts_of_import_linter_are_kept(capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    status = lint_imports(config_filename="pyproject.toml", no_cache=True, no_logo=True)
+    assert status == EXIT_STATUS_SUCCESS, capsys.readouterr().out
+
+
+def test_only_a_simulators_own_modules_import_it(imports):
+    strangers = {
+        (module, package)
+        for module, imported in imports.items()
+        for package, beginning in SIMULATORS.items()
+        if package in imported and not module.startswith(beginning)
+    }
+    assert strangers <= STILL_TO_BE_MOVED
+
+
+def test_no_circle_of_imports(imports):
+    graph = {
+        module: {one for one in imported if (one, module) not in STILL_TO_BE_MOVED}
+        for module, imported in imports.items()
+    }
+    graph = {
+        module: {one for one in imported if (module, one) not in STILL_TO_BE_MOVED}
+        for module, imported in graph.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"these modules import each other: {' -> '.join(error.args[1])}")
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_no_script_imports_another(script):
+    tree = ast.parse((ROOT / f"{script}.py").read_text())
+    imported = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        for name in (
+            [node.module or ""] if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names] if isinstance(node, ast.Import)
+            else []
+        )
+    }  # fmt: skip
+    assert not imported & {*SCRIPTS, "tests", "benchmarks"}
