@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.depth_loops import by_loops, steps_and_slopes
 from benchmarks.digits import load_digits_of
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.grasping_env import RobotGraspingEnv
 from envs.randomized_env import RandomizedGraspingEnv
-from tests.test_depth import by_loops, steps_and_slopes
 from utils.adaptation import (
     SOURCE,
     TARGET,
