@@ -1,0 +1,48 @@
+"""The packages are found from outside the repository: `pip install -e .` and PYTHONPATH."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+OUTSIDE = """
+import gymnasium, envs, models, utils
+from models.graspnet_io import load_graspnet
+from utils.config import DEFAULTS, load_config
+load_config()
+env = gymnasium.make("RobotGrasping-v0", observations=["state"])
+print(DEFAULTS, sorted(env.reset(seed=0)[0]))
+"""
+
+
+def test_an_environment_is_made_from_another_folder(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", OUTSIDE], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == f"{ROOT / 'configs' / 'default.yaml'} ['state']"
+
+
+def test_what_pip_installs_is_there():
+    """What setuptools would miss: a package that is not listed, or data without a pattern."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    code = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"benchmarks", "tests"}
+    assert set(settings["packages"]) == code | {"checkpoints", "configs"}
+    data = {
+        file
+        for package, patterns in settings["package-data"].items()
+        for pattern in patterns
+        for file in (ROOT / package).glob(pattern)
+    }
+    listed = subprocess.run(
+        ["git", "ls-files", *settings["packages"]], cwd=ROOT, capture_output=True, text=True
+    ).stdout.split()
+    assert {ROOT / name for name in listed if not name.endswith(".py")} <= data
+    for file in settings["dynamic"]["dependencies"]["file"]:
+        assert (ROOT / file).is_file()
