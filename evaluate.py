@@ -35,7 +35,7 @@ from envs.scenarios import SCENARIOS
 from envs.simulators import in_world, make_cell
 from envs.studio import Film
 from models.photographs import judge_as_taken, judge_photographs, photographs
-from models.planners import make_planner
+from models.planners import make_planner, needs_truth
 from models.rectangle_examples import draw_rectangles
 from utils.config import (
     OBJECT_SETS,
@@ -201,7 +201,7 @@ def work(task: Task) -> Played:
         else:
             workspace = workspace_of(_config)
             planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
-        privileged = getattr(planner, "needs_truth", False)
+        privileged = needs_truth(planner)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
             if task.keep_pictures or not outcome.success:

@@ -7,13 +7,12 @@ never for a policy that is to work without it. Knows nothing of robots or of PyB
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace
-from utils.grasp_quality import LabelSettings, judge, undersides
+from utils.grasp_quality import LabelSettings, grasp_quality, undersides
 from utils.height_map import height_map_from_scene
 
 ANGLES = 12  # closing lines that are tried, over half a turn
@@ -22,10 +21,7 @@ MOST = 64  # goals of one object
 _HAND = GripperGeometry()
 _STRICT = LabelSettings()
 # For what offers nothing better, such as a bowl upside down.
-_DARING = replace(
-    _STRICT, table_clearance=0.002, min_engagement=0.003, clearance=0.001, room=0.003,
-    max_wedge=np.deg2rad(38), wedge_scale=0.6, tilt_scale=1.0,
-)  # fmt: skip
+_RELAXED = _STRICT.relaxed()
 _GOOD = 0.85
 _CELL = 0.002  # m, of the height map; a goal is tried for every second cell along and across
 _AROUND = 0.12  # m of map around the object: half the palm, at any angle
@@ -65,7 +61,7 @@ class GraspGoals:
         self._points = (self._points - T_WO[:3, 3]) @ T_WO[:3, :3]
         found = _search(scene, _STRICT)
         if len(found) == 0:
-            found = _search(scene, _DARING)
+            found = _search(scene, _RELAXED)
         if len(found) == 0:
             found = _through_the_middle(scene)
         x, y, z, angle, *others = found[_distinct(found)].T
@@ -176,7 +172,7 @@ def _search(scene: SceneGeometry, settings: LabelSettings) -> np.ndarray:
     angles = _narrowest(corners) + math.pi / ANGLES * np.arange(ANGLES)
     found = []
     for angle in angles:
-        judged = judge(surface, angle, heights, under, scene, _HAND, settings)
+        judged = grasp_quality(surface, angle, heights, under, scene, _HAND, settings)
         some = np.flatnonzero(judged.quality > 0)
         middle, reach = judged.middle[some], judged.reach[some]
         narrow = 2 * (reach + _ROOM)

@@ -21,7 +21,7 @@ from models.graspnet import to_input
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
 from models.planner_graspnet import GraspNetPlanner
-from models.planners import Planner, make_planner
+from models.planners import Planner, make_planner, needs_truth
 from models.rectangle_examples import Judged, View, best_rectangle, judged
 from models.rectangle_folds import VIEWS
 from utils.errors import UserError
@@ -73,7 +73,7 @@ def judge_photographs(
     """The rectangle metric of a planner's best grasp, or a network's, on every photograph; None
     where it finds none, and for a planner that needs more than a frame."""
     planned = make_planner(planner, HAND, WORKSPACE, seed)
-    if planned.needs_truth:
+    if needs_truth(planned):
         return None
     found: list[Judged | None] = []
     for sample in samples:

@@ -1,13 +1,11 @@
-"""Many grasps in the making, held column by column so that they are judged all at once.
+"""Antipodal search on a height map: grasps whose two fingers close on opposite faces.
 
-This module knows neither how grasps are found nor what makes one good.
-
-Antipodal search on a height map: where two parallel fingers can close on opposite faces.
-
-First runs of matter along the closing line that fit between the fingers (dense, every angle and
-height); each survivor is then posed on the map, its contacts, clearances and lever arms measured,
-and it is centred and turned onto the faces. This module knows height maps only: neither the image
-nor the solids behind them.
+The search has two stages. The dense stage finds, for every angle and height of the fingertips, runs
+of matter along the closing line that fit between the fingers. The second stage poses each of the
+best on the map, measures contacts, clearances and lever arms, centres the grasp and turns it onto
+the faces. `Candidates` holds all grasps column by column, so that each step is one array operation.
+`SearchPlanner` is the base of the planners that search. This module knows height maps only: neither
+the image nor the solids behind them.
 """
 
 from __future__ import annotations
@@ -19,18 +17,19 @@ import cv2
 import numpy as np
 
 from utils.geometry import GripperGeometry, Workspace
+from utils.grasp_quality import RELAXED, contact_levels, fit_faces
 from utils.height_map import HeightMap
 from utils.transforms import Grasp, angle_difference
 
 
 @dataclass
 class Candidates:
-    """N grasps in the making.
+    """N candidate grasps, one column for each quantity; metres and radians.
 
-    xy: (N, 2) fingertips' centre in W. angle: (N,). tip: (N,) height of the fingertips' lowest
-    point in W. width: (N,) of what is between the fingers. opening: (N,) before closing.
-    turn: (N,) rotation that would bring the pads flat onto the faces. label: (N,) the object in
-    the height map. score: (N,), 0 = not feasible.
+    xy: (N, 2) middle between the fingertips in W. angle: (N,) of the closing line. tip: (N,) height
+    of the fingertips' lowest point in W. width: (N,) of the matter between the fingers. opening:
+    (N,) of the hand before closing. turn: (N,) rotation that would bring the pads flat onto the
+    faces. label: (N,) the object in the height map. score: (N,), 0 for an infeasible grasp.
     """
 
     xy: np.ndarray
@@ -44,7 +43,7 @@ class Candidates:
 
     @staticmethod
     def rough(xy, angle, tip, width, score) -> Candidates:
-        """Candidates of the dense stage, not measured yet."""
+        """Candidates of the dense stage, which are not measured yet."""
         return Candidates(
             xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
         )
@@ -56,12 +55,12 @@ class Candidates:
         return Candidates(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def best(self, count: int) -> Candidates:
-        """The `count` best feasible ones, best first."""
+        """The `count` best feasible candidates, best first."""
         order = np.argsort(-self.score, kind="stable")[:count]
         return self.take(order[self.score[order] > 0])
 
     def replaced(self, index: np.ndarray, others: Candidates) -> Candidates:
-        """All of them, but `others` in the places `index`."""
+        """All candidates, with `others` in the places `index`."""
         result = self.take(np.arange(len(self)))
         for field in fields(self):
             getattr(result, field.name)[index] = getattr(others, field.name)
@@ -84,6 +83,7 @@ class Candidates:
         return self.take(kept)
 
     def grasps(self, gripper: GripperGeometry) -> list[Grasp]:
+        """The candidates as grasps, in the same order."""
         height = self.tip + gripper.tip_below_centre
         return [
             Grasp(np.array([x, y, z]), angle, opening, score)
@@ -100,9 +100,9 @@ class SearchSettings:
     angles: int = 18  # bin k is centred at k * 180 / angles degrees
     level_step: float = 0.006  # between the heights of the fingertips that are tried
     table_clearance: float = 0.004  # under the fingertips
-    clearance: float = 0.003  # over whatever lies under fingers and palm
+    clearance: float = 0.003  # over all matter under fingers and palm
     rooms: tuple[float, ...] = (0.004, 0.006, 0.008, 0.012)  # room beside each contact when open
-    inner_margin: float = 0.0015  # of that room, free of matter beside the descending finger
+    inner_margin: float = 0.0015  # part of that room that has to be free of matter
     min_engagement: float = 0.006  # the object must rise this far over the fingertips
     good_engagement: float = 0.022  # and gains nothing beyond this
     max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
@@ -110,24 +110,53 @@ class SearchSettings:
     reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again
-    split_factor: float = 0.5  # on a grasp whose ends lie on different objects, by the map
+    split_factor: float = 0.5  # on the score of a grasp whose ends lie on different objects
     returned: int = 20  # grasps at most
-    distinct_distance: float = 0.01  # no two returned ones are both closer than this
+    distinct_distance: float = 0.01  # no two returned grasps are both closer than this
     distinct_turn: float = np.deg2rad(20)  # and turned by less than this
 
-    def daring(self) -> SearchSettings:
-        """What is given up where nothing meets the margins: room and wedge for things on slopes or
-        between others, height under the tips for things as flat as a pencil."""
+    def relaxed(self) -> SearchSettings:
+        """Settings whose margins are at most the `RELAXED` ones."""
         return replace(
             self,
-            table_clearance=min(self.table_clearance, 0.002),
-            clearance=min(self.clearance, 0.001),
-            rooms=(min(self.rooms[0], 0.003), *self.rooms),
+            table_clearance=min(self.table_clearance, RELAXED.table_clearance),
+            clearance=min(self.clearance, RELAXED.clearance),
+            rooms=(min(self.rooms[0], RELAXED.room), *self.rooms),
             inner_margin=0.0,
-            min_engagement=min(self.min_engagement, 0.003),
-            max_wedge=max(self.max_wedge, np.deg2rad(38)),
+            min_engagement=min(self.min_engagement, RELAXED.min_engagement),
+            max_wedge=max(self.max_wedge, RELAXED.max_wedge),
             min_facing=min(self.min_facing, 0.6),
         )
+
+
+class SearchPlanner:
+    """Base of the planners that search a height map.
+
+    gripper, workspace: the hand and the square of the table that it works on. seed: unused, for
+    the search draws nothing at random; all planners are made with the same arguments.
+    """
+
+    def __init__(
+        self,
+        gripper: GripperGeometry,
+        workspace: Workspace,
+        seed: int = 0,
+        settings: SearchSettings = SearchSettings(),
+    ):
+        self.gripper, self.workspace, self.settings = gripper, workspace, settings
+
+    def search(
+        self, heights: HeightMap, value: Callable[[Candidates], np.ndarray] | None = None
+    ) -> Candidates:
+        """Feasible candidates on a height map, best first; `value` as in `search`."""
+        return search(heights, self.gripper, self.workspace, self.settings, value)
+
+    def grasps(self, found: Candidates) -> list[Grasp]:
+        """The best of the candidates as grasps, no two of them nearly alike."""
+        settings = self.settings
+        return found.distinct(
+            settings.returned, settings.distinct_distance, settings.distinct_turn
+        ).grasps(self.gripper)
 
 
 def search(
@@ -139,13 +168,13 @@ def search(
 ) -> Candidates:
     """Feasible candidates on a height map, measured and scored, best first; may be empty.
 
-    value: (N,) what else is known of the candidates' worth, such as a network's opinion; a factor
-    on their scores. Where nothing meets the margins, a second search gives some of them up: a poor
-    attempt may clear an object, none ends the round.
+    value: returns a factor (N,) on the candidates' scores, such as a network's prediction. Where
+    nothing meets the margins, a second search has relaxed ones: a poor attempt may clear an object,
+    no attempt ends the round.
     """
     found = _search_once(heights, gripper, workspace, settings, value)
     if len(found) == 0:
-        found = _search_once(heights, gripper, workspace, settings.daring(), value)
+        found = _search_once(heights, gripper, workspace, settings.relaxed(), value)
     return found
 
 
@@ -166,12 +195,13 @@ def _valued(found: Candidates, value) -> Candidates:
 def dense_candidates(
     heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
 ) -> Candidates:
-    """Every angle, fingertip height and row of the map: what might fit between the fingers."""
+    """Runs of matter that may fit between the fingers, for every angle, fingertip height and row
+    of the map."""
     cell, lowest = heights.cell, heights.table_height + settings.table_clearance
     levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
-    if len(levels) == 0 or len(heights.centres) == 0:  # nothing stands up, or only slivers do
+    if len(levels) == 0 or len(heights.centres) == 0:  # nothing but slivers stands on the table
         return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
-    # A square that holds whatever may be grasped, and fingers beside it, at any angle.
+    # A square that holds all graspable matter, and fingers beside it, at any angle.
     matter = np.argwhere(heights.height > lowest)[:, ::-1]
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
@@ -205,7 +235,7 @@ def dense_candidates(
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
         limit = tip - settings.clearance
         free = np.zeros(len(tip), bool)
-        for room in settings.rooms:  # a sloping flank asks for more of it
+        for room in settings.rooms:  # a sloping flank needs more room
             offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
             left, right = (
                 np.clip(np.rint(at).astype(int), 0, size - 1)
@@ -273,7 +303,7 @@ def turn_onto_faces(
     settings: SearchSettings,
     times: int = 2,
 ) -> Candidates:
-    """Measured candidates, each turned and measured again as long as that makes it better."""
+    """Measured candidates, each turned and measured again as long as its score rises."""
     better = np.arange(len(found))
     for _ in range(times):
         before = found.take(better)
@@ -288,10 +318,10 @@ def turn_onto_faces(
 def measure(
     candidates: Candidates, heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings
 ) -> Candidates:
-    """Pose each candidate on the map; centre it between its contacts and score it.
+    """The candidates posed on the map, centred between their contacts, and scored.
 
-    The pads are flat: a pad stops where the first of the lines across it meets matter. Slopes of
-    the meeting points across the pad give the angle to the face, their shift with height its tilt.
+    The pads are flat: a pad stops where the first of the lines across it meets matter. The slope of
+    the contacts across the pad gives the angle to the face, their shift with height its tilt.
     """
     N, tip = len(candidates), candidates.tip
     along, across = candidates.axes()
@@ -307,8 +337,8 @@ def measure(
     window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
     top = np.where(window, highest, -np.inf).max(axis=1)
     engagement = top - tip
-    upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
-    low = (height > tip[:, None, None] + 0.001) & window[:, None]
+    lower, upper = contact_levels(tip, engagement)
+    low = (height > lower[:, None, None]) & window[:, None]
     low_left, low_right = _first_contacts(low, u, heights.cell)
     high = (highest > upper[:, None]) & window
     high_left, high_right = _first_contacts(high, u, heights.cell)
@@ -316,15 +346,13 @@ def measure(
     touched = np.isfinite(left) & np.isfinite(high_left)
     left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
     width, shift = right - left, (right + left) / 2
-    slope, cover = _face(np.stack([low_left - left[:, None], right[:, None] - low_right]), v)
-    yaw_left, yaw_right = np.arctan(slope) * [[1], [-1]]
-    turn, wedge = -(yaw_left + yaw_right) / 2, np.abs(yaw_left - yaw_right) / 2
+    turn, wedge, cover = fit_faces(low_left - left[:, None], right[:, None] - low_right, v)
     rise = upper - tip - 0.001
     tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
     tilt_right = np.arctan2(np.maximum(right - high_right, 0), rise)
     tilt = np.where(touched, (tilt_left + tilt_right) / 2, np.pi / 2)
 
-    # What is held, and how far from its centre of mass.
+    # The object between the fingers, and the lever arms to its centre of mass.
     xy = candidates.xy + shift[:, None] * along
     inner = np.minimum(0.003, width / 3)
     ends = [
@@ -337,7 +365,7 @@ def measure(
     arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
     arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
 
-    # Clearance of fingers and palm on a straight descent, where all else is in order.
+    # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
     near, opening, blind = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
@@ -354,12 +382,12 @@ def measure(
 
     score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
     score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
-    score *= 0.4 + 0.6 * cover.min(axis=0)
+    score *= 0.4 + 0.6 * cover
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
     score *= np.exp(-4 * blind)
     score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
-    score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # mildly: the top of a pile first
+    score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # prefers the top of a pile
     feasible = np.zeros(N, bool)
     feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
@@ -374,10 +402,8 @@ def _cells(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
 
 
 def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
-    """(...) where lines (..., U) first meet matter, from the left and from the right.
-
-    Lines that meet nothing hold +inf (left) and -inf (right).
-    """
+    """(...) places at which lines (..., U) first meet matter, from the left and from the right;
+    +inf (left) and -inf (right) for lines that meet none."""
     hit = matter.any(axis=-1)
     left = u[matter.argmax(axis=-1)] - cell / 2
     right = u[len(u) - 1 - matter[..., ::-1].argmax(axis=-1)] + cell / 2
@@ -392,11 +418,11 @@ def _widest_opening(
     gripper: GripperGeometry,
     settings: SearchSettings,
 ) -> np.ndarray:
-    """(N,) widest opening of the fingers that is free on a straight descent; 0 if none is.
+    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is.
 
     obstacles, near: (N, U) heights along the closing line and their distances from the middle.
     """
-    # Between contact and finger only the closing pads pass, over anything below the tips.
+    # Between contact and finger only the closing pads pass, over all that is below the tips.
     sill = np.where(
         near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
     )
@@ -413,22 +439,10 @@ def _widest_opening(
     return opening
 
 
-def _face(gap: np.ndarray, v: np.ndarray, near: float = 0.008, touch: float = 0.0025):
-    """Slope (...) of the gap (..., V) between pad and face across the pad, and share in touch."""
-    weight = (gap < near).astype(float)
-    gap = np.where(gap < near, gap, 0.0)
-    total = np.maximum(weight.sum(axis=-1), 1)
-    mean_v = (weight * v).sum(axis=-1) / total
-    spread = weight * (v - mean_v[..., None])
-    variance = (spread * v).sum(axis=-1)
-    slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < touch)).mean(axis=-1)
-
-
 def _palm_gap(
     xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
 ) -> np.ndarray:
-    """(N,) smallest height of the palm's underside, fingertips at 0, over whatever may be there."""
+    """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
     # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
     # more cell for rounding to the grid.
     radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1

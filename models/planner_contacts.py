@@ -1,7 +1,8 @@
-"""Judging grasps by the true solids: exact line-solid contacts of the pads, and what lies on top.
+"""Exact quality of candidate grasps: contacts of the pads with the scene's true solids.
 
-Needs the scene's true geometry, so only privileged planners and labels may use it. This module
-knows no image, and not how the candidates were found.
+Lines across the flat pads are intersected with every convex solid, also with the pose perturbed.
+`buried_share` tells which objects others cover. Both need the true geometry, so only privileged
+planners may use them. This module knows no image and no search.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ PERTURBATIONS = np.array(
 def exact_quality(
     candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
 ) -> np.ndarray:
-    """(N,) in [0, 1]: contacts of the flat pads with the true solids, nominal and perturbed.
+    """(N,) in [0, 1]: quality of the pads' contacts, at the nominal pose and at `PERTURBATIONS`.
 
-    A pose counts 0 unless both pads first meet the same object with normals inside the friction
+    The quality of a pose is 0 unless both pads first meet the same object with normals inside the friction
     cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
     """
     N, P = len(candidates), len(PERTURBATIONS)
@@ -49,7 +50,7 @@ def exact_quality(
 def _pad_contacts(
     centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
 ) -> np.ndarray:
-    """(N,) quality in [0, 1] of pads that close along lines over their faces.
+    """(N,) quality in [0, 1] of the contacts of two closing pads.
 
     centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
     """
@@ -72,8 +73,8 @@ def _pad_contacts(
     travel = np.full((2, N * L), np.inf)
     owner = np.full((2, N * L), -1)
     facing = np.zeros((2, N * L))
-    for number, thing in enumerate(scene.objects):
-        for solid in thing.solids:
+    for number, item in enumerate(scene.objects):
+        for solid in item.solids:
             middle = (solid.vertices.max(axis=0) + solid.vertices.min(axis=0)) / 2
             radius = np.linalg.norm(solid.vertices - middle, axis=1).max()
             offset_ = middle - flat
@@ -110,10 +111,10 @@ def _pad_contacts(
     good = (held[0] == held[1])[:, 0] & (held[0, :, 0] >= 0) & alone.all(axis=0)
     good &= (first[..., 0] > 0.0005).all(axis=0)  # a pad that starts inside matter has hit it
     held = held[0, :, 0]
-    friction = np.array([thing.friction for thing in scene.objects])[held]
+    friction = np.array([item.friction for item in scene.objects])[held]
     cone = 0.9 * np.arctan(np.minimum(friction, 1.0))  # the fingers' own friction is 1
     worst = angle.max(axis=0)
-    to_mass = np.array([thing.centre_of_mass for thing in scene.objects])[held] - centre
+    to_mass = np.array([item.centre_of_mass for item in scene.objects])[held] - centre
     arm = np.abs((to_mass * across).sum(axis=1) - point[..., 0].mean(axis=0))
     above = np.abs(to_mass[:, 2] - point[..., 1].mean(axis=0))
     value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(
@@ -127,8 +128,8 @@ def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
     seen = np.bincount(heights.label[heights.label >= 0], minlength=len(scene.objects))
     whole = np.empty(len(scene.objects))
     workspace, margin = _square_of(heights)
-    for number, thing in enumerate(scene.objects):
-        alone = SceneGeometry((thing,), scene.table_height)
+    for number, item in enumerate(scene.objects):
+        alone = SceneGeometry((item,), scene.table_height)
         whole[number] = (
             height_map_from_scene(alone, workspace, 2 * heights.cell, margin).label >= 0
         ).sum()

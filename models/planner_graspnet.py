@@ -1,18 +1,15 @@
-"""Which object every part of a height map belongs to, by votes for the objects' centres of mass.
+"""GraspNet as a planner: the antipodal search proposes grasps, the network ranks them.
 
-A network's centre head says at each pixel what leads to the centre of mass of the object seen
-there. All parts of one object point at one place, whatever touches it, so the places where many
-votes meet are the objects (a Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018;
-Cheng et al., Panoptic-DeepLab, CVPR 2020). Parts whose votes lead nowhere stay what the height map
-takes them for.
+A network's maps are exact to a few millimetres; fingers beside an object need better. So the
+antipodal search proposes exact poses, and the network's quality at their places and angles is a
+factor on their scores: before they are measured on the height map, so that few have to be, and
+after. Colours tell table from object in the holes of the depth image (`table_in_holes`).
 
-GraspNet as a planner: the depth image tells which grasps fit, the network what they are worth.
-
-A network names places well to a few millimetres; fingers need better than that beside an object.
-So the antipodal search of the other planners proposes exact poses, and what the network says of
-their places and angles ranks them: before they are measured on the height map, so that few have to
-be, and after. Its votes for centres of mass tell the objects apart, and the colours what a hole in
-the depth image is. Nothing but the RGB-D image is seen.
+Where the network has a centre head, its votes segment the height map into objects. At each pixel
+the head predicts the offset to the centre of mass of the object there. All parts of one object
+point at one place, even where objects touch, so the places where many votes meet are the objects (a
+Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018; Cheng et al., Panoptic-DeepLab,
+CVPR 2020). Parts whose votes do not meet keep the height map's label.
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ import torch
 
 from models.graspnet_inference import scaled_maps
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
-from models.planner_antipodal import Candidates, SearchSettings, search
+from models.planner_antipodal import Candidates, SearchPlanner, SearchSettings
 from utils.depth import table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, local_maxima
@@ -37,12 +34,12 @@ from utils.transforms import Grasp, RGBDFrame, deproject, project
 
 @dataclass(frozen=True)
 class VoteSettings:
-    """In pixels of the network's image, unless said."""
+    """Of the vote for centres; in pixels of the network's image unless said."""
 
     blur: float = 2.0  # standard deviation of the Gaussian over the votes
-    apart: int = 5  # two objects' centres are farther apart in u or v
-    least: float = 8e-5  # m2 of surface whose votes meet within the blur make an object
-    reach: float = 12.0  # a vote that misses every centre by more belongs to none
+    apart: int = 5  # the centres of two objects are farther apart than this in u or v
+    least: float = 8e-5  # m2 of surface whose votes have to meet within the blur
+    reach: float = 12.0  # a vote that misses every centre by more belongs to no object
     margin: int = 40  # how far outside the image a centre may lie
 
 
@@ -53,12 +50,12 @@ def labelled_by_centres(
     offset: np.ndarray,
     settings: VoteSettings = VoteSettings(),
 ) -> HeightMap:
-    """The height map with a network's objects: their labels and their centres of mass.
+    """The height map with the network's objects: their labels and their centres of mass.
 
-    offset: (2, h, w) pixels to the centre of mass, at the network's scale; scaling leads there from
-    the frame's pixels. What has a label keeps one. The network says where in the image a centre
-    is; its height is that of the columns under the object's visible surface, an estimate that is
-    too low where the object rests on others.
+    offset: (2, h, w) pixels to the centre of mass, at the network's scale; `scaling` takes the
+    frame's pixels to it. Every labelled cell keeps a label. The votes give a centre's place in the
+    image; its height is the centroid of the columns under the object's visible surface, an estimate
+    that is too low where the object rests on others.
     """
     row, column = np.nonzero(heights.label >= 0)
     height = heights.height[row, column]
@@ -69,7 +66,7 @@ def labelled_by_centres(
     limits = offset.shape[2] - 1, offset.shape[1] - 1
     u, v = np.clip(np.rint(place).astype(int), 0, limits).T
     votes = place + offset[:, v, u].T
-    # A hidden cell's height is borrowed, and its pixel shows something else: it has no vote.
+    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
     seen = heights.ceiling[row, column] <= height
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
     if len(centres) == 0:
@@ -96,8 +93,8 @@ def vote_centres(
     cell: float,
     settings: VoteSettings = VoteSettings(),
 ) -> np.ndarray:
-    """(M, 2) places (u, v) in or near an image of `shape` where many of the votes (N, 2) meet, most
-    first; each vote stands for cell x cell metres of surface."""
+    """(M, 2) places (u, v) in or near an image of `shape` where many of the votes (N, 2) meet, in
+    falling order of their number; each vote stands for cell x cell metres of surface."""
     rows, columns = np.array(shape) + 2 * settings.margin
     place = np.rint(votes + settings.margin).astype(int)
     u, v = place[((place >= 0) & (place < (columns, rows))).all(axis=1)].T
@@ -110,11 +107,11 @@ def vote_centres(
     return np.array([votes[around].mean(axis=0) for around in near]).reshape(-1, 2)
 
 
-# Half the heuristic's angles: turning onto the faces and the network make up for it. What belongs
-# together is known better than by height alone.
+# Half the heuristic's angles: turning onto the faces and the network make up for it. The split
+# factor is strict because the votes separate objects better than height alone.
 SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0.1)
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
-LEAST = 0.02  # quality that anything has which fits
+LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
 
 @functools.cache
@@ -123,10 +120,12 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
     return saved._replace(model=for_inference(saved.model))
 
 
-class GraspNetPlanner:
-    """The network of a checkpoint, unless one is given. UserError if it cannot be loaded."""
+class GraspNetPlanner(SearchPlanner):
+    """Antipodal search ranked by a network, which sees nothing but the RGB-D image.
 
-    needs_truth = False
+    checkpoint: file of the network, unless `network` is given. Raises UserError if the file cannot
+    be loaded.
+    """
 
     def __init__(
         self,
@@ -137,12 +136,9 @@ class GraspNetPlanner:
         network: SavedGraspNet | None = None,
         settings: SearchSettings = SETTINGS,
     ):
+        super().__init__(gripper, workspace, seed, settings)
         changed = checkpoint.stat().st_mtime if checkpoint.exists() else 0.0
         self.network = network or _loaded(checkpoint, changed)
-        self.gripper, self.workspace, self.settings = gripper, workspace, settings
-
-    def reset(self, seed: int) -> None:
-        """Nothing to do: the planner is deterministic."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel, *_ = self.network
@@ -160,19 +156,17 @@ class GraspNetPlanner:
 
         if knows_centres:
             heights = labelled_by_centres(heights, frame, scaling, maps[3][0].numpy())
-        found = search(heights, self.gripper, self.workspace, self.settings, value)
-        found = found.distinct(
-            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
-        )
-        return found.grasps(self.gripper)
+        return self.grasps(self.search(heights, value))
 
 
 def quality_between(
     maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor], start: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
-    """(N,) what a network's maps say of closing along the lines from `start` to `end` (N, 2), in
-    the maps' pixels: the quality in their middle times the share of the best angle's that theirs
-    has. The cube root turns the bins' probabilities into qualities (`targets_from_labels`)."""
+    """(N,) quality of closing along the lines from `start` to `end` (N, 2), in the maps' pixels.
+
+    It is the quality at a line's middle, times the quality of the line's angle relative to the best
+    angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`).
+    """
     quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
     u, v = np.rint((start + end) / 2).astype(int).T
     u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)

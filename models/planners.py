@@ -1,11 +1,9 @@
-"""Planners: anything that turns an RGB-D frame into ranked grasps.
+"""Planners: callables `plan(frame) -> list[Grasp]` that turn an RGB-D frame into ranked grasps.
 
-A planner is a callable `plan(frame) -> list[Grasp]`, best first; an empty list means that there is
-nothing to grasp. `random` and `heuristic` see only the depth image, `graspnet` also the colours,
-`oracle` the true geometry.
-Heuristic and oracle share one search over a height map (`models.planner_antipodal`); the oracle judges the
-best ones by exact contacts (`models.planner_contacts`), also with the pose perturbed. This module
-knows no simulator.
+The list is sorted, best first; an empty list means that there is nothing to grasp. `PLANNERS`
+names the planners of this project: `random` and `heuristic` see only the depth image, `graspnet`
+also the colours, `oracle` the true geometry. A planner of your own is named by its import path, see
+`make_planner` and docs/planner.md. This module knows no simulator.
 """
 
 from __future__ import annotations
@@ -16,32 +14,40 @@ from typing import Protocol
 
 import numpy as np
 
-from models.planner_antipodal import SearchSettings, search
+from models.planner_antipodal import SearchPlanner, SearchSettings
 from models.planner_contacts import buried_share, exact_quality
 from models.planner_graspnet import GraspNetPlanner
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
+from utils.plugins import is_import_path, load_plugin
 from utils.transforms import Grasp, RGBDFrame
-
-HEURISTIC_SETTINGS = SearchSettings()
-ORACLE_SETTINGS = SearchSettings(shortlist=1500, finalists=500)
 
 
 class Planner(Protocol):
-    """needs_truth: whether the frame must carry `truth`."""
+    """Any callable that plans grasps. Two attributes are optional.
 
-    needs_truth: bool
-
-    def reset(self, seed: int) -> None: ...
+    needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
+    reset(seed): called before each scene, for planners that draw random numbers.
+    """
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]: ...
 
 
-class RandomPlanner:
-    """Uniform over the pixels that lie above the table, at a random angle, fully open."""
+def needs_truth(planner: Planner | type) -> bool:
+    """Whether the planner's frames have to carry the scene's true geometry."""
+    return bool(getattr(planner, "needs_truth", False))
 
-    needs_truth = False
+
+def reset_planner(planner: Planner, seed: int) -> None:
+    """Prepare the planner for a new scene: `planner.reset(seed)`, where it has that method."""
+    reset = getattr(planner, "reset", None)
+    if reset is not None:
+        reset(seed)
+
+
+class RandomPlanner:
+    """Grasps uniform over the pixels above the table, at random angles, with the hand wide open."""
 
     def __init__(self, gripper: GripperGeometry, workspace: Workspace, seed: int, count: int = 20):
         self.gripper, self.workspace, self.count = gripper, workspace, count
@@ -69,34 +75,18 @@ class RandomPlanner:
         return grasps
 
 
-class HeuristicPlanner:
-    """Antipodal search on the height map that the depth image gives; sees nothing else."""
-
-    needs_truth = False
-
-    def __init__(
-        self,
-        gripper: GripperGeometry,
-        workspace: Workspace,
-        seed: int = 0,
-        settings: SearchSettings = HEURISTIC_SETTINGS,
-    ):
-        self.gripper, self.workspace, self.settings = gripper, workspace, settings
-
-    def reset(self, seed: int) -> None:
-        """Nothing to do: the planner is deterministic."""
+class HeuristicPlanner(SearchPlanner):
+    """Antipodal search on the height map of the depth image, which is all that it sees."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        heights = height_map_from_frame(frame, self.workspace)
-        found = search(heights, self.gripper, self.workspace, self.settings)
-        found = found.distinct(
-            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
-        )
-        return found.grasps(self.gripper)
+        return self.grasps(self.search(height_map_from_frame(frame, self.workspace)))
 
 
-class OraclePlanner:
-    """The same search on the exact height map, then exact contacts under perturbed poses."""
+class OraclePlanner(SearchPlanner):
+    """The same search on the exact height map, then exact contacts under perturbed poses.
+
+    judged: number of candidates whose contacts are computed.
+    """
 
     needs_truth = True
 
@@ -105,39 +95,28 @@ class OraclePlanner:
         gripper: GripperGeometry,
         workspace: Workspace,
         seed: int = 0,
-        settings: SearchSettings = ORACLE_SETTINGS,
+        settings: SearchSettings = SearchSettings(shortlist=1500, finalists=500),
         judged: int = 120,
     ):
-        self.gripper, self.workspace, self.settings, self.judged = (
-            gripper,
-            workspace,
-            settings,
-            judged,
-        )
-
-    def reset(self, seed: int) -> None:
-        """Nothing to do: the planner is deterministic."""
+        super().__init__(gripper, workspace, seed, settings)
+        self.judged = judged
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
         heights = height_map_from_scene(frame.truth, self.workspace)
-        found = search(heights, self.gripper, self.workspace, self.settings)
-        found = found.distinct(self.judged, 0.004, np.deg2rad(8))
+        found = self.search(heights).distinct(self.judged, 0.004, np.deg2rad(8))
         if len(found) == 0:
             return []
         quality = exact_quality(found, frame.truth, self.gripper)
         buried = buried_share(frame.truth, heights)
-        # Antipodal ones first; if there is none, the best of the rest, by the map's measure.
+        # Antipodal grasps come first; where there is none, the height map's score ranks the rest.
         found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
-        found = found.best(len(found))
-        found = found.distinct(
-            self.settings.returned, self.settings.distinct_distance, self.settings.distinct_turn
-        )
-        return found.grasps(self.gripper)
+        return self.grasps(found.best(len(found)))
 
 
-PLANNERS: dict[str, Callable[..., Planner]] = {
+# A planner is made by a call with the gripper, the workspace and a seed.
+PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
     "random": RandomPlanner,
     "heuristic": HeuristicPlanner,
     "graspnet": GraspNetPlanner,
@@ -146,14 +125,20 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 
 
 def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
-    """The planner of that name, or the network in a checkpoint file (NAME.pt); `seed` starts its
-    own random generator.
+    """The planner that `name` stands for.
 
-    Raises UserError for a name that is neither, or a file that holds no network.
+    name: a key of `PLANNERS`; a GraspNet checkpoint FILE.pt; or an import path `module:name`, which
+    names either a function `plan(frame)` or a class, of which one object is made as
+    `Class(gripper, workspace, seed)`. seed: starts the planner's own random generator.
+
+    Raises UserError for any other name, and for a file or module that cannot be loaded.
     """
     if name in PLANNERS:
         return PLANNERS[name](gripper, workspace, seed)
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
-    others = ("a GraspNet checkpoint FILE.pt", "ppo", "ppo:FILE.pt")
+    if is_import_path(name):
+        loaded = load_plugin(name, "evaluate.policies")
+        return loaded(gripper, workspace, seed) if isinstance(loaded, type) else loaded
+    others = ("a GraspNet checkpoint FILE.pt", "module:name", "ppo", "ppo:FILE.pt")
     raise unknown_choice("evaluate.policies", name, [*PLANNERS, *others])

@@ -12,7 +12,7 @@ from models.graspnet_adaptation import DISTINCT
 from models.graspnet_io import SavedGraspNet
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
 from models.planner_graspnet import GraspNetPlanner
-from tests.test_graspnet_planner import METRES_PER_PIXEL, Opinion
+from tests.helpers.fixed_maps import FixedMaps
 from tests.test_real_data import CORNELL
 from tests.test_real_training import write_cornell
 from utils.depth import KinectNoise
@@ -32,6 +32,8 @@ from utils.table_plane import (
     table_misses,
 )
 from utils.transforms import Grasp, RGBDFrame, deproject, look_at, project
+
+METRES_PER_PIXEL = 0.0018
 
 # Cornell's camera looks down like this: 0.73 m over the table, 37 degrees from straight down.
 T_WC = look_at((0.0, -0.55, 0.73), (0.0, 0.0, 0.0))
@@ -271,7 +273,7 @@ def test_a_network_s_best_pixel_becomes_a_grasp_of_the_photograph():
     sample, frame = photographed()
     middle = 8 * round(0.30 / METRES_PER_PIXEL / 8) / 2 - 0.5
     # 27 pixels of 1.8 mm to the right of the middle; 0.8 m away, where the table is.
-    network = Opinion((middle + 27.5, middle - 0.5), radius=0.1)
+    network = FixedMaps((middle + 27.5, middle - 0.5), radius=0.1)
     grasp = photographs.network_grasp(
         SavedGraspNet(network, METRES_PER_PIXEL, {}, {}), frame_of(sample)
     )
@@ -293,7 +295,7 @@ def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monke
     sees 8 round(400 * 1.2 / 525 / 0.002 / 8) = 456."""
     label = GraspRectangle(np.array([320.0, 240.0]), 0.0, 40.0, 20.0)
     sample, _ = photographed(labels=(label,))
-    network = SavedGraspNet(Opinion((285, 227), radius=0.5), 0.002, {}, {})
+    network = SavedGraspNet(FixedMaps((285, 227), radius=0.5), 0.002, {}, {})
     monkeypatch.setattr(
         photographs, "make_planner", lambda *_: GraspNetPlanner(HAND, WORKSPACE, network=network)
     )

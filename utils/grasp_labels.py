@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_quality import LabelSettings, grasp_depth, judge, undersides
+from utils.grasp_quality import LabelSettings, grasp_depth, grasp_quality, undersides
 from utils.height_map import height_map_from_scene
 from utils.statistics import wilson_interval
 from utils.transforms import Grasp, ImageGrasp, RGBDFrame, image_to_grasp
@@ -104,7 +104,7 @@ def dense_labels(
         start, step, turn_of_bin = _world_turns(frame, u, v)
         surface = points[v, u]
         judged = [
-            judge(surface, start + k * step, heights, under, frame.truth, gripper, settings)
+            grasp_quality(surface, start + k * step, heights, under, frame.truth, gripper, settings)
             for k in range(ANGLE_BINS)
         ]
         each = np.arange(len(u))

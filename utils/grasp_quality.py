@@ -1,14 +1,18 @@
-"""Straight descents of the open hand onto a height map: what is in the way, what the pads meet.
+"""Grasp quality on an exact height map: how good is a grasp if the open hand comes straight down?
 
-The exact height map is turned so that the closing line runs along its rows: sliding maxima give
-what is in the way of fingers and palm, rows of heights give the contacts. What lies under an
+The height map is turned so that the closing line runs along its rows. Sliding maxima then give the
+obstacles under fingers and palm, rows of heights give the contacts of the pads. Space under an
 overhang counts as matter for the descent, and for the contacts down to the lowest point of the
-object. This module knows no camera, no simulator and no network.
+object. `grasp_quality` multiplies Gaussian factors of angles and lever arms into one number; dense
+labels (`utils.grasp_labels`) and the environment's goals are made of it. The antipodal search
+(`models.planner_antipodal`) shares `contact_levels`, `fit_faces` and the relaxed margins, but has
+a score of its own. This module knows no camera, no simulator and no network.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,12 +22,27 @@ from utils.height_map import HeightMap
 
 _REACH = 0.108  # m of map around every grasp: half the palm's length and a little
 _SMALLEST_HALF = 0.004  # m, half the smallest opening that is tried
-_TOUCH = 0.0025  # m, a line across the pad nearer than this to its face is in touch
+_NEAR_FACE = 0.008  # m, lines across the pad within this gap belong to the face that is fitted
+_TOUCH = 0.0025  # m, and those within this gap touch it
+
+
+class RelaxedMargins(NamedTuple):
+    """Margins for objects that no grasp with the usual margins fits: objects on slopes or between
+    others need less room and a wider wedge, objects as flat as a pencil less height."""
+
+    table_clearance: float = 0.002  # m, under the fingertips
+    clearance: float = 0.001  # m, over whatever lies under fingers and palm
+    room: float = 0.003  # m, beside each contact when the hand is open
+    min_engagement: float = 0.003  # m that the object must rise over the fingertips
+    max_wedge: float = np.deg2rad(38)  # half the angle between the two faces
+
+
+RELAXED = RelaxedMargins()
 
 
 @dataclass(frozen=True)
 class LabelSettings:
-    """What makes a label; metres and radians unless said.
+    """Margins and scales of grasp quality; metres and radians unless said.
 
     The defaults were chosen by executing labelled grasps on training scenes, which
     `python -m benchmarks.bench_labels` repeats: of quality `positive` and above, 95 % and more
@@ -49,9 +68,13 @@ class LabelSettings:
     off_centre_scale: float = 0.025
     positive: float = 0.6  # labels of at least this quality count as grasps that succeed
 
+    def relaxed(self) -> LabelSettings:
+        """The settings with `RELAXED` margins and wider Gaussians for wedge and tilt."""
+        return replace(self, **RELAXED._asdict(), wedge_scale=0.6, tilt_scale=1.0)
+
 
 def grasp_depth(surface_height, table_height: float, settings: LabelSettings = LabelSettings()):
-    """How far the fingertips' lowest point goes below a visible surface (...), metres.
+    """The depth of the fingertips' lowest point below a visible surface (...), metres.
 
     `settings.depth`, but never nearer to the table than `settings.table_clearance`. Heights are z
     in W; accepts arrays. Not positive where nothing stands on the table.
@@ -62,7 +85,7 @@ def grasp_depth(surface_height, table_height: float, settings: LabelSettings = L
 
 def undersides(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
     """(R, C) float32 lowest matter, z in W, of the object that is on top in each cell; the table's
-    height where there is none. Pads close on nothing below it."""
+    height where no object is. Pads meet nothing below it."""
     under = np.full(heights.height.shape, np.inf)
     for number, thing in enumerate(scene.objects):
         for solid in thing.solids:
@@ -142,13 +165,13 @@ class _TurnedMap:
 
 
 @dataclass(frozen=True)
-class Descents:
-    """N descents that were judged; lengths in metres.
+class GraspQuality:
+    """The quality of N grasps; lengths in metres.
 
-    quality: (N,) in [0, 1], 0 where one is infeasible. half: (N,) half the opening to come down
-    with, 0 where infeasible. widest: (N,) half the widest one that is free all the way from there.
-    middle, reach: (N,) the middle between the contacts along the closing line, from the point
-    asked about, and half their distance.
+    quality: (N,) in [0, 1], 0 for an infeasible grasp. half: (N,) half the opening of the hand
+    that comes down, 0 for an infeasible grasp. widest: (N,) half the widest opening for which all
+    openings from `half` on are free. middle, reach: (N,) the middle between the contacts along the
+    closing line, measured from the grasp's surface point, and half the distance between them.
     """
 
     quality: np.ndarray
@@ -158,7 +181,7 @@ class Descents:
     reach: np.ndarray
 
 
-def judge(
+def grasp_quality(
     surface: np.ndarray,
     angle: float,
     heights: HeightMap,
@@ -166,9 +189,11 @@ def judge(
     scene: SceneGeometry,
     gripper: GripperGeometry,
     settings: LabelSettings,
-) -> Descents:
-    """Grasps at surface points (N, 3) in W that close along the world angle `angle`, each by
-    itself. under: of `undersides`."""
+) -> GraspQuality:
+    """The quality of grasps at surface points (N, 3) in W that close along the world angle `angle`.
+
+    Each grasp counts by itself. under: the result of `undersides`.
+    """
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
     turned = _TurnedMap.around(surface[:, :2], heights, under, along, across)
@@ -179,7 +204,7 @@ def judge(
     palm = _palm_sill(turned, gripper)
     index = np.nonzero(palm[turned.row // 2, turned.column // 4] <= limit)[0]
     index, half, widest = _opening(turned, index, limit, gripper, settings)
-    found = Descents(*np.zeros((5, len(surface)), np.float32))
+    found = GraspQuality(*np.zeros((5, len(surface)), np.float32))
     if len(index) == 0:
         return found
     face = _faces(turned, index, tip[index], half, gripper)
@@ -198,7 +223,7 @@ def judge(
 
 
 def _palm_sill(turned: _TurnedMap, gripper: GripperGeometry) -> np.ndarray:
-    """(R / 2, C / 4) height in W over which the fingertips must stay for the palm to be clear."""
+    """(R / 2, C / 4) height in W above which the fingertips must stay so that the palm is clear."""
     rows, columns = (n - n % k for n, k in zip(turned.height.shape, (2, 4)))
     coarse = turned.height[:rows, :columns].reshape(rows // 2, 2, columns // 4, 4).max(axis=(1, 3))
     length = 2 * int(np.ceil(gripper.palm_half_length / (4 * turned.cell))) + 1
@@ -216,7 +241,7 @@ def _palm_sill(turned: _TurnedMap, gripper: GripperGeometry) -> np.ndarray:
 def _finger_sills(
     turned: _TurnedMap, gripper: GripperGeometry, settings: LabelSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(R, C) each: height in W over which the fingertips must stay if the left (right) pad's face
+    """(R, C) each: height in W above which the fingertips must stay if the left (right) pad's face
     comes down at that cell; includes `min_room` on the face's side."""
     half = gripper.finger_half_width + settings.side_margin
     outline = np.array(gripper.finger_outline)[:, 0]
@@ -240,8 +265,8 @@ def _opening(
     """The points of `index` (M,) where both fingers can come down, half the smallest opening, and
     half the widest one up to which all are free.
 
-    To the smallest is added what is missing to `room`, as far as the fingers are clear there and
-    the hand opens so far.
+    The smallest opening has `min_room` beside each finger. It grows towards `room` as far as the
+    fingers stay clear and the hand opens.
     """
     left, right = _finger_sills(turned, gripper, settings)
     last = round(gripper.max_opening / 2 / turned.cell)
@@ -267,7 +292,7 @@ def _opening(
 
 @dataclass(frozen=True)
 class _Faces:
-    """What the closing pads of M grasps meet; lengths in metres, angles in radians.
+    """The faces that the closing pads of M grasps meet; lengths in metres, angles in radians.
 
     touched: (M,) both pads meet matter of one object, `label`. left, right: (M,) the contacts along
     the closing line from the pixel. engagement: how far the matter between rises over the tips.
@@ -306,8 +331,8 @@ def _faces(
     met &= np.abs(steps * cell) < half[:, None, None]
     height = np.where(met, height, -np.inf)
     engagement = height.max(axis=(1, 2)) - tip
-    upper = tip + 0.5 * np.clip(engagement, 0.002, 0.016)
-    low, high = (_first_matter(height, z) for z in (tip + 0.001, upper))
+    lower, upper = contact_levels(tip, engagement)
+    low, high = (_first_matter(height, level) for level in (lower, upper))
     offset = (steps - np.float32(0.5)) * np.float32(cell)
     at_low, at_high = (
         (np.where(hit, offset[first], np.inf), np.where(hit, offset[last] + cell, -np.inf))
@@ -317,8 +342,8 @@ def _faces(
     touched = low[0].any(axis=1) & high[0].any(axis=1)
     left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
     gaps = at_low[0] - left[:, None], right[:, None] - at_low[1]
-    (slope_left, cover_left), (slope_right, cover_right) = (_fit_face(gap, v) for gap in gaps)
-    yaw_left, yaw_right = np.arctan(slope_left), np.arctan(slope_right)
+    turn, wedge, cover = fit_faces(*gaps, v)
+    cover = cover.astype(np.float32)  # as all that the labels store
     rise = upper - tip - 0.001
     back_left = np.maximum(at_high[0].min(axis=1) - left, 0)
     back_right = np.maximum(right - at_high[1].max(axis=1), 0)
@@ -332,8 +357,7 @@ def _faces(
     label = np.maximum(labels.max(axis=1), 0)
     touched &= ((labels == label[:, None]) | (labels == -2)).all(axis=1)
     return _Faces(
-        touched, label, left, right, engagement, np.abs(yaw_left + yaw_right) / 2,
-        (yaw_left - yaw_right) / 2, tilt, np.minimum(cover_left, cover_right),
+        touched, label, left, right, engagement, wedge, turn, tilt, cover,
     )  # fmt: skip
 
 
@@ -345,16 +369,38 @@ def _first_matter(height: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, ..
     return matter.any(axis=2), first, last
 
 
+def contact_levels(tip: np.ndarray, engagement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two heights (...) in W at which the contacts of the pads are looked for: just over the
+    fingertips `tip`, and up to 8 mm higher, within the `engagement` of the object."""
+    return tip + 0.001, tip + 0.5 * np.clip(engagement, 0.002, 0.016)
+
+
+def fit_faces(
+    left_gap: np.ndarray, right_gap: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How flat pads lie on the two faces that they meet: turn, wedge and cover, each (N,).
+
+    left_gap, right_gap: (N, L) metres between pad and matter on L lines across each pad, at the
+    places v (L,). turn: rotation of the hand, radians, that would bring both pads flat onto the
+    faces. wedge: half the angle between the faces in plan view. cover: smaller share of a pad's
+    lines in touch.
+    """
+    slope, cover = _fit_face(np.stack([left_gap, right_gap]), v)
+    left, right = np.arctan(slope)
+    return -(left - right) / 2, np.abs(left + right) / 2, cover.min(axis=0)
+
+
 def _fit_face(gap: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope (M,) of the gaps (M, L) between pad and face over the places v (L,) across the pad, by
-    least squares over those under 8 mm; and the share (M,) of lines in touch."""
-    weight = (gap < 0.008).astype(np.float32)
-    gap = np.where(gap < 0.008, gap, 0)
-    total = np.maximum(weight.sum(axis=1), 1)
-    spread = weight * (v - ((weight @ v) / total)[:, None])
-    variance = spread @ v
-    slope = (spread * gap).sum(axis=1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < _TOUCH)).mean(axis=1)
+    """Slope (...) of the gaps (..., L) over the places v (L,), by least squares over those under
+    `_NEAR_FACE`; and the share (...) of lines in touch."""
+    weight = (gap < _NEAR_FACE).astype(float)
+    gap = np.where(gap < _NEAR_FACE, gap, 0.0)
+    total = np.maximum(weight.sum(axis=-1), 1)
+    mean_v = (weight * v).sum(axis=-1) / total
+    spread = weight * (v - mean_v[..., None])
+    variance = (spread * v).sum(axis=-1)
+    slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
+    return slope, (weight * (gap < _TOUCH)).mean(axis=-1)
 
 
 def _quality(
@@ -368,7 +414,7 @@ def _quality(
     settings: LabelSettings,
 ) -> np.ndarray:
     """(M,) in [0, 1]: 0 unless both pads press on one object inside its friction cone (Nguyen 1988,
-    two soft contacts; the fingers' own friction is 1), else a product of how well each thing is.
+    two soft contacts; the fingers' own friction is 1), else the product of all factors.
 
     mass_*: (M,) the held object's centre of mass, seen from between the fingertips' lowest points.
     """

@@ -1,0 +1,227 @@
+"""GraspNet's planner with networks whose maps are known, and the votes of a centre head, on boxes
+whose exact grasps and centres of mass are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from models.graspnet_io import SavedGraspNet
+from models.planner_graspnet import (
+    GraspNetPlanner,
+    labelled_by_centres,
+    quality_between,
+    vote_centres,
+)
+from tests.helpers.box_frames import boxes_frame
+from tests.helpers.fixed_maps import FixedMaps
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import height_map_from_frame
+from utils.images import PixelScaling
+from utils.transforms import RGBDFrame, angle_difference, project
+
+CELL = 0.002  # m
+SAME = PixelScaling(1.0, 1.0)
+# Two boxes of one height, side by side without a gap: one piece to a depth image.
+TOUCHING = [((0.04, 0.03, 0.05), 0.0, (0.50, 0.015)), ((0.04, 0.03, 0.05), 0.0, (0.50, -0.015))]
+BOXES = [((0.04, 0.10, 0.05), np.deg2rad(25), (0.45, y)) for y in (-0.1, 0.1)]
+
+
+def plan(frame: RGBDFrame, network: torch.nn.Module):
+    # As many metres to a pixel as the frame has, so that no image is scaled.
+    scale = float(np.median(frame.depth)) / frame.K[0, 0]
+    saved = SavedGraspNet(network, scale, {}, {})
+    return GraspNetPlanner(GripperGeometry(), Workspace(), network=saved)(frame)
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_the_network_chooses_between_boxes_that_fit_alike(chosen: int) -> None:
+    frame = boxes_frame(BOXES)
+    middle = np.array([*BOXES[chosen][2], 0.05])
+    pixel, _ = project(middle, frame.K, frame.T_WC)
+    best = plan(frame, FixedMaps(pixel))[0]
+    assert np.linalg.norm(best.position[:2] - middle[:2]) < 0.004
+    assert np.rad2deg(angle_difference(best.angle, np.deg2rad(25))) < 6
+    assert 0.04 < best.width <= 0.08
+
+
+def test_a_network_that_sees_no_grasp_leaves_the_choice_to_the_geometry() -> None:
+    found = plan(boxes_frame(BOXES), FixedMaps(elsewhere=0.0, best=0.0))
+    assert len(found) >= 2
+    assert {round(abs(grasp.position[1]), 1) for grasp in found} == {0.1}
+
+
+def test_quality_is_a_factor_on_the_measured_score() -> None:
+    frame = boxes_frame(BOXES[:1])
+    (full, half) = (plan(frame, FixedMaps(elsewhere=q, best=q)) for q in (0.8, 0.4))
+    assert [g.quality for g in full] == pytest.approx([2 * g.quality for g in half])
+
+
+def test_an_image_at_twice_the_resolution_gives_the_same_grasp() -> None:
+    frame = boxes_frame(BOXES[:1])
+    zoom = np.diag([2.0, 2.0, 1.0])
+    zoom[:2, 2] = 0.5
+    large = RGBDFrame(
+        frame.rgb.repeat(2, 0).repeat(2, 1),
+        frame.depth.repeat(2, 0).repeat(2, 1),
+        zoom @ frame.K,
+        frame.T_WC,
+    )
+    scale = float(np.median(frame.depth)) / frame.K[0, 0]
+    middle, _ = project(np.array([0.45, -0.1, 0.05]), frame.K, frame.T_WC)
+    planner = GraspNetPlanner(
+        GripperGeometry(), Workspace(), network=SavedGraspNet(FixedMaps(middle), scale, {}, {})
+    )
+    small_best, large_best = planner(frame)[0], planner(large)[0]
+    np.testing.assert_allclose(small_best.position, large_best.position, atol=0.004)
+    assert small_best.quality == pytest.approx(large_best.quality, abs=0.1)
+
+
+def test_quality_between_two_pixels_is_that_of_their_angle() -> None:
+    """Bins 4 (40 degrees) and 5 hold 8/9 and 1/9: qualities in the ratio of 2 to 1."""
+    probability = torch.full((18,), 1e-12)
+    probability[4], probability[5] = 8 / 9, 1 / 9
+    angle = probability.log()[None, :, None, None].expand(1, 18, 40, 60)
+    maps = (torch.full((1, 1, 40, 60), 0.6), angle, torch.zeros(1, 1, 40, 60))
+    for degrees, expected in ((40, 0.6), (220, 0.6), (50, 0.3), (45, 0.45), (100, 0.0)):
+        step = 5 * np.array([[np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))]])
+        middle = np.array([[30.0, 20.0]])
+        found = quality_between(maps, middle - step, middle + step)
+        assert found == pytest.approx([expected], abs=1e-3)
+
+
+class FixedCentres(FixedMaps):
+    """A network with one quality everywhere, and a centre head that returns `offset` (2, H, W)."""
+
+    def __init__(self, offset: np.ndarray):
+        super().__init__(best=0.9, elsewhere=0.9)
+        self.offset, self.centre_head = torch.from_numpy(offset)[None], True
+
+    def forward(self, image, centres=False):
+        maps = super().forward(image)
+        return (*maps, self.offset) if centres else maps
+
+
+def test_two_objects_that_touch_are_not_grasped_as_one() -> None:
+    """Blocks side by side, a piece of 4 cm x 6 cm by height alone: the best grasp of it is in the
+    middle, half on one and half on the other."""
+    frame = boxes_frame(TOUCHING)
+    as_one = plan(frame, FixedMaps(best=0.9, elsewhere=0.9))[0]
+    found = plan(frame, FixedCentres(true_offset(frame)))
+    assert abs(as_one.position[1]) < 0.004, "otherwise this test shows nothing"
+    assert abs(abs(found[0].position[1]) - 0.015) < 0.004
+    for grasp in (g for g in found if g.quality > 0.3 * found[0].quality):
+        assert np.rad2deg(angle_difference(grasp.angle, 0.0)) < 20, "along the line of contact"
+
+
+# --- Votes for centres of mass -----------------------------------------------------------
+
+
+def true_offset(frame: RGBDFrame) -> np.ndarray:
+    """(2, H, W) of a perfect centre head: a pixel belongs to the box on its side of y = 0."""
+    centres = np.array([item.centre_of_mass for item in frame.truth.objects])
+    centres, _ = project(centres, frame.K, frame.T_WC)
+    v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
+    side = (frame.points()[..., 1] < 0).astype(int)
+    return np.moveaxis(centres[side], -1, 0) - np.stack([u, v])
+
+
+def centres_by_place(heights, frame: RGBDFrame) -> np.ndarray:
+    """(M, 3) the centre that the height map gives to what lies at each true centre."""
+    true = np.array([item.centre_of_mass for item in frame.truth.objects])
+    return heights.centres[heights.label[heights.index(true[:, :2])]]
+
+
+def test_boxes_that_touch_are_told_apart() -> None:
+    frame = boxes_frame(TOUCHING)
+    heights = height_map_from_frame(frame, Workspace())
+    assert heights.label.max() == 0, "one piece by height alone"
+    found = labelled_by_centres(heights, frame, SAME, true_offset(frame))
+    for item, centre in zip(frame.truth.objects, centres_by_place(found, frame)):
+        np.testing.assert_allclose(centre, item.centre_of_mass, atol=0.002)
+    assert set(np.unique(found.label)) == {-1, 0, 1}
+    assert ((found.label >= 0) == (heights.label >= 0)).all()
+    assert found.height is heights.height and found.ceiling is heights.ceiling
+
+
+def test_votes_at_another_resolution_lead_to_the_same_centres() -> None:
+    frame = boxes_frame(TOUCHING)
+    heights = height_map_from_frame(frame, Workspace())
+    once = labelled_by_centres(heights, frame, SAME, true_offset(frame))
+    # A network at twice the scale sees every pixel twice and says twice the offset.
+    v, u = np.mgrid[:448, :448]
+    scaling = PixelScaling(2.0, 2.0)
+    at = true_offset(frame) + np.stack(np.mgrid[:224, :224][::-1])
+    doubled = scaling.pixels(np.moveaxis(at, 0, -1)).repeat(2, 0).repeat(2, 1)
+    offset = np.moveaxis(doubled, -1, 0) - np.stack([u, v])
+    twice = labelled_by_centres(heights, frame, scaling, offset)
+    np.testing.assert_allclose(*(centres_by_place(x, frame) for x in (once, twice)), atol=0.002)
+
+
+def test_a_piece_without_common_votes_keeps_the_height_maps_label() -> None:
+    """Two boxes apart; of the second one all votes lead far away and to different places."""
+    apart = [TOUCHING[0], ((0.03, 0.03, 0.04), 0.3, (0.42, -0.08))]
+    frame = boxes_frame(apart)
+    heights = height_map_from_frame(frame, Workspace())
+    offset = true_offset(frame)
+    lost = frame.points()[..., 1] < -0.03
+    offset[:, lost] = np.random.default_rng(0).uniform(-400, 400, (2, lost.sum()))
+    found = labelled_by_centres(heights, frame, SAME, offset)
+    np.testing.assert_allclose(
+        centres_by_place(found, frame)[1], centres_by_place(heights, frame)[1], atol=1e-9
+    )
+    assert len(set(found.label[found.index(np.array([box[2] for box in apart]))])) == 2
+
+
+def test_walls_around_wide_holes_belong_to_no_object() -> None:
+    frame = boxes_frame(TOUCHING)
+    depth = frame.depth.copy()
+    depth[100:170, 130:200] = 0
+    frame = replace(frame, depth=depth)
+    heights = height_map_from_frame(frame, Workspace())
+    wall = heights.height > 0.09
+    assert wall.sum() > 1000
+    found = labelled_by_centres(heights, frame, SAME, true_offset(frame))
+    assert (found.label[wall] == -1).all()
+    for item, centre in zip(frame.truth.objects, centres_by_place(found, frame)):
+        assert centre[2] == pytest.approx(item.centre_of_mass[2], abs=0.003)
+
+
+def test_centres_are_where_enough_votes_meet() -> None:
+    rng = np.random.default_rng(0)
+    meant = np.array([[30.0, 20.0], [60.0, 44.0]])
+    votes = np.concatenate(
+        [centre + rng.normal(0, 1.0, (n, 2)) for centre, n in zip(meant, (300, 200))]
+    )
+    astray = rng.uniform(0, 80, (30, 2))
+    found = vote_centres(np.concatenate([votes, astray]), (80, 100), CELL)
+    np.testing.assert_allclose(found, meant, atol=0.5)
+
+
+def test_centres_may_lie_outside_the_image() -> None:
+    votes = np.random.default_rng(0).normal((-7.0, 90.0), 0.8, (100, 2))
+    found = vote_centres(votes, (80, 100), CELL)
+    np.testing.assert_allclose(found, [[-7.0, 90.0]], atol=0.3)
+
+
+@pytest.mark.parametrize("apart, count", [(1, 1), (3, 1), (5, 1), (9, 2)])
+def test_equal_peaks_closer_than_apart_are_one(apart: int, count: int) -> None:
+    votes = np.repeat([[40.0, 40.0], [40.0 + apart, 40.0]], 100, axis=0)
+    assert len(vote_centres(votes, (80, 100), CELL)) == count
+
+
+def test_how_much_surface_makes_an_object_does_not_depend_on_the_cell() -> None:
+    """1 cm2 does and 0.6 cm2 does not, in cells of 1 mm as of 2 mm."""
+    for cell in (0.001, 0.002):
+        for area, expected in ((1e-4, 1), (0.6e-4, 0)):
+            votes = np.full((round(area / cell**2), 2), 33.0)
+            assert len(vote_centres(votes, (80, 100), cell)) == expected
+
+
+@pytest.mark.parametrize("boxes", [[], TOUCHING])
+def test_scattered_votes_leave_the_map_as_it_is(boxes) -> None:
+    frame = boxes_frame(boxes)
+    heights = height_map_from_frame(frame, Workspace())
+    scattered = np.random.default_rng(0).uniform(-100, 100, (2, 224, 224))
+    assert labelled_by_centres(heights, frame, SAME, scattered) is heights
