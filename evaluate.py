@@ -47,7 +47,7 @@ from utils.config import (
 )
 from utils.errors import UserError
 from utils.executor import Outcome, Played, play_scenes, worker_count
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import Workspace
 from utils.report import balanced, picture, write_failures, write_report
 from utils.result_records import OPEN_LOOP, contestant
 from utils.results import (
@@ -131,7 +131,7 @@ def check_policies(config: Config) -> None:
             controllers = [controller for _, controller in contestants(config)]
             check_learned(name, config.evaluate.scenarios, controllers)
         else:
-            make_planner(name, GripperGeometry(), workspace_of(config), config.seed)
+            make_planner(name, config.gripper.geometry, workspace_of(config), config.seed)
 
 
 def check_cell(config: Config) -> None:
@@ -151,7 +151,10 @@ def check_objects(config: Config) -> None:
 
 @functools.cache
 def load_objects(name: str, config: Config) -> ObjectSet:
-    return load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
+    return load_object_set(
+        name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder,
+        **config.objects.model_dump(),
+    )  # fmt: skip
 
 
 def workspace_of(config: Config) -> Workspace:
@@ -192,7 +195,7 @@ def _set_up(config: Config) -> None:
 def work(task: Task) -> Played:
     """Let each policy of a task work on its scene. Runs in a worker process."""
     objects, layout = load_objects(task.objects, _config), SCENARIOS[task.scenario].layout
-    scene = make_scene(layout, objects, task.seed, _config, _cell.client)
+    scene = make_scene(layout, objects, task.seed, _config)
     played = Played()
     for planner_name, controller in task.policies:
         policy, approach = contestant(planner_name, controller), None
@@ -200,7 +203,7 @@ def work(task: Task) -> Played:
             approach, planner = approach_by(planner_name, _cell), nowhere_yet
         else:
             workspace = workspace_of(_config)
-            planner = make_planner(planner_name, GripperGeometry(), workspace, task.seed)
+            planner = make_planner(planner_name, _cell.gripper, workspace, task.seed)
         privileged = needs_truth(planner)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:

@@ -41,8 +41,8 @@ from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from envs.camera import camera_intrinsics
 from envs.data_generation import generate
-from envs.pybullet_cell import camera_intrinsics
 from models.graspnet import GraspNet, create_model
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, simulated_data

@@ -21,11 +21,12 @@ import pybullet_data
 from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from envs.cell_layout import add_table, set_up_physics
+from envs.camera import Intrinsics
 from envs.cell_scenes import Scene, make_scene
 from envs.grasping_env import RobotGraspingEnv
-from envs.objects import load_object_set, spawn
-from envs.pybullet_camera import Intrinsics, render
+from envs.objects import load_object_set
+from envs.pybullet_bodies import add_table, set_up_physics, spawn
+from envs.pybullet_camera import PybulletCamera
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config, load_config, run_script, with_settings
 
@@ -174,7 +175,7 @@ def bench_frames(config: Config, scenes: Sequence[Scene], repeats: int) -> list[
             )
 
         def our_frame() -> None:
-            render(ours, camera, T_WC, pybullet.ER_TINY_RENDERER)
+            PybulletCamera(ours, pybullet.ER_TINY_RENDERER).render(camera, T_WC)
 
         return median_ratio(lambda: seconds(stock_frame, 3), lambda: seconds(our_frame, 3), repeats)
 

@@ -16,9 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.board import Board
-from envs.board_servo import BoardCamera, CarriedBoard, servo_settings, servo_to_goal, view_of
+from envs.board_servo import BoardCamera, servo_settings, servo_to_goal, view_of
+from envs.camera import wrist_mount
 from envs.cell_scenes import Scene
-from envs.pybullet_cell import PybulletCell, wrist_mount
+from envs.pybullet_bodies import CarriedBoard, add_board
+from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM
 from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
 from utils.config import load_config
@@ -127,14 +129,14 @@ def make_task(cell: PybulletCell, mounting: str, seed: int, straight: bool = Fal
         T_GC = pose([0, 0, -0.08] + around(0.02, 0.02, 0.02), around(5, 5, 20))
         T_WE = T_WO @ inverse_pose(T_GO) @ T_GC @ inverse_pose(wrist_mount(cell.config.camera))
         cell.robot.place(inverse_kinematics(T_WE, cell.home))
-        return Task(cell, mounting, board, board.add(cell.client, T_WO), None, T_GO)
+        return Task(cell, mounting, board, add_board(cell.client, board, T_WO), None, T_GO)
     # The board lies beyond the fingers, face up, where the arm does not hide it from above.
     T_EO = pose([0.14, 0, 0] + around(0.01, 0.01, 0.01), around(3, 3, 3), np.diag([1.0, -1, -1]))
     T_EO[:3, :3] = T_EO[:3, :3] @ _TURNED_RIGHT
     start = pose([0.36, 0, 0.2] + around(0.02, 0.03, 0.03), around(4, 4, 10))
     start[:3, :3] = top_down_pose([0, 0, 0], -np.pi / 2)[:3, :3] @ start[:3, :3]
     cell.robot.place(inverse_kinematics(start, cell.home))
-    carried = CarriedBoard(cell, board, T_EO)
+    carried = cell.attach_board(board, T_EO)
     T_WO = pose([0.5, 0, 0.26] + around(0.015, 0.015, 0.02), around(6, 6, 12), _TURNED_RIGHT)
     if straight:
         T_WO = pose([0.5, 0, 0.26], [0, 0, 0], _TURNED_RIGHT)

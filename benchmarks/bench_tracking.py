@@ -70,7 +70,7 @@ def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[f
     chosen = load_object_set(objects, cache_dir=config.cache_folder, **config.objects.model_dump())
     errors = {height: Errors() for height in HEIGHTS}
     for seed in range(config.seed * 100_000, config.seed * 100_000 + scenes):
-        cell.load(make_scene("isolated", chosen, seed, config, cell.client))
+        cell.load(make_scene("isolated", chosen, seed, config))
         frame = cell.frame()
         plan = make_planner("heuristic", GripperGeometry(), workspace, seed)
         grasps = plan(frame)

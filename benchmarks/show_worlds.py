@@ -14,11 +14,11 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
+from envs.camera import Intrinsics
 from envs.cell import Cell
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_camera import Intrinsics
 from envs.pybullet_cell import PybulletCell
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
 from utils.config import parse_args, run_script

@@ -20,10 +20,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import pybullet
 
 from utils.errors import TargetLostError
-from utils.transforms import position_quaternion
 
 MARKERS = 4
 _DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
@@ -36,7 +34,7 @@ _BLACK_HEIGHT = 1e-4  # m by which the black stands out of the white, so that it
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners' columns and rows, clockwise
 _OUTERMOST = _MARGIN + (_CELLS - 2 * _MARGIN) * _SQUARE  # corners of the markers
 WHITE, BLACK = (0.95, 0.95, 0.95, 1.0), (0.03, 0.03, 0.03, 1.0)
-_MASS = 0.05  # kg, of a board that is carried
+CARRIED_MASS = 0.05  # kg, of a board that is carried
 _ALIGNED = 0.9  # least correlation of the board's image with its pattern; a free view has 0.98
 
 
@@ -71,37 +69,6 @@ class Board:
         x, y = (columns_rows - _CELLS / 2).T * [[self.cell], [-self.cell]]
         c, s = np.cos(_SLANT), np.sin(_SLANT)
         return np.stack([c * x - s * y, s * x + c * y, np.zeros(len(x))], axis=1)
-
-    def add(self, client: int, T_WO: np.ndarray, carried: bool = False) -> int:
-        """Put the board into a client's world at T_WO (4, 4); its body number.
-
-        It stays where it is unless it is `carried`, which gives it a mass.
-        """
-        half, below = self.white()
-        vertices, triangles = self.black()
-        position, quaternion = position_quaternion(T_WO)
-        white = pybullet.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=half, visualFramePosition=below, rgbaColor=WHITE,
-            specularColor=[0, 0, 0], physicsClientId=client,
-        )  # fmt: skip
-        # Geometry and not a texture: its edges are where they are said to be to the last digit.
-        black = pybullet.createVisualShape(
-            pybullet.GEOM_MESH, vertices=vertices, indices=triangles,
-            normals=[[0, 0, 1]] * len(vertices), rgbaColor=BLACK, specularColor=[0, 0, 0],
-            physicsClientId=client,
-        )  # fmt: skip
-        solid = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=half, collisionFramePosition=below,
-            physicsClientId=client,
-        )  # fmt: skip
-        return pybullet.createMultiBody(
-            _MASS if carried else 0.0, solid, white, position, quaternion,
-            linkMasses=[0.0], linkCollisionShapeIndices=[-1], linkVisualShapeIndices=[black],
-            linkPositions=[[0, 0, 0]], linkOrientations=[[0, 0, 0, 1]],
-            linkInertialFramePositions=[[0, 0, 0]], linkInertialFrameOrientations=[[0, 0, 0, 1]],
-            linkParentIndices=[0], linkJointTypes=[pybullet.JOINT_FIXED],
-            linkJointAxis=[[0, 0, 1]], physicsClientId=client,
-        )  # fmt: skip
 
     def find(self, rgb: np.ndarray) -> np.ndarray:
         """(4, 2) pixels (u, v) of `points` in a colour image (H, W, 3) uint8.

@@ -13,13 +13,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 
 from envs.board import Board
-from envs.cell import Cell, wrist_mount
-from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import PybulletCell
-from envs.pybullet_panda import ARM
+from envs.camera import Intrinsics, wrist_mount
+from envs.cell import Cell
+from envs.pybullet_bodies import CarriedBoard
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.robot_safety import ArmStoppedError, SafetyGate
 from utils.config import SafetyConfig, ServoConfig
@@ -27,7 +25,7 @@ from utils.errors import ServoError, unknown_choice
 from utils.servo_control import joint_limit_avoidance
 from utils.servo_features import MOUNTINGS, ServoCamera
 from utils.servo_loop import ServoCommand, ServoHistory, ServoView, VisualServo
-from utils.transforms import inverse_pose, pose_matrix, position_quaternion, transform_points
+from utils.transforms import transform_points
 
 _MOUNTS = dict(zip(MOUNTINGS, ("wrist", "overhead")))
 _DAMPING = 0.01  # of the arm's Jacobian (m and rad), which matters near singular postures only
@@ -100,33 +98,6 @@ class BoardCamera:
         T_CO = self.board.pose(pixels, self.intrinsics.K)
         depths = transform_points(T_CO, self.board.points)[:, 2]
         return Sight(ServoView(pixels, depths, T_CO), self.cell.seconds)
-
-
-class CarriedBoard:
-    """A board screwed to the hand at T_EO (4, 4): a body with mass that its constraint holds."""
-
-    def __init__(self, cell: PybulletCell, board: Board, T_EO: np.ndarray):
-        client, robot = cell.client, cell.robot
-        self.client = client
-        T_WO = forward_kinematics(robot.q) @ T_EO
-        self.body = board.add(client, T_WO, carried=True)
-        # PyBullet tells a constraint's frame in the link's frame of inertia.
-        hand = pybullet.getLinkState(robot.body, ARM[-1], physicsClientId=client)
-        position, quaternion = position_quaternion(inverse_pose(pose_matrix(*hand[:2])) @ T_WO)
-        pybullet.createConstraint(
-            robot.body, ARM[-1], self.body, -1, pybullet.JOINT_FIXED, [0, 0, 0],
-            position, [0, 0, 0], quaternion, [0, 0, 0, 1], physicsClientId=client,
-        )  # fmt: skip
-        for link in range(-1, pybullet.getNumJoints(robot.body, physicsClientId=client)):
-            pybullet.setCollisionFilterPair(
-                robot.body, self.body, link, -1, 0, physicsClientId=client
-            )
-        self.corners_E = transform_points(T_EO, board.outline)
-
-    def contact_force(self) -> float:
-        """Sum of the normal forces on the board in newtons."""
-        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
-        return sum(contact[9] for contact in contacts)
 
 
 class ServoArm:

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.board import Board
-from envs.cell import Cell, wrist_mount
-from envs.pybullet_camera import Intrinsics
+from envs.camera import Intrinsics, wrist_mount
+from envs.cell import Cell
 from envs.robot_kinematics import forward_kinematics
 from utils.table_plane import table_plane
 from utils.transforms import RGBDFrame, inverse_pose

@@ -1,7 +1,7 @@
-"""What is the same in every world's cell: cameras, frames, truth, which objects are in the game.
+"""The abstract robot cell: robot, camera, objects and their truth, whatever simulates them.
 
-`envs.pybullet_cell` builds the cell in PyBullet, `envs.mujoco_cell` in MuJoCo. Execution, closed loops,
-disturbances, rounds and planners know a cell only as far as it is described here.
+`envs.pybullet_cell` and `envs.mujoco_cell` implement it. Execution, closed loops, scenarios, rounds
+and planners know a cell only as far as it is described here.
 """
 
 from __future__ import annotations
@@ -14,41 +14,47 @@ from typing import Any
 import numpy as np
 
 from envs.board import Board
+from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics, camera_intrinsics, wrist_mount
 from envs.cell_layout import on_table
-from envs.cell_scenes import Scene
-from envs.pybullet_camera import Image, Intrinsics
+from envs.cell_scenes import EMPTY, Scene
+from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.robot_safety import ArmGate
-from utils.config import CameraConfig, Config
+from utils.config import Config
 from utils.depth import make_depth_noise
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
+from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at
 
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
-# An object farther than this share of the workspace's side from its centre is out of the game.
+# An object farther than this share of the workspace's side from its centre is out of the round.
 _REACH = 0.63
 # Keeps the depth noise of a seed apart from the scene of the same seed.
 _DEPTH_NOISE_STREAM = 1
 
 
 class PhysicsError(RuntimeError):
-    """The simulation left the realm of finite numbers."""
+    """The simulation has diverged: a position is not finite."""
 
 
 class Cell(ABC):
-    """A simulated robot cell, whatever simulates it. Close it, or use it in a `with` block.
+    """A simulated robot cell. Close it, or use it in a `with` block.
 
-    dt: s, a physics step. home: (7,) rad. client: PyBullet's number, None in another world. robot:
-    has the interface of `envs.pybullet_panda.Panda`. bodies: the simulator's numbers of the objects.
-    remaining: numbers of the objects still in the game. steps, frames: taken since the scene was
-    built. on_step is called after every physics step with the cell (used to film), before_step
-    before it (used to disturb the objects). sample: what was drawn for this scene alone
-    (`utils.domain_randomization`), None for a nominal cell. on_action: what becomes of each action
-    of a policy that moves the hand in turns; None: it is carried out as it is.
+    dt: s, a physics step. home: (7,) rad. gripper: the robot's hand. robot, camera: see
+    `envs.robot.Robot` and `envs.camera.Camera`. bodies: the simulator's numbers of the objects.
+    remaining: numbers of the objects still in the round. steps, frames: taken since the scene was
+    built. Callbacks, each called with the cell: on_build when a scene has been built and nothing
+    has moved yet, before_step before every physics step (to disturb the objects), on_step after it
+    (to film). view: changes what cameras see; None changes nothing. sample: the randomisation drawn
+    for this scene alone (`utils.domain_randomization`), None for a nominal cell. on_action: changes
+    each action of a policy that moves the hand step by step; None leaves it as it is.
     """
 
-    client: int | None = None
+    client: int | None = None  # PyBullet's number of the cell's simulation
+    robot: Robot
+    camera: Camera
+    bodies: list[int]
 
     def __init__(self, config: Config):
         self.config = config
@@ -67,42 +73,104 @@ class Cell(ABC):
                 "come back there; widen the box"
             )
         config.make_cache_folder()
+        self.gripper = config.gripper.geometry
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
-        self.on_step: Callable[[Cell], None] | None = None
-        self.before_step: Callable[[Cell], None] | None = None
+        self.on_build: Callable[[Any], None] | None = None
+        self.before_step: Callable[[Any], None] | None = None
+        self.on_step: Callable[[Any], None] | None = None
+        self.view: RandomView | None = None
         self.sample: dict[str, Any] | None = None
         self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
+
+    # --- Scene --------------------------------------------------------------------------------
+
+    def load(self, scene: Scene) -> None:
+        """Build the scene and let its objects come to rest."""
+        self.build(scene)
+        self._settle()
+
+    def build(self, scene: Scene) -> None:
+        """Rebuild the cell from nothing and put the scene's objects at their poses.
+
+        Rebuilding makes a round independent of the ones before it.
+        """
+        self._rebuild(scene)
+
+    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
+        """Rebuild the cell without objects, with a board that stays at T_WO (4, 4)."""
+        self._rebuild(EMPTY, board, T_WO)
+
+    def _rebuild(
+        self, scene: Scene, board: Board | None = None, T_WO: np.ndarray | None = None
+    ) -> None:
+        self.scene = scene
+        self._build(scene, board, T_WO)
+        self.remaining = set(range(len(self.bodies)))
+        self.steps = self.frames = 0
+        if self.on_build is not None:
+            self.on_build(self)
+
+    @abstractmethod
+    def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
+        """Make table, bin, robot (at home, wide open), objects and perhaps a board at T_WO (4, 4);
+        sets `robot` and `bodies`."""
+
+    @abstractmethod
+    def _settle(self) -> None:
+        """Simulate until the objects rest, for at most scene.settle_seconds; counts no steps."""
 
     def _new_gate(self) -> ArmGate:
         config = self.config
         return ArmGate(config.safety, config.robot, self.dt, config.closed_loop.floor)
 
     @abstractmethod
-    def load(self, scene: Scene) -> None:
-        """Build the scene and let its objects come to rest."""
+    def close(self) -> None:
+        """Free what the simulator holds; may be called again."""
 
-    @abstractmethod
-    def build(self, scene: Scene) -> None:
-        """Rebuild the world from nothing and put the scene's objects at their poses."""
+    # --- Physics ------------------------------------------------------------------------------
 
-    @abstractmethod
-    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
-        """Rebuild the world with nothing in it but what every scene has and a board that stays at
-        T_WO (4, 4)."""
+    @property
+    def seconds(self) -> float:
+        """Simulated seconds since the scene was loaded."""
+        return self.steps * self.dt
 
-    @abstractmethod
     def step(self, count: int = 1) -> None:
         """Advance the physics by `count` steps of 1 / sim.frequency seconds."""
+        if self.on_step is None and self.before_step is None:
+            self._advance(count)
+            self.steps += count
+            return
+        for _ in range(count):
+            if self.before_step is not None:
+                self.before_step(self)
+            self._advance(1)
+            self.steps += 1
+            if self.on_step is not None:
+                self.on_step(self)
 
-    def calm(self) -> bool:
-        """Spare the simulator until the robot touches something, if it knows how; whether it does.
-        `wake` has to be called at the first touch."""
+    @abstractmethod
+    def _advance(self, count: int) -> None:
+        """Simulate `count` physics steps."""
+
+    def enable_sleeping(self) -> bool:
+        """Let objects at rest sleep, which saves the solver's time until the robot touches
+        something; returns whether they do. `disable_sleeping` has to be called at the first touch.
+        """
         return False
 
-    def wake(self) -> None:  # noqa: B027 - there is nothing to undo where nothing was spared
-        """Undo `calm`."""
+    def disable_sleeping(self) -> None:  # noqa: B027 - a simulator without sleep has nothing to undo
+        """Undo `enable_sleeping`."""
+
+    def check_physics(self) -> None:
+        """Raise PhysicsError if a position of the robot or of an object is not finite."""
+        if not np.isfinite(self.robot.q).all():
+            raise PhysicsError("the robot's joint positions are not finite")
+        for index in self.remaining:
+            self.object_position(index)
+
+    # --- Objects ------------------------------------------------------------------------------
 
     @abstractmethod
     def object_pose(self, index: int) -> np.ndarray:
@@ -118,8 +186,8 @@ class Cell(ABC):
 
     @abstractmethod
     def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
-        """Put an object's body frame at T_WO (4, 4), on its way at `velocity` (3,) m/s and turning
-        at `turn_rate` rad/s about +z of W; physics has it from there."""
+        """Put an object's body frame at T_WO (4, 4), moving at `velocity` (3,) m/s and turning at
+        `turn_rate` rad/s about +z of W."""
 
     @abstractmethod
     def touches_table(self, index: int) -> bool:
@@ -137,33 +205,14 @@ class Cell(ABC):
             and not self.touches_table(index)
         )
 
-    @abstractmethod
     def retire(self, index: int) -> None:
-        """Take an object out of the game: it stays visible where it is but collides no more."""
+        """Take an object out of the round: it stays visible where it is but collides no more."""
+        self.remaining.discard(index)
+        self._immobilise(index)
 
     @abstractmethod
-    def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
-        """What `look` sees, without a frame around it."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Free what the simulator holds; may be called again."""
-
-    @abstractmethod
-    def _segmentation(self, image: Image) -> np.ndarray:
-        """(H, W) int32 numbers of objects, TABLE_OR_BACKGROUND or ROBOT."""
-
-    @property
-    def seconds(self) -> float:
-        """Simulated seconds since the scene was loaded."""
-        return self.steps * self.dt
-
-    def check_physics(self) -> None:
-        """Raise PhysicsError if the robot or an object has left the realm of finite numbers."""
-        if not np.isfinite(self.robot.q).all():
-            raise PhysicsError("the robot's joint positions are not finite")
-        for index in self.remaining:
-            self.object_position(index)
+    def _immobilise(self, index: int) -> None:
+        """Fix an object where it is; nothing collides with it any more."""
 
     def retire_lost_objects(self) -> list[int]:
         """Retire the objects that fell off the table or left the camera's reach; their numbers."""
@@ -174,10 +223,26 @@ class Cell(ABC):
 
     def _within_reach(self, index: int) -> bool:
         # The camera sees a margin around the workspace, so an object that rolled a little way out
-        # is still in the game; one behind the robot or off the table is not.
+        # is still in the round; one behind the robot or off the table is not.
         position = self.object_position(index)
         margin = abs(position[:2] - self.config.workspace.center).max()
         return on_table(position) and margin <= _REACH * self.config.workspace.size
+
+    def truth(self) -> SceneGeometry:
+        """The true geometry of the objects still in the round."""
+        solids = []
+        for index in sorted(self.remaining):
+            model, T = self.scene.placements[index].model, self.object_pose(index)
+            solids.append(
+                SolidObject(
+                    tuple(solid.transformed(T) for solid in model.geometry()),
+                    T[:3, 3],
+                    model.friction,
+                )
+            )
+        return SceneGeometry(tuple(solids))
+
+    # --- Camera -------------------------------------------------------------------------------
 
     def camera_pose(self, mount: str | None = None) -> np.ndarray:
         """(4, 4) T_WC of the overhead or the wrist camera."""
@@ -187,7 +252,7 @@ class Cell(ABC):
         return forward_kinematics(self.robot.q) @ wrist_mount(camera)
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:
-        """What the configured camera sees now; `with_truth` adds the true geometry.
+        """The configured camera's frame; `with_truth` adds the true geometry.
 
         `camera.depth_noise` changes the depth alone. It is a function of the scene's seed and the
         number of frames since it was loaded, so that every policy meets the same.
@@ -209,48 +274,44 @@ class Cell(ABC):
         with_truth: bool = False,
         light: dict | None = None,
     ) -> RGBDFrame:
-        """What a camera at T_WC (4, 4) sees now, without noise; `light` as in
-        `envs.pybullet_camera.render`."""
+        """The frame of a camera at T_WC (4, 4), without noise; `light` changes entries of
+        `envs.camera.DEFAULT_LIGHT`."""
         image = self.image(intrinsics, T_WC, light)
         truth = self.truth() if with_truth else None
         return RGBDFrame(
             image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
         )
 
-    def truth(self) -> SceneGeometry:
-        """The true geometry of the objects still in the game."""
-        solids = []
-        for index in sorted(self.remaining):
-            model, T = self.scene.placements[index].model, self.object_pose(index)
-            solids.append(
-                SolidObject(
-                    tuple(solid.transformed(T) for solid in model.geometry()),
-                    T[:3, 3],
-                    model.friction,
-                )
-            )
-        return SceneGeometry(tuple(solids))
+    def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
+        """The image of `look`, without a frame around it.
+
+        With a `view`, the image is taken with changed intrinsics, pose and light, while the frame
+        reports the unchanged ones, as a camera does that has moved since its calibration.
+        """
+        view = self.view
+        if view is None:
+            return self.camera.render(intrinsics, T_WC, light)
+        view.begin_frame()
+        intrinsics = replace(intrinsics, fov_deg=intrinsics.fov_deg * view.fov_scale)
+        T_WC = T_WC @ view.T_CC
+        light = DEFAULT_LIGHT | (light or {})
+        image = self.camera.render(intrinsics, T_WC, view.lit(light))
+        rgb, depth = view.develop(image.rgb, image.depth, image.bodies, intrinsics.K, T_WC)
+        return replace(image, rgb=rgb, depth=depth)
+
+    def _segmentation(self, image: Image) -> np.ndarray:
+        """(H, W) int32 numbers of objects, TABLE_OR_BACKGROUND or ROBOT."""
+        most = max(*self.robot.links, *self.bodies, int(image.bodies.max()))
+        number_of = np.full(most + 2, TABLE_OR_BACKGROUND, dtype=np.int32)
+        number_of[self.robot.links] = ROBOT
+        number_of[self.bodies] = range(len(self.bodies))
+        return number_of[image.bodies]  # -1, no body, is the extra last one
 
     def __enter__(self):
         return self
 
     def __exit__(self, *exception) -> None:
         self.close()
-
-
-def camera_intrinsics(camera: CameraConfig) -> Intrinsics:
-    """The configured camera's intrinsics; the wrist camera has a field of view of its own."""
-    fov = camera.fov_deg if camera.mount == "overhead" else camera.wrist_fov_deg
-    return Intrinsics(camera.width, camera.height, fov, camera.near, camera.far)
-
-
-def wrist_mount(camera: CameraConfig) -> np.ndarray:
-    """(4, 4) T_EC: the wrist camera beside the hand, looking along the approach."""
-    T = np.eye(4)
-    # Image right is E's +y, the closing line; at home image up points away from the robot.
-    T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    T[:3, 3] = camera.wrist_position
-    return T
 
 
 def _box(config: Config) -> tuple[list[float], list[float]]:

@@ -1,97 +1,70 @@
-"""The bare world: physics settings, table and bin. Knows nothing of robots or objects."""
+"""What stands in every cell, in numbers: gravity, table, bin, walls, and when an object rests.
+
+Both simulators build their cells from these constants. This module knows no simulator, robot or
+object.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-import pybullet
+from collections.abc import Iterator
+from typing import NamedTuple
 
-from utils.config import SimConfig
+import numpy as np
 
 GRAVITY = 9.81  # m/s^2
-# (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more
-# than the root of this. PyBullet's default.
-SOLVER_RESIDUAL = 1e-7
+
 TABLE_CENTRE = np.array([0.35, 0.0])  # m in W; the robot's base stands on the table
 TABLE_SIZE = np.array([1.20, 1.50])  # m along x and y; its top is z = 0
+TABLE_THICKNESS = 0.04  # m
+TABLE_COLOUR = (0.62, 0.60, 0.57, 1.0)
 _X_MIN, _Y_MIN = (TABLE_CENTRE - TABLE_SIZE / 2).tolist()
 _X_MAX, _Y_MAX = (TABLE_CENTRE + TABLE_SIZE / 2).tolist()
-_TABLE_THICKNESS = 0.04  # m
-_TABLE_COLOUR = (0.62, 0.60, 0.57, 1.0)
 
 BIN_CENTRE = np.array([0.42, -0.48])  # m in W; outside the overhead camera's view
-BIN_HALF_SIZE, BIN_HEIGHT, _BIN_WALL = 0.13, 0.08, 0.005  # m
-_BIN_COLOUR = (0.25, 0.35, 0.45, 1.0)
+BIN_HALF_SIZE, BIN_HEIGHT, BIN_WALL = 0.13, 0.08, 0.005  # m
+BIN_COLOUR = (0.25, 0.35, 0.45, 1.0)
 
-_WALL_COLOUR = (0.8, 0.8, 0.8, 1.0)
+WALL_COLOUR = (0.8, 0.8, 0.8, 1.0)
+
+REST_SPEED = 0.01  # m/s or (times 10) rad/s under which an object counts as resting
+REST_CHECK_STEPS = 12  # physics steps between two checks of whether objects rest
 
 
-def set_up_physics(client: int, sim: SimConfig) -> None:
-    """Empty the client's world and give it gravity, time step and a deterministic solver."""
-    pybullet.resetSimulation(physicsClientId=client)
-    pybullet.setGravity(0, 0, -GRAVITY, physicsClientId=client)
-    pybullet.setPhysicsEngineParameter(
-        fixedTimeStep=1.0 / sim.frequency,
-        numSolverIterations=sim.solver_iterations,
-        solverResidualThreshold=SOLVER_RESIDUAL,
-        deterministicOverlappingPairs=1,
-        physicsClientId=client,
+class Box(NamedTuple):
+    """half_size (3,) and position (3,) of the centre in W, metres."""
+
+    half_size: np.ndarray
+    position: np.ndarray
+
+
+def table_box() -> Box:
+    """The table, its top at z = 0."""
+    return Box(
+        np.array([*(TABLE_SIZE / 2), TABLE_THICKNESS / 2]),
+        np.array([*TABLE_CENTRE, -TABLE_THICKNESS / 2]),
     )
 
 
-def static_box(client: int, half_size, position, colour) -> int:
-    """An immovable box: half_size and position (3,) in metres. Returns PyBullet's body number.
-
-    In maximal coordinates: a plain rigid body collides just the same and is spared what every
-    articulated body, even an immovable one, costs at every step.
-    """
-    half_size = list(half_size)
-    return pybullet.createMultiBody(
-        0,
-        pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=half_size, physicsClientId=client
-        ),
-        pybullet.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=half_size, rgbaColor=colour, physicsClientId=client
-        ),
-        list(position),
-        useMaximalCoordinates=True,
-        physicsClientId=client,
-    )
+def bin_walls() -> Iterator[Box]:
+    """The four walls of the bin beside the workspace into which picked objects go."""
+    return square_walls(BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, BIN_WALL)
 
 
-def add_table(client: int) -> int:
-    """The table, its top at z = 0. Returns its body number."""
-    half = [*(TABLE_SIZE / 2), _TABLE_THICKNESS / 2]
-    table = static_box(client, half, [*TABLE_CENTRE, -_TABLE_THICKNESS / 2], _TABLE_COLOUR)
-    # Bullet combines lateral friction as the product, and rolling friction as the sum of each
-    # body's times the other's lateral one: with 1 and 0 here the object's own coefficients count.
-    pybullet.changeDynamics(
-        table, -1, lateralFriction=1.0, rollingFriction=0.0, spinningFriction=0.0,
-        physicsClientId=client,
-    )  # fmt: skip
-    return table
-
-
-def add_walls(client: int, centre, half_size: float, height: float, thickness: float, colour=None):
-    """Four walls around a square on the table, `half_size` being the inner half. Body numbers."""
+def square_walls(
+    centre: np.ndarray, half_size: float, height: float, thickness: float
+) -> Iterator[Box]:
+    """Four walls around a square on the table with centre (2,); `half_size` is the inner half."""
     outer = half_size + thickness / 2
-    walls = []
     for sign in (-1, 1):
         for axis in (0, 1):
             size = np.array([half_size + thickness, half_size + thickness, height / 2])
             size[axis] = thickness / 2
             position = np.array([centre[0], centre[1], height / 2])
             position[axis] += sign * outer
-            walls.append(static_box(client, size, position, colour or _WALL_COLOUR))
-    return walls
-
-
-def add_bin(client: int) -> list[int]:
-    """The bin beside the workspace into which picked objects go. Body numbers."""
-    return add_walls(client, BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, _BIN_WALL, _BIN_COLOUR)
+            yield Box(size, position)
 
 
 def on_table(position: np.ndarray) -> bool:
     """Whether a point (3,) in W is over the table and not below its top."""
     x, y, z = position
-    return bool(_X_MIN <= x <= _X_MAX and _Y_MIN <= y <= _Y_MAX and z > -_TABLE_THICKNESS)
+    return bool(_X_MIN <= x <= _X_MAX and _Y_MIN <= y <= _Y_MAX and z > -TABLE_THICKNESS)

@@ -35,12 +35,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from envs.board_servo import ServoArm, servo_period
+from envs.camera import Intrinsics
 from envs.camera_calibration import CameraCalibration
 from envs.cell import Cell
 from envs.closed_loop_tracker import ObjectTracker, WristCamera, WristImage
 from envs.execution import HALF_TURN, ApproachResult, GraspFailure
-from envs.pybullet_camera import Intrinsics
-from envs.pybullet_panda import MAX_OPENING
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -282,7 +281,7 @@ class ClosedLoop:
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
         robot, settings = cell.robot, cell.config.closed_loop
-        robot.command_gripper(min(grasp.width, MAX_OPENING))
+        robot.command_gripper(grasp.width)
         arm = ServoArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
         with _told_as_failure(arm):
             guided = GuidedApproach(self, arm, grasp)

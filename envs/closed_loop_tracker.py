@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.camera import Intrinsics
 from envs.cell import Cell
-from envs.pybullet_camera import Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.depth import make_depth_noise
 from utils.errors import TargetLostError

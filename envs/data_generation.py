@@ -22,14 +22,16 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
+from envs.camera import camera_intrinsics
+from envs.cell import PhysicsError
 from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.pybullet_appearance import Appearance, draw_camera
-from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics
+from envs.pybullet_cell import PybulletCell
 from utils.config import Config, dump_config, with_settings
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
 from utils.random_ranges import changed, draw
@@ -74,7 +76,7 @@ def _content(config: Config) -> str:
         "first_seed": _FIRST_SEED,
     }
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
-    chosen["gripper"] = json.loads(json.dumps(asdict(GripperGeometry())))
+    chosen["gripper"] = json.loads(json.dumps(asdict(config.gripper.geometry)))
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
 
 
@@ -195,7 +197,9 @@ def _make_shard(folder: Path, split: str, number: int) -> int:
         for frame, more_trials in label_scene(_worker_config, scene, name, _worker_cell):
             frames.append(frame)
             trials += more_trials
-    write_shard(shard_path(folder, split, number), frames, trials)
+    write_shard(
+        shard_path(folder, split, number), frames, trials, _worker_cell.gripper.max_opening
+    )
     return len(frames)
 
 
@@ -204,7 +208,9 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
     parts = {}
     settings = config.objects.model_dump() | {"split": "train"}
     for name in config.data.object_sets:
-        whole = load_object_set(name, cache_dir=config.cache_folder, **settings)
+        whole = load_object_set(
+            name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
+        )
         if len(whole) < 2:
             raise UserError(
                 f"data.object_sets: {name} holds {len(whole)} object, but some have to be kept for "
@@ -235,7 +241,7 @@ def draw_scene(
         crowded = with_settings(config, "scene", {"count": count})
         try:
             scene_seed = int(rng.integers(2**62))
-            scene = make_scene(layout, sets[name, split], scene_seed, crowded, cell.client)
+            scene = make_scene(layout, sets[name, split], scene_seed, crowded)
         except SceneError:  # too many for this layout: another draw, from the same generator
             continue
         return Scene(layout, seed, scene.placements), name
@@ -265,7 +271,7 @@ def label_scene(
             intrinsics, T_WC = camera_intrinsics(configured), cell.camera_pose()
         look.paint(cell)
         frame = look.photograph(cell, intrinsics, T_WC, rng)
-        labels = dense_labels(frame, GripperGeometry(), workspace)
+        labels = dense_labels(frame, cell.gripper, workspace)
         trials = []
         if rng.random() < config.data.executed_share:
             trials = execute_pairs(cell, part, frame, labels, rng)
@@ -308,7 +314,7 @@ def execute_pairs(
     """Carry out labelled pairs of every quality, each on the scene freshly loaded. Where the
     simulation blows up, the grasp has failed."""
     trials = []
-    for grasp, quality, weight in draw_pairs(frame, labels, rng):
+    for grasp, quality, weight in draw_pairs(frame, labels, cell.gripper, rng):
         cell.load(scene)
         try:
             success = execute_grasp(cell, grasp).success

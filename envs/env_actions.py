@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from envs.grasp_goals import Grasp
-from envs.pybullet_panda import MAX_OPENING, Panda
+from envs.robot import Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -25,7 +25,6 @@ from envs.robot_kinematics import (
     rotation_matrix,
 )
 from utils.config import Config
-from utils.geometry import GripperGeometry
 
 _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
@@ -52,7 +51,7 @@ class HandCommands:
     """
 
     def __init__(self, config: Config):
-        self._settings = config.env
+        self._settings, self._max_opening = config.env, config.gripper.max_opening
         reach = config.workspace.size / 2 + _MARGIN
         x, y = config.workspace.center
         self.lowest = (x - reach, y - reach, _LOWEST_TIP)
@@ -60,14 +59,15 @@ class HandCommands:
         self._speed = _FASTEST * _SPEED_HEADROOM * config.robot.velocity_scale
         self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency
 
-    def begin(self, robot: Panda, q: np.ndarray, opening: float) -> None:
+    def begin(self, robot: Robot, q: np.ndarray, opening: float | None = None) -> None:
         """Begin with the arm of a robot at joint positions q (7,), its gripper commanded to open by
-        `opening` metres."""
+        `opening` metres; None: as wide as it gets."""
         self._robot = robot
         robot.limit_speed(_FASTEST)
         self._servo = ServoStep(q)  # at the commanded joint positions
         self._T_command = self._servo.reached
-        self.opening, self.reachable = opening, True
+        self.opening = self._max_opening if opening is None else opening
+        self.reachable = True
 
     def command(self, action: np.ndarray, state: np.ndarray) -> None:
         """Move the commanded pose by an action (A,) and send the motors there. state: (15,) of the
@@ -89,11 +89,11 @@ class HandCommands:
     def _new_opening(self, action: float) -> float:
         """What the gripper is told, in metres."""
         if self._settings.gripper == "opening":
-            return MAX_OPENING * (action + 1) / 2
+            return self._max_opening * (action + 1) / 2
         opening = self.opening + self._settings.gripper_step * action
         now = float(self._state[14])
         opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
-        return min(max(opening, 0.0), MAX_OPENING)
+        return min(max(opening, 0.0), self._max_opening)
 
     def _moved_pose(self, action: np.ndarray) -> np.ndarray:
         """(4, 4) the commanded pose of E moved by an action, within the workspace."""
@@ -145,7 +145,6 @@ class HandCommands:
         return self._servo.q + share * change, share
 
 
-_MAX_OPENING = GripperGeometry().max_opening
 _NEAR_SIDE, _NEAR_HEIGHT, _NEAR_TURN = 0.04, (0.01, 0.10), math.pi / 4
 # Looks: heights are even in the logarithm, as what is near moves most in the image.
 _LOOK_HEIGHT, _LOOK_TURN = (0.01, 0.42), math.pi / 2
@@ -175,6 +174,7 @@ def look(
     object_place: np.ndarray,
     top: float,
     grasp: Grasp | None,
+    max_opening: float,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
     """A place to look at an object from, (4, 4), with the opening of the hand and the one that is
@@ -195,7 +195,7 @@ def look(
         place = object_place + random.normal(0, _LOOK_SIDE[0] + _LOOK_SIDE[1] * rise, 2)
         height, turn = top + rise, random.uniform(-_LOOK_TURN, _LOOK_TURN)
         opened = random.random() < _OPEN_SHARE
-        opening = _MAX_OPENING if opened else random.uniform(0, _MAX_OPENING)
+        opening = max_opening if opened else random.uniform(0, max_opening)
     squeeze = random.uniform(0, _MOST_SQUEEZE) if random.random() < _MOVING_SHARE else 0.0
     return _hand(T_home, place, height, turn), opening, max(opening - squeeze, 0.0)
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from envs.cell import Cell
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
-from envs.pybullet_panda import MAX_OPENING
 from envs.robot_kinematics import (
     Trajectory,
     UnreachableError,
@@ -86,7 +85,7 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
     approach = _line(cell, q_pregrasp, target)  # planned before anything moves
 
-    cell.robot.command_gripper(min(grasp.width, MAX_OPENING))
+    cell.robot.command_gripper(grasp.width)
     _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
     _follow(cell, approach, stop_force=settings.contact_stop)
     return ApproachResult(cell.step, target)
@@ -179,7 +178,7 @@ def _carry_to_bin(cell: Cell, index: int) -> None:
     for start in range(0, len(carry), every):
         _follow(cell, carry[start : start + every])
         _still_lifted(cell, index)
-    cell.robot.command_gripper(MAX_OPENING)
+    cell.robot.open_gripper()
     cell.step(round(_RELEASE_SECONDS / cell.dt))
     cell.retire(index)
 
@@ -200,7 +199,7 @@ def _go_home(cell: Cell) -> str:
     """Open, rise on a straight line if the hand is low, and return to the home posture. A remark
     for the outcome's detail where the arm could not do so by itself."""
     robot = cell.robot
-    robot.command_gripper(MAX_OPENING)
+    robot.open_gripper()
     cell.step(round(0.1 / cell.dt))
     T = forward_kinematics(robot.q)
     if T[2, 3] < 0.2:

@@ -18,7 +18,6 @@ from utils.height_map import height_map_from_scene
 ANGLES = 12  # closing lines that are tried, over half a turn
 MOST = 64  # goals of one object
 
-_HAND = GripperGeometry()
 _STRICT = LabelSettings()
 # For what offers nothing better, such as a bowl upside down.
 _RELAXED = _STRICT.relaxed()
@@ -56,21 +55,21 @@ class GraspGoals:
     scene: the object alone in W, at rest at T_WO (4, 4). Takes some 20 ms.
     """
 
-    def __init__(self, scene: SceneGeometry, T_WO: np.ndarray):
+    def __init__(self, scene: SceneGeometry, T_WO: np.ndarray, gripper: GripperGeometry):
         self._points = np.concatenate([solid.vertices for solid in scene.objects[0].solids])
         self._points = (self._points - T_WO[:3, 3]) @ T_WO[:3, :3]
-        found = _search(scene, _STRICT)
+        found = _search(scene, _STRICT, gripper)
         if len(found) == 0:
-            found = _search(scene, _RELAXED)
+            found = _search(scene, _RELAXED, gripper)
         if len(found) == 0:
-            found = _through_the_middle(scene)
+            found = _through_the_middle(scene, gripper)
         x, y, z, angle, *others = found[_distinct(found)].T
         R, t = T_WO[:3, :3], T_WO[:3, 3]
         self.quality, self._narrow, self._wide = others
         self._upright = R[2].copy()
         self._positions = (np.column_stack([x, y, z]) - t) @ R
         self._lines = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) @ R
-        self._price = _QUALITY * (1 - self.quality) + _NARROW * (_HAND.max_opening - self._wide)
+        self._price = _QUALITY * (1 - self.quality) + _NARROW * (gripper.max_opening - self._wide)
 
     def __len__(self) -> int:
         return len(self.quality)
@@ -148,7 +147,9 @@ class GoalView:
 # --- Finding them -------------------------------------------------------------------------------
 
 
-def _search(scene: SceneGeometry, settings: LabelSettings) -> np.ndarray:
+def _search(
+    scene: SceneGeometry, settings: LabelSettings, gripper: GripperGeometry
+) -> np.ndarray:
     """(N, 7) grasps: E's x, y, z in W, the closing line's angle, quality, and the openings between
     which the hand can come down. N may be 0."""
     corners = np.concatenate([solid.vertices[:, :2] for solid in scene.objects[0].solids])
@@ -172,7 +173,7 @@ def _search(scene: SceneGeometry, settings: LabelSettings) -> np.ndarray:
     angles = _narrowest(corners) + math.pi / ANGLES * np.arange(ANGLES)
     found = []
     for angle in angles:
-        judged = grasp_quality(surface, angle, heights, under, scene, _HAND, settings)
+        judged = grasp_quality(surface, angle, heights, under, scene, gripper, settings)
         some = np.flatnonzero(judged.quality > 0)
         middle, reach = judged.middle[some], judged.reach[some]
         narrow = 2 * (reach + _ROOM)
@@ -183,7 +184,7 @@ def _search(scene: SceneGeometry, settings: LabelSettings) -> np.ndarray:
         depth = np.minimum(
             settings.depth, surface[some, 2] - scene.table_height - settings.table_clearance
         )
-        z = surface[some, 2] - depth + _HAND.tip_below_centre
+        z = surface[some, 2] - depth + gripper.tip_below_centre
         z = np.maximum(z, scene.table_height + _LOWEST)
         quality = np.cbrt(judged.quality[some])
         found.append(
@@ -203,13 +204,13 @@ def _narrowest(corners: np.ndarray) -> float:
     return float(angles[spread.argmin()])
 
 
-def _through_the_middle(scene: SceneGeometry) -> np.ndarray:
+def _through_the_middle(scene: SceneGeometry, gripper: GripperGeometry) -> np.ndarray:
     """(1, 7) as of `_search`: across the narrowest side through the centre, the hand wide open."""
     thing = scene.objects[0]
     corners = np.concatenate([solid.vertices for solid in thing.solids])
     x, y, z = thing.centre_of_mass
     z = max(z, corners[:, 2].max() - 0.035, scene.table_height + _LOWEST)
-    wide = _HAND.max_opening
+    wide = gripper.max_opening
     return np.array([[x, y, z, _narrowest(corners[:, :2]), 0.0, wide, wide]])
 
 

@@ -19,14 +19,15 @@ from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
 from envs import env_actions
+from envs.camera import camera_intrinsics, wrist_mount
+from envs.cell import PhysicsError
 from envs.cell_layout import on_table
 from envs.cell_scenes import make_scene
 from envs.env_actions import HandCommands
 from envs.env_rewards import Outline
 from envs.grasp_goals import GraspGoals
 from envs.objects import ObjectSet, load_object_set
-from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics, wrist_mount
-from envs.pybullet_panda import MAX_OPENING
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -130,8 +131,9 @@ class RobotGraspingEnv(gymnasium.Env):
             "render_fps": round(self.config.sim.frequency / self.settings.substeps)
         }
         self.objects = _object_set(
-            self.settings.objects, self.config.cache_folder, self.config.objects
-        )
+            self.settings.objects, self.config.gripper.max_opening, self.config.cache_folder,
+            self.config.objects,
+        )  # fmt: skip
         if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             raise UserError(
                 "render_mode='human' opens a window and there is no display here; "
@@ -159,7 +161,7 @@ class RobotGraspingEnv(gymnasium.Env):
         side = self.settings.resolution
         slack = 0.1  # rad: the motors may overshoot a limit a little
         low = np.concatenate([JOINT_LOWER - slack, -2 * JOINT_VELOCITY, [-0.01]])
-        high = np.concatenate([JOINT_UPPER + slack, 2 * JOINT_VELOCITY, [MAX_OPENING + 0.01]])
+        high = np.concatenate([JOINT_UPPER + slack, 2 * JOINT_VELOCITY, [self.config.gripper.max_opening + 0.01]])
         self._state_low, self._state_high = low.astype(np.float32), high.astype(np.float32)
         everything = {
             "rgb": spaces.Box(0, 255, (side, side, 3), np.uint8),
@@ -199,16 +201,14 @@ class RobotGraspingEnv(gymnasium.Env):
 
     def _make_scene(self, seed: int) -> None:
         self._scene_seed = seed
-        scene = make_scene(
-            self.settings.scenario, self.objects, seed, self.config, self.cell.client
-        )
+        scene = make_scene(self.settings.scenario, self.objects, seed, self.config)
         self.cell.load(scene)
         self._know_the_objects()
-        self._calm = self.cell.calm()  # until the robot first touches something, see `_look`
+        self._sleeping = self.cell.enable_sleeping()  # until the robot touches something, `_look`
 
     def take_over(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode in the cell as it is, the arm at rest; `hand_over` gives it back."""
-        self._scene_seed, self._calm = self.cell.scene.seed, False
+        self._scene_seed, self._sleeping = self.cell.scene.seed, False
         self._know_the_objects()
         return self._begin(self.cell.robot.q)
 
@@ -223,10 +223,10 @@ class RobotGraspingEnv(gymnasium.Env):
         self._goals = self._goals_now() if self.settings.goal == "grasp" else None
 
     def _begin(
-        self, q: np.ndarray, command: float = MAX_OPENING
+        self, q: np.ndarray, command: float | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode with the arm at joint positions q (7,) and the gripper commanded to open
-        by so many metres."""
+        by so many metres; None: as wide as it gets."""
         self._hand.begin(self.cell.robot, q, command)
         self._steps = 0
         self._held_steps = 0
@@ -247,12 +247,14 @@ class RobotGraspingEnv(gymnasium.Env):
         top = self._outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
         if start == "near":
             T = env_actions.near(T_home, T_WO[:2, 3], top, self.np_random)
-            opening = command = MAX_OPENING
+            opening = command = self.config.gripper.max_opening
         else:
             grasp = None
             if self._goals is not None:
                 grasp = self._goals.grasp(self.np_random.integers(len(self._goals)), T_WO)
-            T, opening, command = env_actions.look(T_home, T_WO[:2, 3], top, grasp, self.np_random)
+            T, opening, command = env_actions.look(
+                T_home, T_WO[:2, 3], top, grasp, self.config.gripper.max_opening, self.np_random
+            )
             T[:3, 3] = np.clip(T[:3, 3], self._hand.lowest, self._hand.highest)
         try:
             return inverse_kinematics(T, self.cell.home, self.cell.home), opening, command
@@ -260,7 +262,7 @@ class RobotGraspingEnv(gymnasium.Env):
             return self.cell.home.copy(), opening, command
 
     def _goals_now(self) -> GraspGoals:
-        return GraspGoals(self.cell.truth(), self.cell.object_pose(0))
+        return GraspGoals(self.cell.truth(), self.cell.object_pose(0), self.cell.gripper)
 
     def step(
         self, action: np.ndarray
@@ -366,9 +368,9 @@ class RobotGraspingEnv(gymnasium.Env):
         T_WO = poses[nearest]
         self._view = self._outlines[nearest].seen_from(T_WO, self._T_WE)
         touches = cell.robot.touches()
-        if touches and self._calm:
-            cell.wake()
-            self._calm = False
+        if touches and self._sleeping:
+            cell.disable_sleeping()
+            self._sleeping = False
         self._grasped = touches and cell.robot.holds(cell.bodies[nearest])
         if self._goals is not None:
             leaning = not self._grasped and self._goals.tilt(T_WO) > _LEANING
@@ -457,9 +459,13 @@ def _checked_options(
 
 
 @functools.lru_cache(maxsize=4)
-def _object_set(name: str, cache_dir: Path, settings: ObjectsConfig) -> ObjectSet:
+def _object_set(
+    name: str, max_opening: float, cache_dir: Path, settings: ObjectsConfig
+) -> ObjectSet:
     """One for all environments of a process: each object is made once, which takes a while."""
-    return load_object_set(name, cache_dir=cache_dir, **settings.model_dump())
+    return load_object_set(
+        name, max_opening=max_opening, cache_dir=cache_dir, **settings.model_dump()
+    )
 
 
 def _camera_of_env(config: Config) -> Config:

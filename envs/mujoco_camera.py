@@ -1,7 +1,7 @@
-"""What RGB-D cameras see of a MuJoCo world, drawn without a window by MuJoCo's OpenGL renderer.
+"""The RGB-D camera in MuJoCo: images drawn without a window by MuJoCo's OpenGL renderer.
 
-The same camera model, depth and light settings as `envs.pybullet_camera` has for PyBullet. Knows nothing of
-robots, objects or tasks.
+Camera model, depth and light settings are those of `envs.camera`. Knows nothing of robots, objects
+or tasks.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics
 from envs.mujoco_panda import load_mujoco
-from envs.pybullet_camera import DEFAULT_LIGHT, Image, Intrinsics
 from utils.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ def add_view(spec: mujoco.MjSpec) -> None:
     spec.visual.quality.offsamples = 0  # mixed pixels would have mixed depths and numbers
 
 
-class MujocoCamera:
-    """Takes pictures of one model, made with `add_view`, in the state that `data` has.
+class MujocoCamera(Camera):
+    """Renders one model, made with `add_view`, in the state that `data` has.
 
     Raises UserError where OpenGL cannot draw without a window. Close it before the next one.
     """
@@ -53,10 +53,7 @@ class MujocoCamera:
         self._camera.fixedcamid = model.camera(CAMERA).id
 
     def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
-        """What a camera at T_WC (4, 4) sees; its `bodies` are MuJoCo's numbers, -1 for none.
-
-        light: changes of `envs.pybullet_camera.DEFAULT_LIGHT`, in its words.
-        """
+        """The image of a camera at T_WC (4, 4); its `bodies` are MuJoCo's numbers."""
         mujoco, model, data = self._mujoco, self._model, self._data
         near, far = intrinsics.near, intrinsics.far
         extent = model.stat.extent
@@ -111,8 +108,8 @@ class MujocoCamera:
 
 
 def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
-    """What MuJoCo calls the cell's camera: fovy in degrees, pos (3,) and mat (3, 3) in W, whose
-    columns are right, up and backwards."""
+    """MuJoCo's parameters of a camera: fovy in degrees, pos (3,) and mat (3, 3) in W, whose columns
+    are right, up and backwards."""
     return {
         "fovy": intrinsics.fov_deg,
         "pos": T_WC[:3, 3].copy(),
@@ -121,7 +118,7 @@ def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
 
 
 def _shine(model: mujoco.MjModel, light: dict) -> None:
-    """Light settings in PyBullet's words: its direction is that towards the light."""
+    """Set the model's light; `light` has the keys of DEFAULT_LIGHT."""
     direction, colour = (np.array(light[k], float) for k in ("lightDirection", "lightColor"))
     number = model.light(LIGHT).id
     model.light_dir[number] = -direction / np.linalg.norm(direction)
@@ -152,7 +149,7 @@ def _gl_context():
             GLContext = mujoco.GLContext
         context = GLContext(64, 64)
         context.make_current()
-    except Exception as error:  # of OpenGL's many: its loaders raise what they like
+    except Exception as error:  # OpenGL's loaders raise many types
         raise UserError(
             f"simulator=mujoco: no OpenGL context to draw with ({type(error).__name__}: {error}); "
             "install libegl1 (Mesa's needs no graphics card), or set MUJOCO_GL to egl, osmesa or "

@@ -1,21 +1,19 @@
-"""The Franka Panda in MuJoCo, a second world beside PyBullet's: same kinematics, other physics.
+"""The Panda in MuJoCo: the kinematics of PyBullet's model, identified inertias, other physics.
 
-Made from the same file, pybullet_data's `franka_panda/panda.urdf`, whose inertias are placeholders
-and are replaced by identified ones. Knows nothing of scenes and tasks. MuJoCo is optional:
-pip install "mujoco>=3.3,<4".
+The inertias in pybullet_data's `franka_panda/panda.urdf` are placeholders; identified ones replace
+them here. Knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.3,<4".
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pybullet_data
 
-from envs.pybullet_panda import FINGER_SPEED, GRIP_COSINE, MAX_OPENING
-from envs.robot import Robot
+from envs.pybullet_files import FINGER_JOINTS, panda_model
+from envs.robot import FINGER_SPEED, Contact, Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -25,12 +23,13 @@ from envs.robot_kinematics import (
 )
 from envs.robot_safety import ArmGate
 from utils.errors import UserError
+from utils.geometry import GripperGeometry
 
 if TYPE_CHECKING:
     import mujoco
 
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
-FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+FINGERS = ("panda_leftfinger", "panda_rightfinger")
 HAND, GRASP_TARGET = "panda_hand", "panda_grasptarget"
 _HAND_LINKS = ("panda_link7", "panda_link8", HAND)  # one link in PyBullet's cell
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
@@ -103,14 +102,14 @@ def load_mujoco():
     return mujoco
 
 
-def panda_spec() -> mujoco.MjSpec:
-    """A model of the Panda alone, to which a scene can be added, with its base at W's origin.
+def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
+    """A model of the Panda alone, with its base at W's origin; a scene can be added to it.
 
     Actuators: seven position servos in radians, and the distance between the fingertips in metres.
     One motor drives both fingers, as in the real hand. Raises UserError without MuJoCo.
     """
     mujoco = load_mujoco()
-    spec = mujoco.MjSpec.from_string(_urdf())
+    spec = mujoco.MjSpec.from_string(_urdf(gripper))
     for name, inertial in INERTIALS.items():
         body = spec.body(name)
         body.mass, body.ipos, body.fullinertia = inertial
@@ -130,14 +129,14 @@ def panda_spec() -> mujoco.MjSpec:
     equal = spec.add_equality()
     equal.type, equal.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
     equal.name, (equal.name1, equal.name2) = "fingers", FINGER_JOINTS
-    equal.data[:5] = [0, 1, 0, 0, 0]  # the first finger's place is the second's
+    equal.data[:5] = [0, 1, 0, 0, 0]  # both fingers are at the same position
     opening = spec.add_tendon(name="opening")
     for name in FINGER_JOINTS:
         opening.wrap_joint(name, 1.0)
     # The tendon's force acts on both fingers alike, so this one is a finger's.
     _servo(mujoco, spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, (
         _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
-    ), FINGER_FORCE, [0.0, 0.08])  # fmt: skip
+    ), FINGER_FORCE, [0.0, gripper.max_opening])  # fmt: skip
     for one, other in (("panda_link7", HAND), ("panda_link5", "panda_link7")):
         exclude = spec.add_exclude()
         exclude.bodyname1, exclude.bodyname2 = one, other
@@ -155,16 +154,10 @@ def _servo(mujoco, spec, target: str, kind, gains, force: float, span) -> None:
     actuator.forcelimited = actuator.ctrllimited = True
 
 
-def _urdf() -> str:
-    """PyBullet's URDF with paths and settings that MuJoCo takes, and the coarse meshes.
-
-    The fine ones have the coarse ones' names, and would be taken for the same.
-    """
-    stock = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
-    robot = ElementTree.parse(stock).getroot()
-    for mesh in robot.iter("mesh"):
-        name = mesh.attrib["filename"].replace("package://", "")
-        mesh.set("filename", str(stock.parent / name.replace("/visual/", "/collision/")))
+def _urdf(gripper: GripperGeometry) -> str:
+    """The URDF with settings that MuJoCo takes, and the coarse meshes: the fine ones have the same
+    file names, and MuJoCo would take one for the other."""
+    robot = panda_model(gripper)
     settings = ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler")
     # Links without shapes are frames that are asked for; none of the shapes is only for show.
     for name, value in {
@@ -176,24 +169,25 @@ def _urdf() -> str:
 
 
 class MujocoPanda(Robot):
-    """The Panda in MuJoCo with the commands of `envs.pybullet_panda.Panda`; model and data are MuJoCo's.
+    """The Panda in a MuJoCo model; `model` and `data` are MuJoCo's.
 
-    gate: what every command to the arm passes. dt: s, a control period, in which MuJoCo takes
-    `substeps` steps of its own. grip_force: N a finger. Raises UserError without MuJoCo.
+    spec: a model made from `panda_spec`. dt: s, a control period, in which MuJoCo takes `substeps`
+    steps of its own. Raises UserError without MuJoCo.
     """
 
     def __init__(
         self,
+        spec: mujoco.MjSpec,
+        dt: float,
+        substeps: int,
+        gripper: GripperGeometry,
+        grip_force: float,
         gate: ArmGate,
-        spec: mujoco.MjSpec | None = None,
-        dt: float = 1 / 240,
-        substeps: int = 2,
-        grip_force: float = 10.0,
     ):
-        self._mujoco, self.gate = load_mujoco(), gate
-        spec = spec or panda_spec()
+        super().__init__(dt, gripper, grip_force, gate)
+        self._mujoco = load_mujoco()
         spec.option.timestep = dt / substeps
-        self.dt, self.substeps, self.grip_force = dt, substeps, grip_force
+        self.substeps = substeps
         self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
         joints = [self.model.joint(name) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
@@ -201,7 +195,7 @@ class MujocoPanda(Robot):
         self._speeds = [joint.dofadr[0] for joint in joints]
         bodies = [self.model.body(i) for i in range(self.model.nbody)]
         self._links = {body.name: body.id for body in bodies if body.name.startswith("panda_")}
-        self.links = list(self._links.values())  # MuJoCo's numbers of the robot's bodies
+        self.links = list(self._links.values())
         self._is_robot = np.isin(self.model.geom_bodyid, self.links)
         self.limit_speed(JOINT_VELOCITY.max())
         self.place(np.zeros(7))
@@ -220,12 +214,8 @@ class MujocoPanda(Robot):
 
     def state(self) -> list[float]:
         """Joint positions (7, rad), joint velocities (7, rad/s) and the gripper's opening (m)."""
-        q, velocity, opening = self.joint_state()
-        return [*q.tolist(), *velocity.tolist(), opening]
-
-    def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
-        return self.q, self.data.qvel[self._speeds[:7]].copy(), self.opening
+        velocity = self.data.qvel[self._speeds[:7]]
+        return [*self.q.tolist(), *velocity.tolist(), self.opening]
 
     def pose(self, body: str) -> np.ndarray:
         """(4, 4) pose in W of a link's frame, by its name in the URDF."""
@@ -237,10 +227,15 @@ class MujocoPanda(Robot):
         """(4, 4) T_WE."""
         return forward_kinematics(self.q)
 
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis."""
+        return self.tip_pose()[:3, 1]
+
     # --- Motion -------------------------------------------------------------------------------
 
-    def place(self, q: np.ndarray, opening: float = MAX_OPENING) -> None:
-        """Put the robot at joint positions q (7,) and an opening in metres, at rest."""
+    def place(self, q: np.ndarray, opening: float | None = None) -> None:
+        """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""
+        opening = self.max_opening if opening is None else opening
         self.data.qpos[self._places] = [*q, opening / 2, opening / 2]
         self.data.qvel[:] = 0
         self._stay(q)
@@ -254,18 +249,16 @@ class MujocoPanda(Robot):
 
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         self._goal, self._speed = np.asarray(q, dtype=float), None
-        # The servo's damping brakes the wanted motion, too: stiffness x this takes it back.
+        # The servo's damping brakes the desired motion, too: stiffness x this takes it back.
         self._reference = self._goal + _DAMPING_RATIO_OF_STIFFNESS * np.asarray(velocity)
 
     def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
         self._goal = np.asarray(q, dtype=float)
         self._reference, self._speed = self.q, np.minimum(self._fastest, speeds)
 
-    def command_gripper(self, opening: float, force: float | None = None) -> None:
-        """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
-        force = self.grip_force if force is None else force
+    def _send_gripper(self, opening: float, force: float) -> None:
         self.model.actuator_forcerange[7] = [-force, force]
-        self._opening = min(max(float(opening), 0.0), MAX_OPENING)
+        self._opening = opening
 
     def step(self, count: int = 1) -> None:
         """Advance by so many control periods."""
@@ -285,25 +278,9 @@ class MujocoPanda(Robot):
 
     # --- Contacts -----------------------------------------------------------------------------
 
-    def grip_forces(self, body: int) -> tuple[float, float]:
-        """Newtons with which the left and the right finger press a body towards each other.
-
-        A contact counts where `envs.pybullet_panda.Panda.grip_forces` counts it.
-        """
-        closing, inwards = self.tip_pose()[:3, 1], []
-        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
-        for sign, name in zip((-1.0, 1.0), ("panda_leftfinger", "panda_rightfinger")):
-            force = 0.0
-            for number, normal in self._contacts_between(self._links[name], body):
-                share = sign * float(normal @ closing)
-                if share > GRIP_COSINE:
-                    force += share * self._normal_force(number)
-            inwards.append(force)
-        return inwards[0], inwards[1]
-
-    def holds(self, body: int, min_force: float = 0.1) -> bool:
-        """Whether both fingers grip the body with at least `min_force` newtons each."""
-        return min(self.grip_forces(body)) >= min_force
+    def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
+        for number, normal in self._contacts_between(self._links[FINGERS[finger]], body):
+            yield tuple(normal.tolist()), self._normal_force(number)
 
     def touches(self) -> bool:
         """Whether anything touches the robot."""

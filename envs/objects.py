@@ -1,4 +1,4 @@
-"""The things to be grasped: object sets, and how one object enters a physics client.
+"""The things to be grasped: object sets.
 
 A set is named (`box`, `primitives`, `random_urdfs`) or is any folder of URDF and mesh files. Every
 object is one rigid body whose frame has its origin at the centre of mass and the axes of its
@@ -18,18 +18,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pybullet
-import pybullet_data
 import trimesh
 from tqdm import tqdm
 
 from envs.object_files import FineVisual, fine_visual, object_files, read_object
 from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_primitives import NativeShape, make_primitive, random_color
-from envs.pybullet_bodies import collision_shape, visual_shape
-from envs.pybullet_panda import MAX_OPENING
+from envs.pybullet_files import data_folder
 from utils.config_types import OBJECT_SETS
-from utils.geometry import ConvexSolid
+from utils.geometry import ConvexSolid, GripperGeometry
 
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
@@ -80,41 +77,6 @@ class ObjectModel:
         return tuple(ConvexSolid.from_vertices(part) for part in self.parts)
 
 
-def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = False) -> int:
-    """Put an object into a physics client; returns its body id.
-
-    position (3,) of the centre of mass in W; quaternion (x, y, z, w). With `fine` the camera sees
-    the original mesh, otherwise exactly what the physics touches.
-    """
-    # The shapes live until `resetSimulation`, even if the body is removed (bullet3 #2086).
-    body = pybullet.createMultiBody(
-        baseMass=model.mass,
-        baseCollisionShapeIndex=collision_shape(client, model.collision),
-        baseVisualShapeIndex=visual_shape(
-            client, model.collision, model.color, model.fine_visual if fine else None
-        ),
-        basePosition=np.asarray(position, dtype=float).tolist(),
-        baseOrientation=np.asarray(quaternion, dtype=float).tolist(),
-        physicsClientId=client,
-    )
-    pybullet.changeDynamics(
-        body,
-        -1,
-        localInertiaDiagonal=model.inertia.tolist(),
-        lateralFriction=model.friction,
-        rollingFriction=model.rolling_friction,
-        spinningFriction=model.spinning_friction,
-        restitution=0.0,
-        linearDamping=0.04,
-        angularDamping=0.04,
-        physicsClientId=client,
-    )
-    if isinstance(model.collision, Path):
-        # Bullet grows hulls by 1 mm: objects would hover above what the camera sees.
-        pybullet.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=client)
-    return body
-
-
 class ObjectSet(ABC, Sequence[ObjectModel]):
     """A sequence of objects, each made when first asked for and then kept in memory."""
 
@@ -157,6 +119,7 @@ def load_object_set(
     scale: float | None = None,
     fit: float | None = None,
     density: float = DEFAULT_DENSITY,
+    max_opening: float = GripperGeometry().max_opening,
     cache_dir: str | Path,
 ) -> ObjectSet:
     """A named set, or every URDF and mesh file below a folder (whose units must be metres).
@@ -167,6 +130,8 @@ def load_object_set(
         so that the middle side of its oriented bounding box has this many metres.
     density: kg/m3 of the objects of `random_urdfs` or of a folder; `box` and `primitives` have
         their own. No object weighs less than 0.02 kg.
+    max_opening: m, of the gripper; a warning names the first object of a folder that is too wide
+        for it.
     cache_dir: where convex parts are kept.
     Raises ObjectError for an unknown name, a missing or empty folder, a split or number that is
     not allowed; a broken mesh raises it when its object is asked for.
@@ -189,7 +154,8 @@ def load_object_set(
     if name_or_path == "random_urdfs":
         default = RANDOM_URDFS_SCALE if fit is None else 1.0
         return FileSet(
-            "random_urdfs", _random_urdf_files(split), scale or default, fit, density, cache_dir
+            "random_urdfs", _random_urdf_files(split), scale or default, fit, density, max_opening,
+            cache_dir,
         )
     folder = Path(name_or_path).expanduser()
     if not folder.is_dir():
@@ -198,7 +164,9 @@ def load_object_set(
             "existing folder"
         )
     files = object_files(folder)
-    return FileSet(folder.resolve().name, files, scale or 1.0, fit, density, cache_dir)
+    return FileSet(
+        folder.resolve().name, files, scale or 1.0, fit, density, max_opening, cache_dir
+    )
 
 
 def prepare(objects: ObjectSet, workers: int) -> None:
@@ -278,11 +246,13 @@ class FileSet(ObjectSet):
         scale: float,
         fit: float | None,
         density: float,
+        max_opening: float,
         cache_dir: Path,
     ) -> None:
         super().__init__(name)
         self.files = tuple(files)
         self.scale, self.fit, self.density, self.cache_dir = scale, fit, density, cache_dir
+        self.max_opening = max_opening
         self._warned = False
 
     def __len__(self) -> int:
@@ -294,13 +264,13 @@ class FileSet(ObjectSet):
             path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
         )
         # random_urdfs is known to hold a few that no hand can take; of a folder it is a surprise.
-        ungraspable = model.extents.min() > MAX_OPENING or model.extents.max() > LARGEST_EXTENT
+        ungraspable = model.extents.min() > self.max_opening or model.extents.max() > LARGEST_EXTENT
         if ungraspable and not self._warned:
             self._warned = True
             sides = " x ".join(f"{side:.3g}" for side in model.extents)
             warnings.warn(
                 f"object {path} measures {sides} m, too large for a hand that opens "
-                f"{MAX_OPENING} m (and so may others be); set objects.fit, for example to 0.06, "
+                f"{self.max_opening} m (and so may others be); set objects.fit, for example to 0.06, "
                 "or objects.scale",
                 stacklevel=3,
             )
@@ -309,7 +279,7 @@ class FileSet(ObjectSet):
 
 def _random_urdf_files(split: str) -> list[Path]:
     """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
-    folder = Path(pybullet_data.getDataPath()) / "random_urdfs"
+    folder = data_folder() / "random_urdfs"
     numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
     return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
 

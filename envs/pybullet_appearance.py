@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pybullet
 
-from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import TABLE_OR_BACKGROUND, PybulletCell, camera_intrinsics
+from envs.camera import Intrinsics, camera_intrinsics
+from envs.cell import TABLE_OR_BACKGROUND
+from envs.pybullet_cell import PybulletCell
 from utils.config import CameraConfig
 from utils.random_view import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at

@@ -1,20 +1,138 @@
-"""PyBullet shapes of an object: what collides and what the camera sees.
+"""Bodies in a PyBullet client: table, bin and walls, objects, boards, and whether they rest.
 
-This module knows shapes only: neither mass nor friction, and no object set.
+Every function takes the number of the physics client. This module knows no cell, robot or camera.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pybullet
 
+from envs.board import BLACK, CARRIED_MASS, WHITE, Board
+from envs.cell_layout import (
+    BIN_COLOUR,
+    GRAVITY,
+    REST_CHECK_STEPS,
+    REST_SPEED,
+    TABLE_COLOUR,
+    WALL_COLOUR,
+    Box,
+    bin_walls,
+    table_box,
+)
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
+from envs.objects import ObjectModel
+from utils.config import Config, SimConfig
+from utils.transforms import inverse_pose, pose_matrix, position_quaternion, transform_points
+
+# (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more
+# than the root of this. PyBullet's default.
+SOLVER_RESIDUAL = 1e-7
 
 
-def collision_shape(client: int, shape: NativeShape | Path) -> int:
-    """Id of a new collision shape; `shape` is native or an OBJ file of convex parts."""
+def set_up_physics(client: int, sim: SimConfig) -> None:
+    """Remove all bodies, and set gravity, time step and a deterministic solver."""
+    pybullet.resetSimulation(physicsClientId=client)
+    pybullet.setGravity(0, 0, -GRAVITY, physicsClientId=client)
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=1.0 / sim.frequency,
+        numSolverIterations=sim.solver_iterations,
+        solverResidualThreshold=SOLVER_RESIDUAL,
+        deterministicOverlappingPairs=1,
+        physicsClientId=client,
+    )
+
+
+# --- Table, bin and walls -------------------------------------------------------------------
+
+
+def static_box(client: int, half_size, position, colour) -> int:
+    """An immovable box: half_size and position (3,) in metres. Returns PyBullet's body number.
+
+    In maximal coordinates: a plain rigid body collides just the same and is spared what every
+    articulated body, even an immovable one, costs at every step.
+    """
+    half_size = list(half_size)
+    return pybullet.createMultiBody(
+        0,
+        pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=half_size, physicsClientId=client
+        ),
+        pybullet.createVisualShape(
+            pybullet.GEOM_BOX, halfExtents=half_size, rgbaColor=colour, physicsClientId=client
+        ),
+        list(position),
+        useMaximalCoordinates=True,
+        physicsClientId=client,
+    )
+
+
+def add_table(client: int) -> int:
+    """The table, its top at z = 0. Returns its body number."""
+    table = static_box(client, *table_box(), TABLE_COLOUR)
+    # Bullet combines lateral friction as the product, and rolling friction as the sum of each
+    # body's times the other's lateral one: with 1 and 0 here the object's own coefficients count.
+    pybullet.changeDynamics(
+        table, -1, lateralFriction=1.0, rollingFriction=0.0, spinningFriction=0.0,
+        physicsClientId=client,
+    )  # fmt: skip
+    return table
+
+
+def add_walls(client: int, walls: Iterable[Box], colour=WALL_COLOUR) -> list[int]:
+    """Immovable walls; their body numbers."""
+    return [static_box(client, *wall, colour) for wall in walls]
+
+
+def add_bin(client: int) -> list[int]:
+    """The bin beside the workspace into which picked objects go. Body numbers of its walls."""
+    return add_walls(client, bin_walls(), BIN_COLOUR)
+
+
+# --- Objects --------------------------------------------------------------------------------
+
+
+def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = False) -> int:
+    """Put an object into a physics client; returns its body number.
+
+    position (3,) of the centre of mass in W; quaternion (x, y, z, w). With `fine` the camera sees
+    the original mesh, otherwise exactly what the physics touches.
+    """
+    # The shapes live until `resetSimulation`, even if the body is removed (bullet3 #2086).
+    body = pybullet.createMultiBody(
+        baseMass=model.mass,
+        baseCollisionShapeIndex=_collision_shape(client, model.collision),
+        baseVisualShapeIndex=_visual_shape(
+            client, model.collision, model.color, model.fine_visual if fine else None
+        ),
+        basePosition=np.asarray(position, dtype=float).tolist(),
+        baseOrientation=np.asarray(quaternion, dtype=float).tolist(),
+        physicsClientId=client,
+    )
+    pybullet.changeDynamics(
+        body,
+        -1,
+        localInertiaDiagonal=model.inertia.tolist(),
+        lateralFriction=model.friction,
+        rollingFriction=model.rolling_friction,
+        spinningFriction=model.spinning_friction,
+        restitution=0.0,
+        linearDamping=0.04,
+        angularDamping=0.04,
+        physicsClientId=client,
+    )
+    if isinstance(model.collision, Path):
+        # Bullet grows hulls by 1 mm: objects would hover above what the camera sees.
+        pybullet.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=client)
+    return body
+
+
+def _collision_shape(client: int, shape: NativeShape | Path) -> int:
+    """Number of a new collision shape; `shape` is native or an OBJ file of convex parts."""
     if isinstance(shape, NativeShape):
         kind, size = _native_arguments(shape, "height")
         return pybullet.createCollisionShape(kind, physicsClientId=client, **size)
@@ -23,15 +141,15 @@ def collision_shape(client: int, shape: NativeShape | Path) -> int:
     )
 
 
-def visual_shape(
+def _visual_shape(
     client: int,
     shape: NativeShape | Path,
     color: tuple[float, float, float, float],
     fine: FineVisual | None = None,
 ) -> int:
-    """Id of a new visual shape: what `collision_shape` makes of `shape`, or `fine` in its place.
+    """Number of a new visual shape: that of the collision shape, or `fine` in its place.
 
-    A native shape shows itself, whatever `fine` is.
+    A native shape is drawn as it is, whatever `fine` is.
     """
     if isinstance(shape, NativeShape):
         kind, size = _native_arguments(shape, "length")
@@ -65,3 +183,92 @@ def _native_arguments(shape: NativeShape, length_name: str) -> tuple[int, dict]:
 def _has_texture(path: Path) -> bool:
     material = path.with_suffix(".mtl")
     return material.is_file() and "map_Kd" in material.read_text(errors="replace")
+
+
+# --- Boards ---------------------------------------------------------------------------------
+
+
+def add_board(client: int, board: Board, T_WO: np.ndarray, carried: bool = False) -> int:
+    """Put a board into a client at T_WO (4, 4); its body number.
+
+    The board stays where it is unless it is `carried`, which gives it a mass.
+    """
+    half, below = board.white()
+    vertices, triangles = board.black()
+    position, quaternion = position_quaternion(T_WO)
+    white = pybullet.createVisualShape(
+        pybullet.GEOM_BOX, halfExtents=half, visualFramePosition=below, rgbaColor=WHITE,
+        specularColor=[0, 0, 0], physicsClientId=client,
+    )  # fmt: skip
+    # Geometry and not a texture: its edges are where they are said to be to the last digit.
+    black = pybullet.createVisualShape(
+        pybullet.GEOM_MESH, vertices=vertices, indices=triangles,
+        normals=[[0, 0, 1]] * len(vertices), rgbaColor=BLACK, specularColor=[0, 0, 0],
+        physicsClientId=client,
+    )  # fmt: skip
+    solid = pybullet.createCollisionShape(
+        pybullet.GEOM_BOX, halfExtents=half, collisionFramePosition=below,
+        physicsClientId=client,
+    )  # fmt: skip
+    return pybullet.createMultiBody(
+        CARRIED_MASS if carried else 0.0, solid, white, position, quaternion,
+        linkMasses=[0.0], linkCollisionShapeIndices=[-1], linkVisualShapeIndices=[black],
+        linkPositions=[[0, 0, 0]], linkOrientations=[[0, 0, 0, 1]],
+        linkInertialFramePositions=[[0, 0, 0]], linkInertialFrameOrientations=[[0, 0, 0, 1]],
+        linkParentIndices=[0], linkJointTypes=[pybullet.JOINT_FIXED],
+        linkJointAxis=[[0, 0, 1]], physicsClientId=client,
+    )  # fmt: skip
+
+
+class CarriedBoard:
+    """A board screwed to a link of the robot: a body with mass that a constraint holds.
+
+    T_WO: (4, 4) where the board is now. T_EO: (4, 4) where it is on the hand. corners_E: (4, 3) its
+    corners in E, metres.
+    """
+
+    def __init__(
+        self, client: int, robot: int, link: int, board: Board, T_WO: np.ndarray, T_EO: np.ndarray
+    ):
+        self.client = client
+        self.body = add_board(client, board, T_WO, carried=True)
+        # PyBullet gives a constraint's frame in the link's frame of inertia.
+        hand = pybullet.getLinkState(robot, link, physicsClientId=client)
+        position, quaternion = position_quaternion(inverse_pose(pose_matrix(*hand[:2])) @ T_WO)
+        pybullet.createConstraint(
+            robot, link, self.body, -1, pybullet.JOINT_FIXED, [0, 0, 0],
+            position, [0, 0, 0], quaternion, [0, 0, 0, 1], physicsClientId=client,
+        )  # fmt: skip
+        for part in range(-1, pybullet.getNumJoints(robot, physicsClientId=client)):
+            pybullet.setCollisionFilterPair(robot, self.body, part, -1, 0, physicsClientId=client)
+        self.corners_E = transform_points(T_EO, board.outline)
+
+    def contact_force(self) -> float:
+        """Sum of the normal forces on the board in newtons."""
+        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
+        return sum(contact[9] for contact in contacts)
+
+
+# --- Rest -----------------------------------------------------------------------------------
+
+
+def settle(client: int, bodies: Sequence[int], config: Config, checks: int = 1) -> bool:
+    """Step until the bodies rest; False if they still move after scene.settle_seconds.
+
+    checks: how many times in a row, REST_CHECK_STEPS apart, they must be found at rest. A single
+    check cannot tell a body that rests from one that begins to topple or turns round at the top of
+    a bounce.
+    """
+    found = 0
+    for step in range(int(config.scene.settle_seconds * config.sim.frequency)):
+        pybullet.stepSimulation(physicsClientId=client)
+        if step % REST_CHECK_STEPS == REST_CHECK_STEPS - 1:
+            found = found + 1 if all(_resting(client, body) for body in bodies) else 0
+            if found == checks:
+                return True
+    return False
+
+
+def _resting(client: int, body: int) -> bool:
+    linear, angular = pybullet.getBaseVelocity(body, physicsClientId=client)
+    return max(map(abs, linear)) < REST_SPEED and max(map(abs, angular)) < 10 * REST_SPEED

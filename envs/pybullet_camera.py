@@ -1,4 +1,4 @@
-"""RGB-D cameras: pinhole intrinsics, pose, rendering through PyBullet, metric depth.
+"""The RGB-D camera in PyBullet: images rendered by TinyRenderer or EGL, with metric depth.
 
 Knows nothing of robots, objects or tasks.
 """
@@ -6,103 +6,71 @@ Knows nothing of robots, objects or tasks.
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pybullet
 
+from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics
 from utils.errors import UserError
-
-# The light that every picture gets unless it says otherwise. PyBullet keeps these settings from
-# one call to the next (the shadow flag above all), so each call names all of them.
-DEFAULT_LIGHT = {
-    "lightDirection": (0.3, -0.4, 1.0),
-    "lightColor": (1.0, 1.0, 1.0),
-    "lightDistance": 2.0,
-    "lightAmbientCoeff": 0.55,
-    "lightDiffuseCoeff": 0.45,
-    "lightSpecularCoeff": 0.05,
-    "shadow": 0,
-}
 
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z with y up
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without distortion. width, height in pixels; fov_deg is vertical;
-    near and far bound the depths that are seen, in metres."""
+class PybulletCamera(Camera):
+    """Renders one physics client. renderer: PyBullet's number, see `load_renderer`."""
 
-    width: int
-    height: int
-    fov_deg: float
-    near: float = 0.1
-    far: float = 2.0
+    def __init__(self, client: int, renderer: int):
+        self.client, self.renderer = client, renderer
 
-    @property
-    def K(self) -> np.ndarray:
-        """(3, 3) pinhole matrix; square pixels; integer coordinates at pixel centres."""
-        focal = self.height / 2 / np.tan(np.radians(self.fov_deg) / 2)
-        return np.array(
-            [
-                [focal, 0.0, (self.width - 1) / 2],
-                [0.0, focal, (self.height - 1) / 2],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+    def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
+        """The image of a camera at T_WC (4, 4); its `bodies` are PyBullet's numbers.
 
-    def projection_matrix(self, renderer: int) -> list[float]:
-        """OpenGL's projection matrix, column by column, such that pixel centres are integers.
-
-        TinyRenderer draws half a pixel to the right and half a pixel up of where OpenGL does
-        (measured on 120 small plates, see tests/test_camera.py); the last two terms take it back.
+        PyBullet keeps light settings from one call to the next (the shadow flag above all), so each
+        call names all of them.
         """
-        matrix = list(
-            pybullet.computeProjectionMatrixFOV(
-                self.fov_deg, self.width / self.height, self.near, self.far
-            )
+        width, height = intrinsics.width, intrinsics.height
+        view = np.linalg.inv(T_WC @ _OPENGL_FROM_OPTICAL)
+        _, _, rgba, z_buffer, bodies = pybullet.getCameraImage(
+            width,
+            height,
+            viewMatrix=view.T.ravel(),
+            projectionMatrix=projection_matrix(intrinsics, self.renderer),
+            renderer=self.renderer,
+            flags=0,
+            physicsClientId=self.client,
+            **(DEFAULT_LIGHT if light is None else DEFAULT_LIGHT | light),
         )
-        if renderer == pybullet.ER_TINY_RENDERER:
-            matrix[8] += 1 / self.width
-            matrix[9] += 1 / self.height
-        return matrix
+        # Wheels built without numpy return tuples (bullet3 #4523).
+        rgba = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)
+        z_buffer = np.asarray(z_buffer, dtype=np.float32).reshape(height, width)
+        bodies = np.asarray(bodies, dtype=np.int32).reshape(height, width)
+        near, far = intrinsics.near, intrinsics.far
+        depth = near * far / (far - (far - near) * z_buffer)
+        # The cleared z-buffer is not quite 1 in single precision.
+        depth[depth >= far * (1 - 1e-5)] = 0.0
+        return Image(np.ascontiguousarray(rgba[:, :, :3]), depth, bodies)
 
 
-@dataclass(frozen=True)
-class Image:
-    """rgb (H, W, 3) uint8; depth (H, W) float32 metres along the optical axis, 0 where nothing is
-    nearer than the far plane; bodies (H, W) int32 PyBullet body numbers, -1 for none."""
+def projection_matrix(intrinsics: Intrinsics, renderer: int) -> list[float]:
+    """OpenGL's projection matrix, column by column, such that pixel centres are integers.
 
-    rgb: np.ndarray
-    depth: np.ndarray
-    bodies: np.ndarray
-
-
-def render(
-    client: int, intrinsics: Intrinsics, T_WC: np.ndarray, renderer: int, light: dict | None = None
-) -> Image:
-    """What a camera at T_WC (4, 4) sees of a physics client's world."""
-    width, height = intrinsics.width, intrinsics.height
-    view = np.linalg.inv(T_WC @ _OPENGL_FROM_OPTICAL)
-    _, _, rgba, z_buffer, bodies = pybullet.getCameraImage(
-        width,
-        height,
-        viewMatrix=view.T.ravel(),
-        projectionMatrix=intrinsics.projection_matrix(renderer),
-        renderer=renderer,
-        flags=0,
-        physicsClientId=client,
-        **(DEFAULT_LIGHT if light is None else DEFAULT_LIGHT | light),
+    TinyRenderer draws half a pixel to the right and half a pixel up of where OpenGL does
+    (measured on 120 small plates, see tests/test_pybullet_camera.py); the last two terms take it
+    back.
+    """
+    matrix = list(
+        pybullet.computeProjectionMatrixFOV(
+            intrinsics.fov_deg,
+            intrinsics.width / intrinsics.height,
+            intrinsics.near,
+            intrinsics.far,
+        )
     )
-    # Wheels built without numpy return tuples (bullet3 #4523).
-    rgba = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)
-    z_buffer = np.asarray(z_buffer, dtype=np.float32).reshape(height, width)
-    bodies = np.asarray(bodies, dtype=np.int32).reshape(height, width)
-    near, far = intrinsics.near, intrinsics.far
-    depth = near * far / (far - (far - near) * z_buffer)
-    depth[depth >= far * (1 - 1e-5)] = 0.0  # the cleared z-buffer, not quite 1 in single precision
-    return Image(np.ascontiguousarray(rgba[:, :, :3]), depth, bodies)
+    if renderer == pybullet.ER_TINY_RENDERER:
+        matrix[8] += 1 / intrinsics.width
+        matrix[9] += 1 / intrinsics.height
+    return matrix
 
 
 def load_renderer(client: int, choice: str) -> int:

@@ -1,15 +1,14 @@
-"""Motions of the arm between postures and along straight lines, sampled at the control rate.
+"""The abstract robot: a Panda arm with a gripper and contacts, whatever simulates it.
 
-The same plans for every simulator: pure numpy, no state but the control period.
-
-Commands to the arm, each of which passes its gate, whatever simulates the arm.
-
-`envs.pybullet_panda` drives PyBullet's motors, `envs.mujoco_panda` MuJoCo's; no other way leads to them.
+`envs.pybullet_panda` and `envs.mujoco_panda` implement it. A simulator brings the state, the
+motors and the contacts; motions, grips and the gate that every command to the arm passes are the
+same for all. This module knows no simulator, object, camera or task.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,15 +23,121 @@ from envs.robot_kinematics import (
     time_path,
 )
 from envs.robot_safety import ArmGate, ArmStoppedError, contact_reason
+from utils.geometry import GripperGeometry
+
+FINGER_SPEED = 0.05  # m/s a finger, from the Franka Hand's product manual
+GRIP_COSINE = np.cos(np.radians(70))  # of the steepest contact normal that counts as a grip
+LEFT, RIGHT = 0, 1  # fingers; the left one is on the side of E's +y axis
 
 _WAYPOINT_SPACING = 0.01  # m
 _MAX_JUMP = 0.3  # rad between neighbouring waypoints
 
+Contact = tuple[tuple[float, float, float], float]  # normal in W, and newtons along it
 
-class MotionPlanner:
-    """dt: control period in seconds."""
 
-    dt: float
+class Robot(ABC):
+    """A robot in one cell. Bodies are the simulator's numbers.
+
+    dt: s, a control period. grip_force: N a finger, unless a command names another force. gate:
+    every command to the arm passes it. gripper: the hand. links: the numbers under which the robot
+    appears in an `Image`.
+    """
+
+    links: list[int]
+
+    def __init__(self, dt: float, gripper: GripperGeometry, grip_force: float, gate: ArmGate):
+        self.dt, self.gripper, self.grip_force, self.gate = dt, gripper, grip_force, gate
+
+    # --- State --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def state(self) -> list[float]:
+        """Joint positions (7, rad), joint velocities (7, rad/s) and the gripper's opening (m)."""
+
+    def joint_state(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Joint positions (7,) rad, velocities (7,) rad/s and the gripper's opening in metres."""
+        state = self.state()
+        return np.array(state[:7]), np.array(state[7:14]), state[14]
+
+    @property
+    def q(self) -> np.ndarray:
+        """Joint positions (7,) in radians."""
+        return self.joint_state()[0]
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingertips in metres."""
+        return self.joint_state()[2]
+
+    @property
+    def max_opening(self) -> float:
+        """Widest distance between the fingertips in metres."""
+        return self.gripper.max_opening
+
+    @abstractmethod
+    def tip_pose(self) -> np.ndarray:
+        """(4, 4) T_WE."""
+
+    @abstractmethod
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis, from the right finger to the left one."""
+
+    @abstractmethod
+    def place(self, q: np.ndarray, opening: float | None = None) -> None:
+        """Put the robot at joint positions q (7,), rad, with the gripper at `opening` metres, at
+        rest; None opens it as wide as it gets."""
+
+    # --- Commands to the arm ------------------------------------------------------------------
+
+    def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s.
+
+        Returns the q that was sent: another one where the gate has slowed the arm. Where the gate
+        lets nothing pass, the arm is commanded to stay where it is and ArmStoppedError is raised.
+        """
+        try:
+            q, velocity = self.gate.passed(q, velocity)
+        except ArmStoppedError:
+            self.hold()
+            raise
+        self._send_arm(q, velocity)
+        return q
+
+    def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
+        """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
+        nor than `speed` rad/s. Raises ArmStoppedError, and sends nothing, where the gate refuses
+        q."""
+        self.gate.admit(q)
+        self._drive_arm(q, [min(limit, speed) for limit in self.gate.speeds])
+
+    def hold(self) -> None:
+        """Command the arm to stay where it is, which is allowed everywhere."""
+        self._stay(self.q)
+
+    def stop_on_contact(self, limit: float) -> None:
+        """Hold the arm and raise ArmStoppedError if more than `limit` newtons press against it."""
+        reason = contact_reason(self.contact_force(), limit)
+        if reason is not None:
+            self.hold()
+            raise ArmStoppedError(reason, contact=True)
+
+    @abstractmethod
+    def limit_speed(self, speed: float) -> None:
+        """Limit every joint to `speed` rad/s."""
+
+    def _stay(self, q: np.ndarray) -> None:
+        self.gate.restart(q)
+        self._send_arm(q, np.zeros(7))
+
+    @abstractmethod
+    def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        """Give the motors one period's references, rad and rad/s, each (7,)."""
+
+    @abstractmethod
+    def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
+        """Let the motors go to q (7,), rad, at up to `speeds`, seven in rad/s."""
+
+    # --- Motions ------------------------------------------------------------------------------
 
     def joint_move(self, start: np.ndarray, goal: np.ndarray, **scales: float) -> Trajectory:
         """The quickest synchronous motion between joint positions (7,) within all limits."""
@@ -73,56 +178,65 @@ class MotionPlanner:
             max_speed=speed, max_acceleration=CARTESIAN_ACCELERATION, **scales,
         )  # fmt: skip
 
+    # --- Gripper ------------------------------------------------------------------------------
 
-class Robot(MotionPlanner):
-    """gate: what every command to the arm passes. q: (7,) rad, where its joints are."""
+    def command_gripper(self, opening: float, force: float | None = None) -> None:
+        """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
+        opening = min(max(float(opening), 0.0), self.max_opening)
+        self._send_gripper(opening, self.grip_force if force is None else force)
 
-    gate: ArmGate
-    q: np.ndarray
+    def open_gripper(self) -> None:
+        """Drive both fingers apart as far as they get."""
+        self.command_gripper(self.max_opening)
 
-    def command_arm(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Motor targets of one control period of a trajectory: q (7,) rad, velocity (7,) rad/s.
-        Gives the q that was sent: another one where the gate has slowed the arm. Raises
-        ArmStoppedError, the arm being told to stay where it is, where the gate lets nothing pass.
+    @abstractmethod
+    def _send_gripper(self, opening: float, force: float) -> None:
+        """Give the fingers' motor its goal in metres, FINGER_SPEED a finger being the fastest."""
+
+    def grip_forces(self, body: int) -> tuple[float, float]:
+        """Newtons with which the left and the right finger press a body towards each other; zero
+        where one of them does not touch the body.
+
+        A contact counts only where its normal lies within 70 degrees of the closing line and points
+        inwards: a body that lies on the fingers, or is pushed down by a fist, is not gripped.
         """
-        try:
-            q, velocity = self.gate.passed(q, velocity)
-        except ArmStoppedError:
-            self.hold()
-            raise
-        self._send_arm(q, velocity)
-        return q
+        contacts = [list(self._finger_contacts(finger, body)) for finger in (LEFT, RIGHT)]
+        if not (contacts[LEFT] and contacts[RIGHT]):
+            return 0.0, 0.0
+        x, y, z = self.closing_direction().tolist()
+        inwards = []
+        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
+        for sign, touching in zip((-1.0, 1.0), contacts):
+            force = 0.0
+            for normal, newtons in touching:
+                share = sign * (normal[0] * x + normal[1] * y + normal[2] * z)
+                if share > GRIP_COSINE:
+                    force += share * newtons
+            inwards.append(force)
+        return inwards[LEFT], inwards[RIGHT]
 
-    def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
-        """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
-        nor than `speed` rad/s. Raises ArmStoppedError, and sends nothing, where the gate refuses
-        q."""
-        self.gate.admit(q)
-        self._drive_arm(q, [min(limit, speed) for limit in self.gate.speeds])
+    def holds(self, body: int, min_force: float = 0.1) -> bool:
+        """Whether both fingers grip the body with at least `min_force` newtons each."""
+        return min(self.grip_forces(body)) >= min_force
 
-    def hold(self) -> None:
-        """Tell the arm to stay where it is, which is allowed everywhere."""
-        self._stay(self.q)
+    @abstractmethod
+    def _finger_contacts(self, finger: int, body: int) -> Iterable[Contact]:
+        """Contacts of a finger, LEFT or RIGHT, with a body; their normals point into the body."""
 
-    def stop_on_contact(self, limit: float) -> None:
-        """Hold the arm and raise ArmStoppedError if more than `limit` newtons press against it."""
-        reason = contact_reason(self.contact_force(), limit)
-        if reason is not None:
-            self.hold()
-            raise ArmStoppedError(reason, contact=True)
-
-    def _stay(self, q: np.ndarray) -> None:
-        self.gate.restart(q)
-        self._send_arm(q, np.zeros(7))
+    # --- Contacts -----------------------------------------------------------------------------
 
     @abstractmethod
     def contact_force(self) -> float:
         """Sum of the normal forces in newtons on the whole robot."""
 
     @abstractmethod
-    def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
-        """Give the motors one period's references, rad and rad/s, each (7,)."""
+    def touches(self) -> bool:
+        """Whether anything touches the robot, or is so near that the simulator looks for contact."""
 
     @abstractmethod
-    def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
-        """Let the motors go to q (7,), rad, at up to `speeds`, seven in rad/s."""
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body are in contact."""
+
+    @abstractmethod
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""

@@ -26,10 +26,10 @@ import imageio.v2 as imageio
 import numpy as np
 import pybullet
 
+from envs.camera import Intrinsics
 from envs.cell import Cell
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.pybullet_camera import Intrinsics, render
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
 from utils.config import parse_args, run_script
@@ -66,7 +66,7 @@ class Studio:
         for body, copy in zip(cell.bodies, twin.bodies):
             pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
             pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=twin.client)
-        return render(twin.client, self._intrinsics, self._T_WC, twin.renderer, _LIGHT).rgb
+        return twin.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
 
     def close(self) -> None:
         if self._twin is not None:

@@ -14,7 +14,6 @@ import torch
 from torch.utils.data import Dataset
 
 from models.graspnet import GraspNet
-from models.graspnet_decoding import PANDA_HAND
 from models.graspnet_examples import AtPixelSize, GraspExamples, LabelledImages
 from models.graspnet_scores import centre_error, score_labels
 from utils.augmentation import Augmentation, ColourJitter
@@ -84,7 +83,7 @@ def simulated_data(config: Config, folder: Path, focal: float, distance: float) 
         lambda model: score_simulated(model, validation),
         "label_quality",
         metres_per_pixel,
-        PANDA_HAND.max_opening,
+        config.gripper.max_opening,
     )
 
 

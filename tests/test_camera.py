@@ -4,8 +4,9 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.cell_layout import static_box
-from envs.pybullet_camera import Intrinsics, load_renderer, render
+from envs.camera import Intrinsics
+from envs.pybullet_bodies import static_box
+from envs.pybullet_camera import PybulletCamera, load_renderer
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at, project
 
@@ -17,6 +18,10 @@ def client():
     client = pybullet.connect(pybullet.DIRECT)
     yield client
     pybullet.disconnect(physicsClientId=client)
+
+
+def tiny(client) -> PybulletCamera:
+    return PybulletCamera(client, pybullet.ER_TINY_RENDERER)
 
 
 def test_intrinsics_by_hand():
@@ -33,7 +38,7 @@ def test_pixels_lie_where_the_pinhole_says(client, side):
     for _ in range(60):
         centre = rng.uniform([0.4, -0.1, 0.05], [0.6, 0.1, 0.08])
         plate = static_box(client, [*rng.uniform(0.01, 0.03, 2), 0.001], centre, (1, 0, 0, 1))
-        image = render(client, intrinsics, OVERHEAD, pybullet.ER_TINY_RENDERER)
+        image = tiny(client).render(intrinsics, OVERHEAD)
         v, u = np.nonzero(image.bodies == plate)
         expected, _ = project(centre + [0, 0, 0.001], intrinsics.K, OVERHEAD)
         offsets.append([u.mean(), v.mean()] - expected)
@@ -46,7 +51,7 @@ def test_depth_is_metric_and_deprojects_to_the_surface(client):
     box = static_box(client, [0.03, 0.05, 0.04], [0.52, -0.07, 0.04], (1, 0, 0, 1))
     table = static_box(client, [0.6, 0.6, 0.05], [0.5, 0, -0.05], (0.5, 0.5, 0.5, 1))
     intrinsics = Intrinsics(224, 224, 32.0)
-    image = render(client, intrinsics, OVERHEAD, pybullet.ER_TINY_RENDERER)
+    image = tiny(client).render(intrinsics, OVERHEAD)
     assert image.rgb.dtype == np.uint8 and image.depth.dtype == np.float32
     frame = RGBDFrame(image.rgb, image.depth, intrinsics.K, OVERHEAD)
     points = frame.points()
@@ -60,7 +65,7 @@ def test_depth_is_metric_and_deprojects_to_the_surface(client):
 
 
 def test_nothing_in_view_has_no_depth(client):
-    image = render(client, Intrinsics(32, 32, 60.0), OVERHEAD, pybullet.ER_TINY_RENDERER)
+    image = tiny(client).render(Intrinsics(32, 32, 60.0), OVERHEAD)
     assert (image.depth == 0).all() and (image.bodies == -1).all()
 
 
@@ -68,11 +73,11 @@ def test_shadow_does_not_stick(client):
     # PyBullet keeps the shadow flag from one call to the next unless it is passed every time.
     static_box(client, [0.6, 0.6, 0.05], [0.5, 0, -0.05], (0.5, 0.5, 0.5, 1))
     static_box(client, [0.03, 0.05, 0.1], [0.5, 0, 0.1], (1, 0, 0, 1))
-    arguments = (client, Intrinsics(64, 64, 32.0), OVERHEAD, pybullet.ER_TINY_RENDERER)
-    before = render(*arguments).rgb
-    shadowed = render(*arguments, {"shadow": 1}).rgb
+    camera, view = tiny(client), (Intrinsics(64, 64, 32.0), OVERHEAD)
+    before = camera.render(*view).rgb
+    shadowed = camera.render(*view, {"shadow": 1}).rgb
     assert (shadowed != before).any()
-    np.testing.assert_array_equal(render(*arguments).rgb, before)
+    np.testing.assert_array_equal(camera.render(*view).rgb, before)
 
 
 def test_renderer_choice(client, monkeypatch):

@@ -4,11 +4,12 @@ import numpy as np
 import pybullet
 import pytest
 
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
 from envs.cell_scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
 from envs.execution import choose_posture, execute_grasp
 from envs.objects import load_object_set
-from envs.pybullet_cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError, PybulletCell
+from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
 from envs.robot_kinematics import forward_kinematics, inverse_kinematics
 from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
@@ -40,8 +41,8 @@ def cube_grasp(angle=0.0, offset=(0.0, 0.0, 0.0), width=0.08) -> Grasp:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_scene_is_a_pure_function_of_its_seed(layout, primitives, config, cell):
     first = make_scene(layout, primitives, 7, config)
-    make_scene("pile", primitives, 8, config, cell.client)  # other work in between
-    again = make_scene(layout, primitives, 7, config, cell.client)
+    make_scene("pile", primitives, 8, config)  # other work in between
+    again = make_scene(layout, primitives, 7, config)
     other = make_scene(layout, primitives, 9, config)
     assert len(first.placements) == (1 if layout == "isolated" else config.scene.count)
     for a, b in zip(first.placements, again.placements):

@@ -20,10 +20,10 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
-from envs.cell_scenes import settle
+from envs.cell import PhysicsError
 from envs.env_rewards import Outline
 from envs.grasping_env import RobotGraspingEnv
-from envs.pybullet_cell import PhysicsError
+from envs.pybullet_bodies import settle
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scripted_pick import scripted_action
 from utils.config import ConfigError
@@ -228,15 +228,15 @@ def make_awake(make, monkeypatch):
 
     def make_env(**settings) -> RobotGraspingEnv:
         env = make(**settings)
-        monkeypatch.setattr(env.cell, "calm", lambda: settle_only(env.cell))
+        monkeypatch.setattr(env.cell, "enable_sleeping", lambda: settle_only(env.cell))
         return env
 
     return make_env
 
 
 def settle_only(cell) -> bool:
-    """What `PybulletCell.calm` does before it decides."""
-    settle(cell.client, cell.bodies, cell.config, looks=5)
+    """What `PybulletCell.enable_sleeping` does before it decides."""
+    settle(cell.client, cell.bodies, cell.config, checks=5)
     return False
 
 

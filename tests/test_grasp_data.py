@@ -18,6 +18,8 @@ import pytest
 import torch
 
 from envs import data_generation
+from envs.camera import Intrinsics, camera_intrinsics
+from envs.cell import PhysicsError
 from envs.cell_scenes import SceneError
 from envs.data_generation import (
     SPLITS,
@@ -32,8 +34,7 @@ from envs.data_generation import (
 )
 from envs.objects import ObjectError
 from envs.pybullet_appearance import Appearance, Texture, draw_camera
-from envs.pybullet_camera import Intrinsics
-from envs.pybullet_cell import PhysicsError, PybulletCell, camera_intrinsics
+from envs.pybullet_cell import PybulletCell
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, SceneGeometry, SolidObject
@@ -69,7 +70,7 @@ def stored(tmp_path):
     frames = [made_up(rng) for _ in range(4)]
     trials = [Trial(0.6, 2.5, True), Trial(0.0, 1000.0, False), Trial(1.0, 1.0, True)]
     for number in range(2):
-        write_shard(shard_path(tmp_path, "train", number), frames[2 * number :][:2], trials)
+        write_shard(shard_path(tmp_path, "train", number), frames[2 * number :][:2], trials, 0.08)
     return tmp_path, frames, trials
 
 
@@ -110,7 +111,7 @@ def test_what_is_stored_comes_back_to_half_a_unit(stored):
 def test_depth_beyond_16_bits_is_cut_off_not_wrapped(tmp_path):
     frame = made_up(np.random.default_rng(0))
     frame.frame.depth[1, 1] = 5.0
-    write_shard(shard_path(tmp_path, "train", 0), [frame], [])
+    write_shard(shard_path(tmp_path, "train", 0), [frame], [], 0.08)
     assert SimulatedDataset(tmp_path, "train")[0].depth[1, 1] == pytest.approx(65535 * 5e-5)
     assert read_trials(tmp_path) == []
 
@@ -197,7 +198,7 @@ def test_table_distance_of_a_tilted_camera(tmp_path):
     eye = np.array([0.5, 0.1, 0.6])
     target = eye + (0.6 * np.tan(np.radians(30)), 0.0, -0.6)
     tilted = made_up(np.random.default_rng(0), look_at(eye, target))
-    write_shard(shard_path(tmp_path, "train", 0), [tilted], [])
+    write_shard(shard_path(tmp_path, "train", 0), [tilted], [], 0.08)
     distance = SimulatedDataset(tmp_path, "train").table_distance(0)
     assert distance == pytest.approx(0.6 / (np.sqrt(3) / 2))
 
@@ -255,7 +256,8 @@ def test_pairs_are_drawn_from_every_stratum_with_weights_that_count_them_all():
     opening = np.where(quality > 0, 0.03, 0).astype(np.float32)
     valid = np.ones((height, width), bool)
     valid[19, :15] = False  # not labelled: not drawn
-    pairs = list(draw_pairs(frame, GraspLabels(quality, opening, valid), np.random.default_rng(0)))
+    labels, rng = GraspLabels(quality, opening, valid), np.random.default_rng(0)
+    pairs = list(draw_pairs(frame, labels, GripperGeometry(), rng))
 
     zeros = 18 * 19 * 15 - 12
     found = sorted((q, weight) for _, q, weight in pairs)

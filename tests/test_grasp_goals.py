@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.grasp_goals import GoalView, GraspGoals
 from tests.test_geometry import CORNERS
-from utils.geometry import ConvexSolid, SceneGeometry, SolidObject
+from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject
 
 YAW = math.radians(30)
 PLACE = np.array([0.5, 0.1, 0.025])
@@ -36,7 +36,7 @@ def hand(position, yaw: float) -> np.ndarray:
 def goals_of(parts, T_WO: np.ndarray) -> GraspGoals:
     """Of an object of convex parts (V, 3) in its own frame."""
     solids = tuple(ConvexSolid.from_vertices(part).transformed(T_WO) for part in parts)
-    return GraspGoals(SceneGeometry((SolidObject(solids, T_WO[:3, 3], 0.8),)), T_WO)
+    return GraspGoals(SceneGeometry((SolidObject(solids, T_WO[:3, 3], 0.8),)), T_WO, GripperGeometry())
 
 
 def brick() -> GraspGoals:

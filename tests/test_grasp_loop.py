@@ -11,12 +11,13 @@ import pytest
 
 from envs import closed_loop_tracker
 from envs.board_servo import ServoArm
+from envs.camera import wrist_mount
 from envs.camera_calibration import displaced, level, teach, true_calibration, wrong_calibration
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import GraspFailure, execute_grasp
-from envs.pybullet_cell import PybulletCell, wrist_mount
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbed

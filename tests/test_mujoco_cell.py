@@ -8,12 +8,12 @@ from scipy import ndimage
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
+from envs.camera import Intrinsics
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_camera import Intrinsics
 from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from models.planners import make_planner

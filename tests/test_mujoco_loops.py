@@ -13,6 +13,7 @@ pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3
 
 import evaluate
 from envs.board_servo import ServoArm
+from envs.camera import wrist_mount
 from envs.camera_calibration import teach, true_calibration
 from envs.cell_layout import GRAVITY
 from envs.cell_scenes import make_scene
@@ -20,7 +21,7 @@ from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
-from envs.pybullet_cell import PybulletCell, wrist_mount
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, disturbed

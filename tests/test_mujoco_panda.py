@@ -7,7 +7,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
-from envs.mujoco_panda import FINGER_JOINTS, GRASP_TARGET, HAND, INERTIALS, MujocoPanda
+from envs.mujoco_panda import GRASP_TARGET, HAND, INERTIALS, MujocoPanda, panda_spec
+from envs.pybullet_files import FINGER_JOINTS
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.robot_safety import ArmGate
 
@@ -17,7 +18,9 @@ READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 @pytest.fixture(scope="module")
 def panda(config) -> MujocoPanda:
     dt = 1 / config.sim.frequency
-    return MujocoPanda(ArmGate(config.safety, config.robot, dt, config.closed_loop.floor), dt=dt)
+    gate = ArmGate(config.safety, config.robot, dt, config.closed_loop.floor)
+    hand = config.gripper.geometry
+    return MujocoPanda(panda_spec(hand), dt, 2, hand, config.robot.grip_force, gate)
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
+from envs.camera import Intrinsics
 from envs.cell_scenes import make_scene
 from envs.mujoco_camera import camera_of
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_camera import Intrinsics
 from utils.transforms import look_at
 
 

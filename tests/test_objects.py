@@ -10,15 +10,8 @@ import pytest
 import trimesh
 
 from envs.object_primitives import FAMILIES, make_primitive
-from envs.objects import (
-    BROKEN_RANDOM_URDFS,
-    ObjectError,
-    load_object,
-    load_object_set,
-    prepare,
-    spawn,
-)
-from envs.pybullet_panda import MAX_OPENING
+from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
+from envs.pybullet_bodies import spawn
 
 DATA = Path(pybullet_data.getDataPath())
 IDENTITY = (0, 0, 0, 1)
@@ -319,7 +312,7 @@ def test_objects_in_wrong_units_warn_once(tmp_path):
     for name in ("a", "b"):
         trimesh.creation.box((3, 4, 8)).export(tmp_path / "big" / f"{name}.stl")
     objects = load_object_set(str(tmp_path / "big"), cache_dir=tmp_path / "cache")
-    with pytest.warns(UserWarning, match=f"a.stl .* opens {MAX_OPENING} m .*objects.fit"):
+    with pytest.warns(UserWarning, match="a.stl .* opens 0.08 m .*objects.fit"):
         objects[0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

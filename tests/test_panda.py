@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import set_up_physics
-from envs.pybullet_panda import ARM, FINGERS, MAX_OPENING, Panda, panda_urdf
+from envs.pybullet_bodies import set_up_physics
+from envs.pybullet_files import write_welded_panda
+from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.robot_kinematics import (
     JOINT_ACCELERATION,
     JOINT_LOWER,
@@ -38,10 +39,11 @@ joint_positions = st.tuples(*(st.floats(a, b) for a, b in zip(JOINT_LOWER, JOINT
 def robot(config):
     client = pybullet.connect(pybullet.DIRECT)
     set_up_physics(client, config.sim)
-    urdf = panda_urdf(config.cache_folder, fine=False)
+    urdf = write_welded_panda(config.cache_folder, config.gripper.geometry, fine=False)
     dt = 1 / config.sim.frequency
     gate = ArmGate(config.safety, config.robot, dt, config.closed_loop.floor)
-    robot = Panda(client, dt, urdf, config.robot.grip_force, gate)
+    gripper, force = config.gripper.geometry, config.robot.grip_force
+    robot = PybulletPanda(client, dt, urdf, gripper, force, gate)
     robot.place(HOME)
     yield robot
     pybullet.disconnect(physicsClientId=client)
@@ -264,4 +266,4 @@ def test_fingers_are_coupled(robot):
             for finger in FINGERS
         )
         assert left == pytest.approx(right, abs=1e-4)
-        assert robot.opening == pytest.approx(min(opening, MAX_OPENING), abs=1e-3)
+        assert robot.opening == pytest.approx(min(opening, robot.max_opening), abs=1e-3)

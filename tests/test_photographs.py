@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from envs.camera import Intrinsics
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_camera import Intrinsics
 from envs.pybullet_cell import PybulletCell
 from models import photographs
 from models.graspnet_adaptation import DISTINCT
@@ -177,7 +177,7 @@ def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
     eye = middle + 0.75 * np.array([-np.sin(angle), 0.0, np.cos(angle)])
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
     with PybulletCell(config) as cell:
-        cell.load(make_scene("pile", objects, 1, config, cell.client))
+        cell.load(make_scene("pile", objects, 1, config))
         T_WC = look_at(eye, middle, (0.0, 1.0, 0.0))
         clean = cell.image(Intrinsics(640, 480, vertical, 0.1, 2.0), T_WC).depth
     depth = fill_depth_holes(KinectNoise()(clean, np.random.default_rng(0)))

@@ -101,7 +101,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
     with PybulletCell(config) as cell:
         approach, outcomes = PolicyApproach(cell, policy, policy.config), []
         for seed in range(3):
-            cell.load(make_scene("isolated", objects, seed, config, cell.client))
+            cell.load(make_scene("isolated", objects, seed, config))
             (grasp,) = nowhere_yet(cell.frame())
             place = cell.object_position(0)
             outcomes.append(execute_grasp(cell, grasp, approach))
@@ -114,7 +114,7 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
     with PybulletCell(config) as cell:
         approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config)
-        cell.load(make_scene("isolated", objects, 0, config, cell.client))
+        cell.load(make_scene("isolated", objects, 0, config))
         outcome = execute_grasp(cell, nowhere_yet(cell.frame())[0], approach)
         assert (outcome.reason, approach.closed_at) == ("stopped", None)
         assert "gripped nothing" in outcome.detail
@@ -140,7 +140,7 @@ def driven(cell, actions, seed=0):
     left = iter(actions)
     approach = PolicyApproach(cell, lambda observation: next(left), trained)
     told = recorded(approach.env._hand)
-    cell.load(make_scene("isolated", objects, seed, cell.config, cell.client))
+    cell.load(make_scene("isolated", objects, seed, cell.config))
     execute_grasp(cell, nowhere_yet(None)[0], approach)
     return np.array(told), cell.robot.q
 

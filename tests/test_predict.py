@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 import predict
+from envs.camera import Intrinsics
 from envs.cell_scenes import Placement, Scene
-from envs.pybullet_camera import Intrinsics
 from envs.pybullet_cell import PybulletCell
 from envs.studio import write_rgbd
 from models import graspnet_backbones, graspnet_inference

@@ -18,9 +18,10 @@ from envs.board_servo import (
     servo_to_goal,
     view_of,
 )
-from envs.cell_layout import static_box
+from envs.camera import Intrinsics
 from envs.cell_scenes import Scene
-from envs.pybullet_camera import Intrinsics, render
+from envs.pybullet_bodies import add_board, static_box
+from envs.pybullet_camera import PybulletCamera
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
 from utils.config import load_config
@@ -45,13 +46,13 @@ def studio():
     """A client with a grey table and a board at the world's origin."""
     client = pybullet.connect(pybullet.DIRECT)
     static_box(client, [0.6, 0.6, 0.02], [0, 0, -0.1], (0.6, 0.6, 0.6, 1))
-    BOARD.add(client, np.eye(4))
+    add_board(client, BOARD, np.eye(4))
     yield client
     pybullet.disconnect(physicsClientId=client)
 
 
 def photograph(client, T_OC, intrinsics=INTRINSICS):
-    return render(client, intrinsics, T_OC, pybullet.ER_TINY_RENDERER).rgb
+    return PybulletCamera(client, pybullet.ER_TINY_RENDERER).render(intrinsics, T_OC).rgb
 
 
 def empty(cell, *overrides):

@@ -37,6 +37,7 @@ from utils.config_types import (
 )
 from utils.depth import DEPTH_NOISES, make_depth_noise
 from utils.errors import UserError
+from utils.geometry import GripperGeometry
 from utils.transforms import look_at
 
 
@@ -51,6 +52,15 @@ class RobotConfig(Section):
     grip_force: Annotated[float, Field(gt=0, le=35)]  # beyond it the gear between fingers yields
     velocity_scale: Share
     acceleration_scale: Share
+
+
+class GripperConfig(Section):
+    max_opening: Annotated[float, Field(ge=0.02, le=0.2)]
+
+    @property
+    def geometry(self) -> GripperGeometry:
+        """The hand: the shapes of its fingers and palm are the Panda's, the opening is its own."""
+        return GripperGeometry(max_opening=self.max_opening)
 
 
 class CameraConfig(Section):
@@ -387,6 +397,7 @@ class Config(Section):
     simulator: Literal["pybullet", "mujoco"]
     sim: SimConfig
     robot: RobotConfig
+    gripper: GripperConfig
     camera: CameraConfig
     workspace: WorkspaceConfig
     objects: ObjectsConfig

@@ -27,7 +27,6 @@ from utils.transforms import RGBDFrame, project
 # To be raised with the format of the files, and with what makes scenes, images or labels.
 FORMAT_VERSION = 2
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
-_WIDTH_UNIT = 0.08 / 255  # metres; the Panda hand opens 0.08 m
 _QUALITY_UNIT = 1 / 255
 
 
@@ -44,19 +43,23 @@ def shard_path(folder: Path, split: str, number: int) -> Path:
     return Path(folder) / split / f"{number:05d}.h5"
 
 
-def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Trial]) -> None:
+def write_shard(
+    path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Trial], max_width: float
+) -> None:
     """Write labelled frames, and the label trials made on them, as one HDF5 file.
 
-    Depth, quality and width are stored as whole numbers of their attribute `unit`; `instance` is
+    max_width: m, the gripper's widest opening; no label is wider. Depth, quality and width are
+    stored as whole numbers of their attribute `unit`, width in 255 steps; `instance` is
     the number of the object at each pixel, -1 for none, and `centres` has the objects' centres of
     mass in W. The frames carry segmentation and truth, of scenes in which nothing was retired: only
     then do both number the objects alike.
     """
+    units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": max_width / 255}
     stacked = {
         "rgb": np.stack([f.frame.rgb for f in frames]),
         "depth": _whole([f.frame.depth for f in frames], _DEPTH_UNIT, np.uint16),
         "quality": _whole([f.labels.quality for f in frames], _QUALITY_UNIT, np.uint8),
-        "width": _whole([f.labels.width for f in frames], _WIDTH_UNIT, np.uint8),
+        "width": _whole([f.labels.width for f in frames], units["width"], np.uint8),
         "valid": np.stack([f.labels.valid for f in frames]),
         "instance": np.stack([np.maximum(f.frame.segmentation, -1) for f in frames]).astype(
             np.int8
@@ -67,7 +70,6 @@ def write_shard(path: Path, frames: Sequence[LabelledFrame], trials: Sequence[Tr
     for row, f in zip(centres, frames):
         for number, thing in enumerate(f.frame.truth.objects):
             row[number] = thing.centre_of_mass
-    units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": _WIDTH_UNIT}
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         file.attrs["format_version"] = FORMAT_VERSION
@@ -135,7 +137,7 @@ class SimulatedDataset(Dataset):
             rgb=torch.from_numpy(np.moveaxis(file["rgb"][i], -1, 0).copy()),
             depth=torch.from_numpy(file["depth"][i].astype(np.float32) * np.float32(_DEPTH_UNIT)),
             quality=torch.from_numpy(file["quality"][i] * np.float32(_QUALITY_UNIT)),
-            width=torch.from_numpy(file["width"][i] * np.float32(_WIDTH_UNIT)),
+            width=torch.from_numpy(file["width"][i] * np.float32(file["width"].attrs["unit"])),
             mask=torch.from_numpy(file["valid"][i]),
             centre=torch.from_numpy(self._centre(index, file["instance"][i], file["centres"][i])),
         )

@@ -150,13 +150,17 @@ class Trial:
 
 
 def draw_pairs(
-    frame: RGBDFrame, labels: GraspLabels, rng: np.random.Generator, per_stratum: int = PER_STRATUM
+    frame: RGBDFrame,
+    labels: GraspLabels,
+    gripper: GripperGeometry,
+    rng: np.random.Generator,
+    per_stratum: int = PER_STRATUM,
 ) -> Iterator[tuple[Grasp, float, float]]:
     """Grasps of pairs drawn from every stratum of quality, each with its quality and its weight.
 
     Pairs of quality 0 come from the objects' pixels and are tried with the hand wide open.
     """
-    settings, gripper = LabelSettings(), GripperGeometry()
+    settings = LabelSettings()
     lowest = settings.table_clearance + settings.min_engagement
     on_object = labels.valid & (frame.segmentation >= 0) & (frame.points()[..., 2] > lowest)
     quality = np.where(on_object, labels.quality, -1)
