@@ -18,9 +18,7 @@ import numpy as np
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
-from models.ppo import KIND
 from models.ppo_rollouts import derived_seeds
-from utils.checkpoint import load_checkpoint
 from utils.config import Config, load_config, run_script
 from utils.statistics import wilson_interval
 
@@ -53,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
     """The config that a checkpoint was trained with, changed by overrides."""
-    plain = load_checkpoint(checkpoint, KIND)["config"]
+    plain = load_policy(checkpoint).config
     with NamedTemporaryFile("w", suffix=".yaml") as file:
         json.dump(plain, file)  # JSON is YAML
         file.flush()

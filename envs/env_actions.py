@@ -1,10 +1,9 @@
-"""HandCommands: from a policy's actions to what the arm and the gripper are told.
+"""Actions of `RobotGraspingEnv`, and the initial states of its episodes.
 
-Actions change the commanded pose a little at a time. What of them can be carried out, within joint
-limits, speeds, workspace and safety, is decided here.
-
-Where the hand is when an episode begins somewhere else than at home: poses of E in W, not yet
-checked for the arm's reach. Knows no robot.
+An action changes the commanded pose of the hand a little. `ActionDecoder` decides how much of the
+change the arm may carry out, within joint limits, speeds, workspace and safety, and sends the
+commands. `near_pose` and `pretraining_state` draw where the hand is when an episode does not begin
+at home; their poses are not yet checked for the arm's reach.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import math
 
 import numpy as np
 
-from envs.grasp_goals import Grasp
+from envs.env_rewards import GraspGoal
 from envs.robot import Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
@@ -26,28 +25,34 @@ from envs.robot_kinematics import (
 )
 from utils.config import Config
 
+# What each entry of an action means, by `env.control`.
+ACTION_ENTRIES = {
+    "ee": ("dx", "dy", "dz", "rotation x", "rotation y", "rotation z", "gripper"),
+    "ee_planar": ("dx", "dy", "dz", "dyaw", "gripper"),
+    "joint": (*(f"joint {number}" for number in range(1, 8)), "gripper"),
+}
+
 _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
-# How far the arm's answer to a command may lie from it before the command is refused.
+# How far the solution of inverse kinematics may miss a command before the command is refused.
 _FOLLOW_POSITION, _FOLLOW_ROTATION = 0.01, 0.06  # m, rad
-# The quicker joints of the wrist go no faster than the others: Bullet can hold a body's joints to
-# one limit only, and what is held to the lowest is legal for all.
+# All joints share the lowest speed limit, because Bullet holds a body's joints to one limit only.
 _FASTEST = float(JOINT_VELOCITY.min())  # rad/s
-# Share of that speed that is commanded: inertia and contacts throw a joint a little over what its
+# Share of that speed that is commanded: inertia and contacts carry a joint a little over what its
 # motor asks for (3 % in free motion).
 _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
-_FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first will do
+_FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first is enough
 
 
-class HandCommands:
-    """What is commanded in an episode; see `RobotGraspingEnv` for the actions.
+class ActionDecoder:
+    """Turns the actions of an episode into commands; `RobotGraspingEnv` documents the actions.
 
-    config: whose section `env` says what actions mean. lowest, highest: (3,) m in W, the corners of
-    the box that E is held in. opening: m, as commanded. reachable: whether the arm could follow the
-    last action.
+    config: its section `env` says what the entries of an action mean. lowest, highest: (3,) m in W,
+    the corners of the box that E stays in. opening: m, as commanded. reachable: whether the arm
+    could follow the last action.
     """
 
     def __init__(self, config: Config):
@@ -60,8 +65,8 @@ class HandCommands:
         self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency
 
     def begin(self, robot: Robot, q: np.ndarray, opening: float | None = None) -> None:
-        """Begin with the arm of a robot at joint positions q (7,), its gripper commanded to open by
-        `opening` metres; None: as wide as it gets."""
+        """Begin with a robot whose arm is at joint positions q (7,) and whose gripper is commanded
+        to open by `opening` metres, or as wide as it gets."""
         self._robot = robot
         robot.limit_speed(_FASTEST)
         self._servo = ServoStep(q)  # at the commanded joint positions
@@ -71,7 +76,7 @@ class HandCommands:
 
     def command(self, action: np.ndarray, state: np.ndarray) -> None:
         """Move the commanded pose by an action (A,) and send the motors there. state: (15,) of the
-        robot as it is, see `RobotGraspingEnv`."""
+        robot now, as in the observation of `RobotGraspingEnv`."""
         self._state = state
         if self._settings.control == "joint":
             goal = self._servo.q + self._settings.joint_step * action[:7]
@@ -87,7 +92,7 @@ class HandCommands:
         self._robot.command_gripper(self.opening)
 
     def _new_opening(self, action: float) -> float:
-        """What the gripper is told, in metres."""
+        """The commanded opening in metres after an action of the gripper in [-1, 1]."""
         if self._settings.gripper == "opening":
             return self._max_opening * (action + 1) / 2
         opening = self.opening + self._settings.gripper_step * action
@@ -128,76 +133,82 @@ class HandCommands:
         self.reachable = False
 
     def _allowed(self, goal: ServoStep) -> bool:
-        """Whether a goal may be commanded: the arm is free, and its gate lets that pass."""
+        """Whether a goal may be commanded: nothing blocks the arm, and its gate lets the goal
+        pass."""
         tip = goal.reached[:3, 3]
         return not self._blocked(goal.q) and self._robot.gate.refusal(goal.q, tip) is None
 
     def _blocked(self, goal: np.ndarray) -> bool:
-        """Whether the arm is held up by something and a goal (7,) is yet farther ahead of it."""
+        """Whether something holds the arm up and a goal (7,) is still farther ahead of it."""
         now = self._state[:7]
         lead = abs(goal - now).max()
         return bool(lead > _LONGEST_LEAD and lead > abs(self._servo.q - now).max())
 
     def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joint positions (7,) towards a goal, and the share of the way that an action gets."""
+        """Joint positions (7,) towards a goal that one action can reach, and the share of the way
+        that they are."""
         change = goal - self._servo.q
         share = 1.0 / max(float(abs(change).max()) / self._max_joint_change, 1.0)
         return self._servo.q + share * change, share
 
 
+# --- Initial states -----------------------------------------------------------------------------
+
 _NEAR_SIDE, _NEAR_HEIGHT, _NEAR_TURN = 0.04, (0.01, 0.10), math.pi / 4
-# Looks: heights are even in the logarithm, as what is near moves most in the image.
-_LOOK_HEIGHT, _LOOK_TURN = (0.01, 0.42), math.pi / 2
-_LOOK_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
-_OPEN_SHARE = 0.6  # of the looks: with open fingers, as nearly all of an episode is seen
-_GRASP_SHARE = 0.4  # of the looks: on the way down to a grasp
-_MOVING_SHARE, _MOST_SQUEEZE = 0.5, 0.02  # of the looks: while the fingers close; m
+# Pretraining: heights are even in the logarithm, as what is near moves most in the image.
+_PRETRAINING_HEIGHT, _PRETRAINING_TURN = (0.01, 0.42), math.pi / 2
+_PRETRAINING_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
+_OPEN_SHARE = 0.6  # of the states: with open fingers, as nearly all of an episode is seen
+_GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
+_MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
 
 
-def near(
+def near_pose(
     T_home: np.ndarray, object_place: np.ndarray, top: float, random: np.random.Generator
 ) -> np.ndarray:
-    """(4, 4) a little over an object, and turned a little from how the hand is at home.
+    """(4, 4) T_WE a little over an object, turned a little from how the hand is at home.
 
-    T_home: (4, 4) the hand at home. object_place: (2,) x, y of the object and top: its highest
-    point, in W, m.
+    T_home: (4, 4) T_WE at home. object_place: (2,) x, y of the object; top: height of its highest
+    point; both m in W.
     """
     side = random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
     height = top + random.uniform(*_NEAR_HEIGHT)
     return _hand(T_home, object_place + side, height, random.uniform(-_NEAR_TURN, _NEAR_TURN))
 
 
-def look(
+def pretraining_state(
     T_home: np.ndarray,
     object_place: np.ndarray,
     top: float,
-    grasp: Grasp | None,
+    goal: GraspGoal | None,
     max_opening: float,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
-    """A place to look at an object from, (4, 4), with the opening of the hand and the one that is
-    commanded, in metres: wherever an episode may lead, from high above to right around a grasp.
+    """A state that an episode may lead to, from high above an object to right around a grasp:
+    (4, 4) T_WE, the opening and the commanded opening in metres.
 
-    Arguments as of `near`; grasp: of the object, None where no looks on the way down to one are
-    wanted.
+    Arguments as of `near_pose`; goal: a grasp of the object, None for no states on the way down.
+    max_opening: m, of the hand.
     """
-    if grasp is not None and random.random() < _GRASP_SHARE:
-        place = grasp.position[:2] + random.normal(0, _GRASP_SIDE, 2)
-        height = random.uniform(grasp.position[2], top + _GRASP_HEIGHT)
-        turn = grasp.angle - math.atan2(T_home[1, 1], T_home[0, 1])
+    if goal is not None and random.random() < _GRASP_SHARE:
+        place = goal.position[:2] + random.normal(0, _GRASP_SIDE, 2)
+        height = random.uniform(goal.position[2], top + _GRASP_HEIGHT)
+        turn = goal.angle - math.atan2(T_home[1, 1], T_home[0, 1])
         turn -= _HALF_TURN * round(turn / _HALF_TURN)
         turn += random.normal(0, _GRASP_TURN)
-        opening = random.uniform(grasp.narrow, grasp.wide)
+        opening = random.uniform(goal.narrow, goal.wide)
     else:
-        rise = math.exp(random.uniform(*np.log(_LOOK_HEIGHT)))
-        place = object_place + random.normal(0, _LOOK_SIDE[0] + _LOOK_SIDE[1] * rise, 2)
-        height, turn = top + rise, random.uniform(-_LOOK_TURN, _LOOK_TURN)
+        rise = math.exp(random.uniform(*np.log(_PRETRAINING_HEIGHT)))
+        deviation = _PRETRAINING_SIDE[0] + _PRETRAINING_SIDE[1] * rise
+        place = object_place + random.normal(0, deviation, 2)
+        height, turn = top + rise, random.uniform(-_PRETRAINING_TURN, _PRETRAINING_TURN)
         opened = random.random() < _OPEN_SHARE
         opening = max_opening if opened else random.uniform(0, max_opening)
-    squeeze = random.uniform(0, _MOST_SQUEEZE) if random.random() < _MOVING_SHARE else 0.0
-    return _hand(T_home, place, height, turn), opening, max(opening - squeeze, 0.0)
+    closing = random.random() < _MOVING_SHARE
+    opening_error = random.uniform(0, _LARGEST_OPENING_ERROR) if closing else 0.0
+    return _hand(T_home, place, height, turn), opening, max(opening - opening_error, 0.0)
 
 
 def _hand(T_home: np.ndarray, place: np.ndarray, height: float, turn: float) -> np.ndarray:

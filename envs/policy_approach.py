@@ -26,14 +26,14 @@ from utils.errors import UserError
 from utils.result_records import OPEN_LOOP
 from utils.transforms import Grasp, RGBDFrame
 
-TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "squeeze")
+TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
 _SURE = 3  # looks in a row at which something must be gripped: a first touch may slip
 SCENARIOS = ("isolated", "static")  # one object, which stays where it is
 
 
 class PolicyApproach:
     """An `envs.execution.Approach`. trained: sections env and camera of the config that the policy
-    was trained with, as plain data; what it lives in besides is the cell's.
+    was trained with, as plain data; everything else is the cell's, and so is the depth noise.
 
     It ends when both fingers have gripped something for a quarter of a second, which a gripper
     feels; from there the object is held, lifted and judged as any other. closed_at: where that was,
@@ -48,8 +48,9 @@ class PolicyApproach:
     ):
         # No reward is asked for; the objects are those of the cell.
         plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
-        config = with_settings(cell.config, "camera", trained["camera"])
-        self.env = RobotGraspingEnv(config=with_settings(config, "env", plain), cell=cell)
+        noise = cell.config.camera.model_dump(include={"depth_noise", "depth_noise_args"})
+        config = with_settings(cell.config, "camera", trained["camera"] | noise)
+        self.env = RobotGraspingEnv(config=config, cell=cell, **plain)
         self.policy = policy
         self.closed_at: Grasp | None = None
 

@@ -1,17 +1,83 @@
-"""A pick by rule in `RobotGraspingEnv`, without a display: python -m envs.scripted_pick"""
+"""A scripted pick in `RobotGraspingEnv`, the demonstration: python -m envs.grasping_env [--gui]
+
+It lifts the cube of one scene (`seed=N` chooses it), prints a line on each phase, and leaves
+picture.png and film.mp4 in a new folder of runs/grasping_env/. With --gui a window shows the
+physics instead.
+"""
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
+from envs.studio import write_film
+from utils.config import parse_args, with_settings
+from utils.runs import new_run_folder
+
+PHASES = {
+    "approach": "the hand moves over the cube",
+    "descend": "the hand goes down around it",
+    "close": "the fingers close",
+    "lift": "the hand lifts it",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Play one scripted episode and show it."""
+    config, options = parse_args(argv, "Lift a cube by a script; `seed` chooses it.", _add_options)
+    config = with_settings(config, "env", {"control": "ee_planar", "gripper": "opening"})
+    env = RobotGraspingEnv("human" if options.gui else "rgb_array", config)
+    observation, info = env.reset(seed=config.seed)
+    print("observation:", {name: value.shape for name, value in observation.items()})
+    print(f"action: {env.action_space}: dx, dy, dz, dyaw, gripper")
+    phase, total, step, ended = "", 0.0, 0, False
+    pictures = [] if options.gui else [env.render()]
+    while not ended:
+        now, action = scripted_pick(env, info)
+        if now != phase:
+            phase = now
+            print(f"step {step:3d}: {PHASES[phase]}; {_state_in_words(env, info)}")
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, step, ended = total + reward, step + 1, terminated or truncated
+        if not options.gui:
+            pictures.append(env.render())
+    print(
+        f"step {step:3d}: ended by {info['reason']}, return {total:.3f}; {_state_in_words(env, info)}"
+    )
+    if not options.gui:
+        folder = new_run_folder("grasping_env", None, config)
+        imageio.imwrite(folder / "picture.png", pictures[-1])
+        write_film(folder / "film.mp4", pictures, env.metadata["render_fps"])
+        print(f"picture and film: {folder / 'picture.png'}, {folder / 'film.mp4'}")
+    env.close()
+    return 0 if info["is_success"] else 1
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--gui", action="store_true", help="show a window; needs a display")
+
+
+def _state_in_words(env: RobotGraspingEnv, info: dict[str, Any]) -> str:
+    return (
+        f"fingers {1000 * env.get_gripper_width():.0f} mm apart, cube at "
+        f"{info['object_position'][2]:.3f} m, {'grasped' if info['grasped'] else 'not grasped'}"
+    )
 
 
 def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:
-    """(5,) `ee_planar` action of a simple pick of the nearest object: above it, down, close, up."""
+    """(5,) `ee_planar` action of a simple pick of the nearest object."""
+    return scripted_pick(env, info)[1]
+
+
+def scripted_pick(env: RobotGraspingEnv, info: dict[str, Any]) -> tuple[str, np.ndarray]:
+    """The phase of PHASES that a pick of the nearest object is in, and its (5,) `ee_planar`
+    action."""
     offset = info["object_position"] - info["end_effector_position"]
     over_it = bool(np.linalg.norm(offset[:2]) < 0.01)
     if not over_it:
@@ -22,7 +88,10 @@ def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:
         offset[:] = 0.0, 0.0, 0.05 if info["grasped"] else 0.0
     move = np.clip(offset / env.settings.position_step, -1, 1)
     turn = 0.0 if closing else np.clip(_turn_to_sides(env) / env.settings.rotation_step, -1, 1)
-    return np.array([*move, turn, -1.0 if closing else 1.0], dtype=np.float32)
+    action = np.array([*move, turn, -1.0 if closing else 1.0], dtype=np.float32)
+    if closing:
+        return "lift" if info["grasped"] else "close", action
+    return "descend" if over_it else "approach", action
 
 
 def _turn_to_sides(env: RobotGraspingEnv) -> float:
@@ -33,26 +102,3 @@ def _turn_to_sides(env: RobotGraspingEnv) -> float:
     closing_line = forward_kinematics(env.cell.robot.q)[:3, 1]
     angle = np.arctan2(level[1], level[0]) - np.arctan2(closing_line[1], closing_line[0])
     return float((angle + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-
-
-def main() -> None:
-    """The scripted pick on the default scene."""
-    env = RobotGraspingEnv(render_mode="rgb_array", control="ee_planar")
-    observation, info = env.reset(seed=0)
-    print("observation:", {name: value.shape for name, value in observation.items()})
-    print("action:", env.action_space)
-    done, step, total = False, 0, 0.0
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(scripted_action(env, info))
-        total, step, done = total + reward, step + 1, terminated or truncated
-        if step % 5 == 0 or done:
-            print(
-                f"step {step:3d}: reward {reward:+.3f}, gripper {env.get_gripper_width():.3f} m, "
-                f"object at {info['object_position'][2]:.3f} m, grasped {info['grasped']}"
-            )
-    print(f"ended by {info['reason']} with return {total:.3f}; picture {env.render().shape}")
-    env.close()
-
-
-if __name__ == "__main__":
-    main()

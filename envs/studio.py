@@ -170,11 +170,15 @@ def film_episode(
         observation, _, terminated, truncated, info = env.step(act(observation))
         pictures.append(env.render())
         ended = terminated or truncated
-    pictures += [pictures[-1]] * _HOLD
-    rate = env.metadata.get("render_fps", 30)
+    write_film(path, pictures, env.metadata.get("render_fps", 30))
+    return str(info.get("reason") or ("terminated" if terminated else "truncated"))
+
+
+def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
+    """Write an MP4 or GIF of `rate` pictures a second; the last one stays for a while."""
+    pictures = [*pictures, *[pictures[-1]] * _HOLD]
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
         imageio.mimwrite(path, pictures, duration=1000 / rate, loop=0)
     else:
         imageio.mimwrite(path, pictures, fps=rate, quality=6)
-    return str(info.get("reason") or ("terminated" if terminated else "truncated"))

@@ -128,7 +128,7 @@ class VectorEnvs:
     @contextmanager
     def looking(self) -> Iterator[None]:
         """Episodes begun in here, which are not played, begin anywhere that one may lead to."""
-        with self._begun_with({"start": "look"}):
+        with self._begun_with({"start": "pretraining"}):
             yield
 
     @contextmanager
@@ -234,7 +234,7 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
 
 
 def with_info(env: gymnasium.Env, wanted: Sequence[str]) -> gymnasium.Env:
-    """The environment, its observation completed by wanted entries that only its info has."""
+    """The environment, its observation completed by wanted entries that only its info holds."""
     space = env.observation_space
     here = space.spaces if isinstance(space, spaces.Dict) else {}
     missing = [name for name in wanted if name not in here]

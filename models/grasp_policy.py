@@ -18,8 +18,14 @@ from gymnasium import spaces
 from torch import nn
 
 from models.ppo import KIND, GraspPPO
-from models.ppo_observations import ObservationLayout, ObservationNormaliser, Observations
+from models.ppo_observations import (
+    RENAMED_OBSERVATIONS,
+    ObservationLayout,
+    ObservationNormaliser,
+    Observations,
+)
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.config import with_current_keys
 from utils.config_schema import RLConfig
 from utils.errors import UserError
 
@@ -353,7 +359,18 @@ def load_policy(path: Path | str) -> SavedPolicy:
     load_weights(network, checkpoint, path)
     extra = checkpoint["extra"]
     layout = ObservationLayout.from_plain(extra["layout"])
-    return SavedPolicy(network.eval(), layout, extra, checkpoint["config"])
+    return SavedPolicy(network.eval(), layout, extra, _current_config(checkpoint["config"]))
+
+
+def _current_config(stored: dict) -> dict:
+    """The config of a checkpoint, perhaps of an older version, in the words of this version."""
+    config = with_current_keys(stored)
+    for role in ("policy", "privileged", "estimated"):
+        key = f"{role}_observations"
+        names = config.get("rl", {}).get(key)
+        if names is not None:
+            config["rl"][key] = [RENAMED_OBSERVATIONS.get(name, name) for name in names]
+    return config
 
 
 def save_policy(path: Path | str, policy: SavedPolicy) -> None:

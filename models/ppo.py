@@ -339,7 +339,7 @@ class GraspPPO:
             path, KIND, model_args=self.network.model_args, map_location=self.team.device
         )
         extra = checkpoint["extra"]
-        if extra["layout"] != self.layout.to_plain():
+        if ObservationLayout.from_plain(extra["layout"]) != self.layout:
             raise UserError(f"{path}: a policy of other observations than this environment's")
         if checkpoint["optimizer"] is None:
             raise UserError(f"{path}: holds weights only, no training to go on with")

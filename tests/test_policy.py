@@ -12,7 +12,7 @@ import torch
 
 from benchmarks.bench_policy import config_of, run_episodes
 from envs.cell_scenes import make_scene
-from envs.env_actions import HandCommands
+from envs.env_actions import ActionDecoder
 from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
@@ -46,7 +46,7 @@ def test_policies_lift_what_they_have_never_seen(objects):
     assert config.env.objects == objects
     policy = load_policy(path)
     told = {part.key for part in (*policy.layout.images, *policy.layout.state)}
-    assert told == {"rgb", "depth", "end_effector_position", "gripper", "squeeze"}
+    assert told == {"rgb", "depth", "end_effector_position", "gripper", "opening_error"}
     ends = run_episodes(policy, config, 10)
     assert sum(reason == "success" for reason, _ in ends) >= 6
 
@@ -85,8 +85,9 @@ def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
     pybullet.resetBasePositionAndOrientation(
         cell.bodies[0], elsewhere, quaternion, physicsClientId=cell.client
     )
-    inner._look()
-    seen = {**inner._info(None), **inner._observation()}
+    inner._seen.read()
+    info = inner._info(None)
+    seen = {**info, **inner._seen.observation(info)}
     assert seen["object_position"] == pytest.approx(elsewhere), "the simulator knows"
     after = policy.layout.read_one(seen)
     assert torch.equal(before.state, after.state)
@@ -121,10 +122,10 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
         assert np.abs(cell.robot.q - cell.home).max() < 0.02, "home again"
 
 
-def recorded(hand: HandCommands) -> list[np.ndarray]:
-    """The actions that a hand will be told."""
-    told, command = [], hand.command
-    hand.command = lambda action, state: (told.append(action.copy()), command(action, state))
+def recorded(decoder: ActionDecoder) -> list[np.ndarray]:
+    """The actions that reach the decoder from now on."""
+    told, command = [], decoder.command
+    decoder.command = lambda action, state: (told.append(action.copy()), command(action, state))
     return told
 
 
@@ -139,7 +140,7 @@ def driven(cell, actions, seed=0):
     trained["env"]["max_steps"] = len(actions)
     left = iter(actions)
     approach = PolicyApproach(cell, lambda observation: next(left), trained)
-    told = recorded(approach.env._hand)
+    told = recorded(approach.env._actions)
     cell.load(make_scene("isolated", objects, seed, cell.config))
     execute_grasp(cell, nowhere_yet(None)[0], approach)
     return np.array(told), cell.robot.q
@@ -194,8 +195,8 @@ def test_randomised_actions_are_those_of_the_environment():
     env = gymnasium.make("RandomizedGrasping-v0", **settings).unwrapped
     _, info = env.reset(options={"scene_seed": 0})
     env.reset(options={"scene_seed": 0, "randomization": info["randomization"] | {"seed": 0}})
-    reached, command = [], env._hand.command
-    env._hand.command = lambda action, state: (
+    reached, command = [], env._actions.command
+    env._actions.command = lambda action, state: (
         reached.append(action.copy()),
         command(action, state),
     )

@@ -300,6 +300,32 @@ def with_settings(config: Config, section: str, settings: Mapping[str, Any]) -> 
         raise ConfigError(explain(error, layers)) from error
 
 
+def with_current_keys(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """A config that a checkpoint of an older version stored, under the keys of this version: keys
+    that were renamed get their new names, keys that were removed are left out."""
+    current: dict[str, Any] = {}
+
+    def visit(values: Mapping[str, Any], prefix: str) -> None:
+        for name, value in values.items():
+            key = f"{prefix}{name}"
+            while (newer := new_name(key)) is not None:
+                key = newer
+            schema = schema_at(key)
+            if schema is None:
+                continue
+            if "properties" in schema:
+                visit(value, f"{prefix}{name}.")
+            else:
+                *sections, leaf = key.split(".")
+                place = current
+                for section in sections:
+                    place = place.setdefault(section, {})
+                place[leaf] = value
+
+    visit(stored, "")
+    return current
+
+
 def dump_config(config: Config) -> str:
     """The config as YAML that `load_config` reads back to an equal object."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)

@@ -38,6 +38,7 @@ from utils.config_types import (
 from utils.depth import DEPTH_NOISES, make_depth_noise
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
+from utils.plugins import IMPORT_PATH
 from utils.transforms import look_at
 
 
@@ -281,10 +282,12 @@ class AdaptationConfig(Section):
     held_out: Annotated[float, Field(gt=0, lt=1)]
 
 
+Names = Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
+PluginPath = Annotated[str, Field(pattern=IMPORT_PATH, description="an import path module:name")]
+
+
 class EnvConfig(Section):
-    observations: Annotated[
-        tuple[Literal["rgb", "depth", "state"], ...], Several, AfterValidator(no_repeats)
-    ]
+    observations: Names
     control: Literal["ee", "ee_planar", "joint"]
     frame: Literal["world", "hand"]
     gripper: Literal["opening", "change"]
@@ -292,7 +295,7 @@ class EnvConfig(Section):
     camera: Mount
     objects: ObjectSet
     scenario: Scenario
-    reward: Literal["dense", "sparse"]
+    reward: Literal["dense", "sparse"] | PluginPath
     goal: Literal["object", "grasp"]
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
@@ -314,7 +317,6 @@ class EnvConfig(Section):
 EnvArgument = Annotated[
     str, Field(pattern=r"^[A-Za-z_]\w*=", description="NAME=VALUE, the value as YAML")
 ]
-Names = Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
 
 
 class RLConfig(Section):

@@ -1,7 +1,6 @@
 """`RobotGrasping-v0`: Gymnasium's contract, physics limits, reward, success and its endings."""
 
 import gc
-import itertools
 import math
 import os
 import subprocess
@@ -18,15 +17,16 @@ import pytest
 import torch
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from scipy.spatial.transform import Rotation
 
 from envs.cell import PhysicsError
+from envs.env_observations import INFO_OBSERVATIONS
 from envs.env_rewards import Outline
 from envs.grasping_env import RobotGraspingEnv
 from envs.pybullet_bodies import settle
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scripted_pick import scripted_action
-from utils.config import ConfigError
+from tests.helpers.shapes import cube_corners
+from utils.config import with_settings
 from utils.errors import UserError
 
 SIDE = 32  # pixels
@@ -36,7 +36,7 @@ OBSERVATIONS = [["rgb"], ["depth"], ["state"], ["rgb", "depth", "state"]]
 
 @pytest.fixture
 def make(config):
-    """Makes environments, state-only unless told otherwise, and closes them after the test."""
+    """Makes environments, state-only unless given otherwise, and closes them after the test."""
     made = []
 
     def make_env(render_mode=None, **settings) -> RobotGraspingEnv:
@@ -144,14 +144,67 @@ def test_public_methods_of_the_tutorial_exist():
         assert callable(getattr(RobotGraspingEnv, name)), name
 
 
-def test_demonstration_runs_without_a_display():
+def test_demonstration_runs_without_a_display(tmp_path):
+    """The tutorial's command, from any folder: a line on each phase, a picture and a film."""
+    repository = str(Path(__file__).resolve().parents[1])
     environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
+    command = [sys.executable, "-m", "envs.grasping_env", "env.resolution=32"]
     result = subprocess.run(
-        [sys.executable, "-m", "envs.scripted_pick"],
-        cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True, timeout=100,
+        command, cwd=tmp_path, env=environment | {"PYTHONPATH": repository},
+        capture_output=True, text=True, timeout=100,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    assert "ended by success" in result.stdout
+    for words in ("moves over", "goes down", "fingers close", "lifts it", "ended by success"):
+        assert words in result.stdout
+    (folder,) = (tmp_path / "runs" / "grasping_env").iterdir()
+    assert str(folder.relative_to(tmp_path) / "film.mp4") in result.stdout
+    assert (folder / "picture.png").stat().st_size > 10_000 < (folder / "film.mp4").stat().st_size
+
+
+# --- What is observed -------------------------------------------------------------------------
+
+
+def test_numbers_of_info_can_be_observed(make):
+    names = [name for name in INFO_OBSERVATIONS if name != "grasp_goal"]
+    env = make(observations=names)
+    for observation, *_, info in run(env, 0, 3):
+        assert env.observation_space.contains(observation)
+        for name in names:
+            np.testing.assert_array_equal(observation[name], np.float32(info[name]).reshape(-1))
+    goals = make(observations=["grasp_goal"], goal="grasp")
+    observation, info = goals.reset(seed=0)
+    np.testing.assert_array_equal(observation["grasp_goal"], np.float32(info["grasp_goal"]))
+
+
+def test_a_config_s_policy_observations_are_those_of_the_environment(tmp_path):
+    """So that any library trains on what the config's policy sees."""
+    file = Path(__file__).resolve().parents[1] / "configs" / "ppo.yaml"
+    env = gymnasium.make("RobotGrasping-v0", config=file)
+    observation, info = env.reset(seed=0)
+    assert set(observation) == {"rgb", "depth", "end_effector_position", "gripper"}
+    assert observation["gripper"].tolist() == np.float32(info["gripper"]).tolist()
+    assert observation["rgb"].shape == (64, 64, 3) and env.action_space.shape == (5,)
+    env.close()
+    chosen = gymnasium.make("RobotGrasping-v0", config=file, observations=["state"])
+    assert set(chosen.observation_space) == {"state"}, "given by name"
+    chosen.close()
+
+
+def test_depth_noise_reaches_the_environment(make, config):
+    """It is a function of the scene and the number of images, and changes the depth alone."""
+    settings = {"observations": ["rgb", "depth"]}
+    noisy = RobotGraspingEnv(config=with_settings(config, "camera", {"depth_noise": "kinect"}),
+                             resolution=64, **settings)  # fmt: skip
+    clean = make(resolution=64, **settings)
+    seen, plain = list(run(noisy, 4, 2)), list(run(clean, 4, 2))
+    again = list(run(noisy, 4, 2))
+    noisy.close()
+    assert_identical(seen, again)
+    for (observation, *_), (without, *_) in zip(seen, plain):
+        np.testing.assert_array_equal(observation["rgb"], without["rgb"])
+        known = observation["depth"] > 0
+        error = (observation["depth"] - without["depth"])[known]
+        assert 1e-3 < np.abs(error).max() and np.abs(error).mean() < 0.01 < known.mean()
 
 
 # --- Rendering --------------------------------------------------------------------------------
@@ -377,12 +430,8 @@ def potential(env, info, rest: float = 0.03, lift_height: float = 0.15) -> float
         return (1 + min(max(h, 0.0), 1.0)) / 2
     T_WE = forward_kinematics(env.cell.robot.q)
     view = Outline(cube_corners()).seen_from(env.cell.object_pose(0), T_WE)
-    w = view.way_to_grasp(env.get_gripper_width())
+    w = view.way(env.get_gripper_width())
     return (1 - np.tanh(3 * w) / 2 - np.tanh(20 * w) / 2) / 4
-
-
-def cube_corners() -> tuple[np.ndarray]:
-    return (np.array(list(itertools.product([-0.03, 0.03], repeat=3))),)
 
 
 def test_dense_rewards_telescope_over_random_actions(make):
@@ -394,42 +443,6 @@ def test_dense_rewards_telescope_over_random_actions(make):
         total += step[1]
     info = step[-1]
     assert total == pytest.approx(potential(env, info) - start, abs=1e-5)
-
-
-def test_the_way_to_a_grasp_by_hand():
-    """Of a cube of 6 cm whose centre is E's origin: around it, 10 cm over it, turned by half a
-    right angle, shut, and 10 cm beside it, from where the way goes by a point 2 cm over its top."""
-    cube, here = Outline(cube_corners()), np.diag([1.0, -1.0, -1.0, 1.0])  # E looks down
-
-    def way(x=0.0, z=0.0, yaw=0.0, opening=0.08) -> float:
-        T_WE = here.copy()
-        T_WE[:3, :3] = Rotation.from_euler("z", yaw).as_matrix() @ T_WE[:3, :3]
-        T_WE[0, 3], T_WE[2, 3] = x, z
-        return cube.seen_from(np.eye(4), T_WE).way_to_grasp(opening)
-
-    assert way() == pytest.approx(0.0, abs=1e-12)
-    assert way(z=0.1) == pytest.approx(0.1)
-    assert way(yaw=np.pi / 4) == pytest.approx(0.06 * (np.sqrt(2) - 1))
-    assert way(opening=0.0) == pytest.approx(0.07)
-    assert way(x=0.1) == pytest.approx(0.1 + 0.05)
-    assert way(x=0.1, z=0.05) == pytest.approx(0.1)
-
-
-def test_an_outline_by_hand():
-    """A plate of 4 x 2 x 1 cm turned by 30 degrees from the closing line, its centre 5 cm under E:
-    along a line turned by t its shadow is 4 |cos (30 - t)| + 2 |sin (30 - t)| cm wide."""
-    corners = itertools.product([-0.02, 0.02], [-0.01, 0.01], [-0.005, 0.005])
-    plate = Outline((np.array(list(corners)),))
-    T_WO = np.eye(4)
-    T_WO[:3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
-    T_WE = np.eye(4)  # upright hand whose closing line is x
-    T_WE[:3, :3] = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]).T
-    T_WE[2, 3] = 0.05
-    view = plate.seen_from(T_WO, T_WE)
-    t = np.radians(30 - 25 * np.arange(8))
-    widths = 0.04 * abs(np.cos(t)) + 0.02 * abs(np.sin(t))
-    np.testing.assert_allclose(view.outline(), [*widths, 0.005 - 0.05], atol=1e-12)
-    np.testing.assert_allclose(view.offset, [0, 0, 0.05], atol=1e-12)
 
 
 def test_episodes_can_begin_near_an_object(make):
@@ -445,14 +458,16 @@ def test_episodes_can_begin_near_an_object(make):
         np.testing.assert_allclose(env.cell.robot.q, before, atol=0.02)
     _, at_home = env.reset(seed=0, options={"start": "home"})
     assert at_home["end_effector_position"][2] > 0.4
-    with pytest.raises(UserError, match="start must be 'home', 'near', 'look' or .*, got 'here'"):
+    with pytest.raises(
+        UserError, match="start must be 'home', 'near', 'pretraining' or .*, got 'here'"
+    ):
         env.reset(options={"start": "here"})
 
 
-def test_looks_are_from_many_places_at_each_scene(make):
+def test_pretraining_states_are_many_at_each_scene(make):
     env = make(control="ee_planar", goal="grasp")
-    look = {"start": "look"}
-    infos = [env.reset(seed=3 if n == 0 else None, options=look)[1] for n in range(33)]
+    pretraining = {"start": "pretraining"}
+    infos = [env.reset(seed=3 if n == 0 else None, options=pretraining)[1] for n in range(33)]
     scenes = [info["scene_seed"] for info in infos]
     assert scenes == [scenes[0]] * 16 + [scenes[16]] * 16 + [scenes[32]]
     assert len(set(scenes)) == 3
@@ -462,24 +477,24 @@ def test_looks_are_from_many_places_at_each_scene(make):
     hands = np.array([info["end_effector_position"] for info in infos[:32]])
     assert (np.ptp(hands, axis=0) > 0.1).all()
     assert np.ptp([info["gripper"][0] for info in infos]) > 0.04
-    squeezes = np.array([info["squeeze"][0] for info in infos])
+    errors = np.array([info["opening_error"][0] for info in infos])
     commands = np.array([info["gripper"] for info in infos])
-    np.testing.assert_allclose(squeezes, commands[:, 0] - commands[:, 1], atol=1e-6)
-    assert 0.25 < np.mean(squeezes > 1e-3) < 0.75, "about half of them while the fingers close"
-    again = [env.reset(seed=3 if n == 0 else None, options=look)[1] for n in range(2)]
+    np.testing.assert_allclose(errors, commands[:, 0] - commands[:, 1], atol=1e-6)
+    assert 0.25 < np.mean(errors > 1e-3) < 0.75, "about half of them while the fingers close"
+    again = [env.reset(seed=3 if n == 0 else None, options=pretraining)[1] for n in range(2)]
     for info, before in zip(again, infos):
         np.testing.assert_array_equal(info["grasp_goal"], before["grasp_goal"])
 
 
-def test_an_action_or_a_scene_that_is_asked_for_ends_the_looks_at_one(make):
+def test_an_action_or_a_chosen_scene_ends_the_pretraining_at_a_scene(make):
     env = make(control="ee_planar")
-    _, first = env.reset(seed=3, options={"start": "look"})
-    _, second = env.reset(options={"start": "look"})
+    _, first = env.reset(seed=3, options={"start": "pretraining"})
+    _, second = env.reset(options={"start": "pretraining"})
     assert second["scene_seed"] == first["scene_seed"]
     env.step(np.array([0, 0, 0, 0, 1.0]))
-    _, third = env.reset(options={"start": "look"})
+    _, third = env.reset(options={"start": "pretraining"})
     assert third["scene_seed"] != first["scene_seed"]
-    _, asked = env.reset(options={"start": "look", "scene_seed": 7})
+    _, asked = env.reset(options={"start": "pretraining", "scene_seed": 7})
     assert asked["scene_seed"] == 7
 
 
@@ -588,7 +603,7 @@ def test_bad_actions_are_refused(make, control):
     env, size = make(control=control), CONTROLS[control]
     env.reset(seed=0)
     for shape in [(size + 1,), (1, size), ()]:
-        with pytest.raises(InvalidAction, match=rf"{control}.*\({size},\)"):
+        with pytest.raises(InvalidAction, match=rf"{control}.*\({size},\): .*gripper, each in"):
             env.step(np.zeros(shape))
     for bad in (np.nan, np.inf, -np.inf):
         with pytest.raises(InvalidAction, match="non-finite"):
@@ -616,6 +631,10 @@ def test_life_cycle_errors(make):
         ({"control": "cartesian"}, r"env\.control.*cartesian"),
         ({"observations": []}, r"env\.observations"),
         ({"observations": ["state", "state"]}, r"env\.observations.*repeated"),
+        ({"observations": ["stat"]}, r"env\.observations.*did you mean state"),
+        ({"observations": ["grasp_goal"]}, r"env\.observations.*'grasp_goal'"),
+        ({"reward": "dence"}, r"env\.reward.*dense, sparse, or an import path"),
+        ({"reward": "no_such_module:reward"}, r"env\.reward.*no_such_module"),
         ({"resolution": 8}, r"env\.resolution.*16"),
         ({"max_steps": 0}, r"env\.max_steps"),
         ({"objects": "no_such_set"}, r"env\.objects.*random_urdfs"),
@@ -624,7 +643,7 @@ def test_life_cycle_errors(make):
     ],
 )
 def test_wrong_settings_name_their_key(make, settings, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(UserError, match=message):
         make(**settings)
 
 

@@ -1,14 +1,24 @@
-"""Grasps that an object offers, and the way to them, against shapes whose grasps are known."""
+"""Rewards: the way to an object and to its grasps, against shapes whose grasps are known."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.grasp_goals import GoalView, GraspGoals
+from envs.env_rewards import (
+    REWARDS,
+    GoalView,
+    GraspGoals,
+    Outline,
+    RewardState,
+    make_reward,
+    progress,
+)
+from tests.helpers.shapes import cube_corners
 from tests.test_geometry import CORNERS
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject
 
@@ -36,7 +46,9 @@ def hand(position, yaw: float) -> np.ndarray:
 def goals_of(parts, T_WO: np.ndarray) -> GraspGoals:
     """Of an object of convex parts (V, 3) in its own frame."""
     solids = tuple(ConvexSolid.from_vertices(part).transformed(T_WO) for part in parts)
-    return GraspGoals(SceneGeometry((SolidObject(solids, T_WO[:3, 3], 0.8),)), T_WO, GripperGeometry())
+    return GraspGoals(
+        SceneGeometry((SolidObject(solids, T_WO[:3, 3], 0.8),)), T_WO, GripperGeometry()
+    )
 
 
 def brick() -> GraspGoals:
@@ -69,8 +81,8 @@ def test_goals_go_with_their_object():
     moved = pose(PLACE + [0.03, -0.02, 0.01], YAW + 0.7)
     motion = moved @ np.linalg.inv(pose())
     after = goals.seen_from(moved, motion @ hand([0.52, 0.07, 0.2], 0.4))
-    np.testing.assert_allclose(after.told()[:9], before.told()[:9], atol=1e-9)
-    np.testing.assert_allclose(after.told()[9:], before.told()[9:] + 0.01, atol=1e-9)
+    np.testing.assert_allclose(after.vector()[:9], before.vector()[:9], atol=1e-9)
+    np.testing.assert_allclose(after.vector()[9:], before.vector()[9:] + 0.01, atol=1e-9)
 
 
 def test_leaning():
@@ -116,7 +128,7 @@ def test_the_way_to_a_goal_by_hand():
 
     def way(x=0.0, y=0.0, up=0.0, turn=0.0, opening=0.07, wide=0.08) -> float:
         offset = np.array([x, y, up])
-        return GoalView(offset, turn, 0.05, wide, 0.05, 0.03 + up).way_to_grasp(opening)
+        return GoalView(offset, turn, 0.05, wide, 0.05, 0.03 + up).way(opening)
 
     assert way() == pytest.approx(0.0)
     assert way(up=0.1) == pytest.approx(0.1), "straight down"
@@ -126,3 +138,80 @@ def test_the_way_to_a_goal_by_hand():
     assert way(turn=1.0) == pytest.approx(0.04 + 0.06), "not down without having turned"
     assert way(opening=0.08, wide=0.03) == pytest.approx(0.04 + 0.05), "nor into the other wall"
     assert way(opening=0.02) == pytest.approx(0.04 + 0.03), "nor onto the object, half shut"
+
+
+# --- The way to an object -----------------------------------------------------------------------
+
+
+def test_the_way_to_a_grasp_by_hand():
+    """Of a cube of 6 cm whose centre is E's origin: around it, 10 cm over it, turned by half a
+    right angle, shut, and 10 cm beside it, from where the way goes by a point 2 cm over its top."""
+    cube, here = Outline(cube_corners()), np.diag([1.0, -1.0, -1.0, 1.0])  # E looks down
+
+    def way(x=0.0, z=0.0, yaw=0.0, opening=0.08) -> float:
+        T_WE = here.copy()
+        T_WE[:3, :3] = Rotation.from_euler("z", yaw).as_matrix() @ T_WE[:3, :3]
+        T_WE[0, 3], T_WE[2, 3] = x, z
+        return cube.seen_from(np.eye(4), T_WE).way(opening)
+
+    assert way() == pytest.approx(0.0, abs=1e-12)
+    assert way(z=0.1) == pytest.approx(0.1)
+    assert way(yaw=np.pi / 4) == pytest.approx(0.06 * (np.sqrt(2) - 1))
+    assert way(opening=0.0) == pytest.approx(0.07)
+    assert way(x=0.1) == pytest.approx(0.1 + 0.05)
+    assert way(x=0.1, z=0.05) == pytest.approx(0.1)
+
+
+def test_an_outline_by_hand():
+    """A plate of 4 x 2 x 1 cm turned by 30 degrees from the closing line, its centre 5 cm under E:
+    along a line turned by t its shadow is 4 |cos (30 - t)| + 2 |sin (30 - t)| cm wide."""
+    corners = itertools.product([-0.02, 0.02], [-0.01, 0.01], [-0.005, 0.005])
+    plate = Outline((np.array(list(corners)),))
+    T_WO = np.eye(4)
+    T_WO[:3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    T_WE = np.eye(4)  # upright hand whose closing line is x
+    T_WE[:3, :3] = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]).T
+    T_WE[2, 3] = 0.05
+    view = plate.seen_from(T_WO, T_WE)
+    t = np.radians(30 - 25 * np.arange(8))
+    widths = 0.04 * abs(np.cos(t)) + 0.02 * abs(np.sin(t))
+    np.testing.assert_allclose(view.vector(), [*widths, 0.005 - 0.05], atol=1e-12)
+    np.testing.assert_allclose(view.offset, [0, 0, 0.05], atol=1e-12)
+
+
+# --- Terms --------------------------------------------------------------------------------------
+
+
+def state_of(**changes) -> RewardState:
+    """Nothing gripped, 10 cm away, no progress."""
+    return RewardState(
+        **{
+            "success": False, "grasped": False, "way": 0.1, "lift": 0.0, "progress": 0.1,
+            "progress_before": 0.1, "action": np.zeros(5), "reachable": True, "opening": 0.08,
+            "hand_position": np.zeros(3), "object_position": np.zeros(3), **changes,
+        }
+    )  # fmt: skip
+
+
+def test_progress_by_hand():
+    assert progress(False, 0.0, 0.0) == 0.25, "at the grasp"
+    assert progress(False, 100.0, 0.0) == pytest.approx(0.0), "far away"
+    near = 0.25 - (math.tanh(0.3) + math.tanh(2.0)) / 8
+    assert progress(False, 0.1, 0.9) == pytest.approx(near)
+    assert (progress(True, 0.0, 0.0), progress(True, 0.0, 0.4)) == (0.5, 0.7)
+
+
+def test_rewards_add_their_terms():
+    state = state_of(success=True, progress=0.9, progress_before=0.5)
+    assert make_reward("dense")(state) == pytest.approx(1.0 + 0.4)
+    assert make_reward("sparse")(state) == 1.0
+    assert make_reward("dense")(state_of()) == make_reward("sparse")(state_of()) == 0.0
+    assert set(REWARDS) == {"dense", "sparse"}
+
+
+def test_a_reward_by_import_path(tmp_path, monkeypatch):
+    (tmp_path / "far_reward.py").write_text(
+        "def by_height(state):\n    return state.lift - state.way\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert make_reward("far_reward:by_height")(state_of(lift=0.5)) == pytest.approx(0.4)
