@@ -1,0 +1,115 @@
+"""README and docs say what is there: both languages alike, every file and link, generated tables.
+
+The tables of README and docs/results.md are those that `docs/results/*.json` give; what they are
+drawn with is tested by `test_result_tables`.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from benchmarks.result_tables import PAGES, with_tables
+from benchmarks.results import FIGURES
+from utils.config import load_config
+
+ROOT = Path(__file__).resolve().parent.parent
+READMES = (ROOT / "README.md", ROOT / "README.zh-CN.md")
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+# Files that a reader brings or a run leaves.
+READERS_OWN = re.compile(
+    r"^(runs/|data/|path/to/|my|color\.png|depth\.png|scene\.png|results\.|report\.html|~|\$|"
+    r"NAME|FILE|.*[<*{])"
+)
+
+
+def text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def code_blocks(text: str) -> list[str]:
+    return re.findall(r"```\w*\n(.*?)```", text, re.DOTALL)
+
+
+def commands(text: str) -> list[list[str]]:
+    """The shell commands of a page's blocks, without comments, as words."""
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [shlex.split(line, comments=True) for line in lines if line.strip()]
+
+
+def code(text: str) -> list[str]:
+    """Code blocks without comments."""
+    return [re.sub(r" *#.*", "", block) for block in code_blocks(text)]
+
+
+def anchor(heading: str) -> str:
+    """A heading's anchor, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower().replace("`", "")).replace(" ", "-")
+
+
+def test_readme_is_short():
+    assert len(text_of(READMES[0]).splitlines()) <= 150
+    assert len(text_of(READMES[1]).splitlines()) <= 150
+
+
+def test_both_languages_have_the_same_commands_links_names_and_figures():
+    english, chinese = map(text_of, READMES)
+    assert code(english) == code(chinese)
+    links = [re.findall(r"\]\(([^)]+)\)", text)[1:] for text in (english, chinese)]
+    assert links[0] == links[1]  # but the first, which leads to the other language
+    for pattern in (r"(?<!`)`([^`\n]+)`(?!`)", r"\d[\d,.]*\d|\d"):
+        prose = [
+            sorted(set(re.findall(pattern, re.sub(r"```.*?```", "", text, flags=re.DOTALL))))
+            for text in (english, chinese)
+        ]
+        assert prose[0] == prose[1]
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
+        if target.startswith("http"):
+            continue
+        file, _, place = target.partition("#")
+        path = (page.parent / file).resolve() if file else page
+        assert path.exists(), f"{page.name} links {target}"
+        if place:
+            headings = re.findall(r"^#+ +(.*)$", text_of(path), re.MULTILINE)
+            assert place in map(anchor, headings), f"{page.name} links {target}"
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
+def test_named_files_exist(page):
+    """Every `folder/file.py`, `configs/x.yaml` and module of `python -m` on a page."""
+    text = text_of(page)
+    named = set(re.findall(r"(?<![\w/.-])((?:[\w.-]+/)+[\w.-]+\.(?:py|yaml|md|pt|j2|toml))", text))
+    bare = set(re.findall(r"(?<![\w/.-])(\w+\.py)\b", " ".join(code_blocks(text))))
+    for name in sorted(named | bare):
+        if READERS_OWN.match(name):
+            continue
+        places = [ROOT / name, page.parent / name]
+        assert any(place.exists() for place in places), f"{page.name} names {name}"
+    for module in set(re.findall(r"python -m ([\w.]+)", text)) - {"pytest", "venv", "pip"}:
+        assert (ROOT / (module.replace(".", "/") + ".py")).exists(), f"{page.name} names {module}"
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
+def test_overrides_of_commands_are_keys_of_the_config(page):
+    overrides = [
+        word
+        for words in commands(text_of(page))
+        if any(word.endswith(".py") for word in words)
+        for word in words
+        if re.match(r"[a-z_]+(\.[a-z_]+)*=", word) and "<" not in word and "..." not in word
+    ]
+    load_config(None, overrides)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_are_those_of_the_measured_figures(page):
+    text = text_of(ROOT / page)
+    assert text == with_tables(text, ROOT / FIGURES, "zh" in page), "make results ARGS=--write"
