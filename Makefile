@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run quick test test-fast lint bench results clean
+.PHONY: run quick test test-fast lint typecheck bench results clean
+
+# Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
+PARALLEL := -n 2 --dist loadfile
+test test-fast: export OMP_NUM_THREADS := 1
 
 run: $(VENV)/.installed
 	$(BIN)/python evaluate.py $(ARGS)
@@ -15,16 +19,20 @@ quick: $(VENV)/.installed
 	$(BIN)/python evaluate.py --config configs/quick.yaml
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q --durations=10 $(ARGS)
+	$(BIN)/python -m pytest -q $(PARALLEL) --durations=10 $(ARGS)
 
 test-fast: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -q $(PARALLEL) -m "not slow" $(ARGS)
 
 # Style, and who imports whom (pyproject.toml, tests/test_layers.py).
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python -m pytest -q tests/test_layers.py
+
+# Types of the public modules that pyproject.toml lists.
+typecheck: $(VENV)/.installed-dev
+	$(BIN)/mypy
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.bench_env $(ARGS)

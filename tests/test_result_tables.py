@@ -1,0 +1,109 @@
+"""Tables of figures made up here, so that every cell is known; parts and commands of make results."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks import results
+from benchmarks.result_tables import PAGES, TABLES, rate, with_tables
+from benchmarks.results import PARTS, chosen_parts, keep_rounds, main
+from utils.config import load_config
+from utils.errors import UserError
+
+
+def row(policy: str, successes: int, attempts: int, objects: str = "random_urdfs") -> dict:
+    return {
+        "policy": policy, "scenario": "pile", "objects": objects, "controller": "open_loop",
+        "successes": successes, "attempts": attempts, "objects_cleared": successes,
+        "objects_total": 500, "plan_ms_median": 24.4, "picks_per_hour": 536.2,
+    }  # fmt: skip
+
+
+def figures(folder, name: str, rows: list[dict]) -> None:
+    pair = {
+        "first": "graspnet", "second": "heuristic", "scenario": "pile", "objects": "random_urdfs",
+        "success": {"value": 0.015, "low": -0.002, "high": 0.0311}, "cleared": None,
+    }  # fmt: skip
+    command = {"command": "python evaluate.py seed=2027", "rows": rows, "comparisons": [pair]}
+    part = {"part": name, "commit": 40 * "a", "seed": 2027, "date": "2026-11-22"}
+    (folder / f"{name}.json").write_text(json.dumps(part | {"commands": {name: command}}))
+
+
+def test_rate_has_wilsons_interval():
+    """Newcombe, Stat. Med. 17 (1998), table I, method 3: 81 of 263 is 0.2553 to 0.3662."""
+    assert rate(81, 263) == "31 % [26, 37] (81/263)"
+    assert rate(0, 0) == "-"
+
+
+def test_a_table_is_written_between_its_marks_with_commit_seed_and_command(tmp_path):
+    figures(tmp_path, "clutter15", [row("heuristic", 81, 263)])
+    page = "before\n<!-- results:clutter15 -->\nold\n<!-- /results -->\nafter\n"
+    written = with_tables(page, tmp_path)
+    assert written.startswith("before\n<!-- results:clutter15 -->\n| planner |")
+    assert written.endswith("<!-- /results -->\nafter\n") and "old" not in written
+    cells = "| `heuristic` | 31 % [26, 37] (81/263) | 16 % [13, 20] (81/500) | 24 ms | 536 |"
+    assert cells in written.splitlines()
+    assert "commit `aaaaaaaaaa` (2026-11-22), seed 2027: `python evaluate.py seed=2027`" in written
+    assert with_tables(written, tmp_path) == written
+
+
+def test_both_languages_have_the_same_figures(tmp_path):
+    rows = [row("heuristic", 400, 500), row("graspnet", 450, 500)]
+    for part in ("scoreboard", "clutter15"):
+        figures(tmp_path, part, rows)
+    page = "<!-- results:planners -->\n<!-- /results -->\n"
+    english, chinese = with_tables(page, tmp_path), with_tables(page, tmp_path, chinese=True)
+    assert "is +1.5 [-0.2, +3.1] points" in english and "规划器" in chinese
+    assert "| `graspnet` | 90 % [87, 92] (450/500) |" in english
+    assert [line for line in english.splitlines() if "`" in line and "|" in line] == [
+        line for line in chinese.splitlines() if "`" in line and "|" in line
+    ]
+
+
+def test_a_table_that_is_not_measured_says_how_to(tmp_path):
+    written = with_tables("<!-- results:servo -->\n<!-- /results -->", tmp_path)
+    assert "*not measured yet: `make results PARTS=servo`*" in written
+
+
+def test_every_table_stands_on_a_page_and_needs_known_parts():
+    marked = "".join((results.REPOSITORY / page).read_text(encoding="utf-8") for page in PAGES)
+    assert all(f"<!-- results:{name} -->" in marked for name in TABLES)
+    parts = {part.name for part in PARTS}
+    assert {need for needs, _ in TABLES.values() for need in needs} == parts
+
+
+def test_parts_are_chosen_by_name():
+    assert [part.name for part in chosen_parts("servo, ppo")] == ["servo", "ppo"]
+    with pytest.raises(UserError, match="'serv' is no part; choose among scoreboard"):
+        chosen_parts("serv")
+
+
+def test_commands_are_valid_and_take_fresh_seeds(capsys):
+    """Seeds used while developing stand in docs/results.md; the tables' is none of them."""
+    assert results.SEED == 2027
+    for part in PARTS:
+        for command in part.commands:
+            words = command.line(command.scaled(0.001)).split()
+            if words[1].endswith(".py"):
+                overrides = [w for w in words[2:] if "=" in w and "path/to" not in w]
+                assert load_config(None, overrides).seed == 2027
+    assert main(["--list", "--scale", "0.1"]) == 0
+    assert "seed=2027" in capsys.readouterr().out
+
+
+def test_the_first_rounds_of_each_row_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "FIGURES", tmp_path)
+    lines = [
+        json.dumps({"objects": "box", "scenario": "pile", "policy": policy, "seed": 202700000 + i})
+        for i in (12, 1, 10, 9)
+        for policy in ("oracle", "heuristic")
+    ]
+    (tmp_path / "rounds.jsonl").write_text("\n".join(lines) + "\n")
+    part = PARTS[0]
+    keep_rounds(part, part.commands[0], tmp_path)
+    kept = (tmp_path / "scoreboard-scoreboard.jsonl").read_text().splitlines()
+    assert [(json.loads(x)["policy"], json.loads(x)["seed"] % 100) for x in kept] == [
+        ("heuristic", 1), ("heuristic", 9), ("oracle", 1), ("oracle", 9),
+    ]  # fmt: skip
