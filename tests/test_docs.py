@@ -114,3 +114,12 @@ def test_overrides_of_commands_are_keys_of_the_config(page):
 def test_tables_are_those_of_the_measured_figures(page):
     text = text_of(ROOT / page)
     assert text == with_tables(text, ROOT / FIGURES, "zh" in page), "make results ARGS=--write"
+
+
+def test_architecture_lists_every_module_once():
+    text = text_of(ROOT / "docs/architecture.md")
+    for folder in ("envs", "models", "utils"):
+        room = text.split(f"### `{folder}/`")[1].split("\n### ")[0]
+        listed = re.findall(r"^\| `(\w+\.py)`", room, re.MULTILINE)
+        there = {path.name for path in (ROOT / folder).glob("*.py")} - {"__init__.py"}
+        assert sorted(listed) == sorted(there)
