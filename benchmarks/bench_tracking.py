@@ -28,8 +28,7 @@ from utils.config import load_config, run_script
 from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
-from utils.table_plane import planar, planar_part
-from utils.transforms import Grasp, inverse_pose, position_quaternion
+from utils.transforms import Grasp, inverse_pose, planar, planar_part, position_quaternion
 
 OBJECT_SETS = ("random_urdfs", "primitives")
 HEIGHTS = (0.25, 0.16, 0.10)  # m over the grasp: far, where the near stage begins, and below that

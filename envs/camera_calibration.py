@@ -19,7 +19,7 @@ from envs.board import Board
 from envs.camera import Intrinsics, wrist_mount
 from envs.cell import Cell
 from envs.robot_kinematics import forward_kinematics
-from utils.table_plane import table_plane
+from utils.table_plane import fit_table_plane
 from utils.transforms import RGBDFrame, inverse_pose
 
 _BOARD_DEPTH = 0.25  # m from the camera to the board on the jig
@@ -68,7 +68,7 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
     """The frame with its camera turned about its own place and lifted so that the table that it
     shows is level at z = `table`: a planner that believes the table to stand two centimetres in
     the air plans nothing. Place and heading stay as wrong as they were."""
-    normal, offset = table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), table)
+    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), table)
     up = frame.T_WC[:3, :3] @ normal
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
     T_WC = frame.T_WC.copy()

@@ -59,11 +59,11 @@ from utils.errors import (
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
 from utils.servo_loop import ServoView, VisualServo
-from utils.table_plane import planar_part
 from utils.transforms import (
     Grasp,
     RGBDFrame,
     inverse_pose,
+    planar_part,
     pose_exp,
     top_down_pose,
     transform_points,

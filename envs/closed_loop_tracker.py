@@ -24,8 +24,7 @@ from envs.robot_kinematics import forward_kinematics
 from utils.depth import make_depth_noise
 from utils.errors import TargetLostError
 from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
-from utils.table_plane import planar, planar_part
-from utils.transforms import Grasp, RGBDFrame, inverse_pose
+from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part
 
 _NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
 

@@ -21,8 +21,7 @@ import numpy as np
 
 from envs.camera_calibration import CameraCalibration, true_calibration, wrong_calibration
 from envs.cell import Cell
-from utils.table_plane import planar
-from utils.transforms import inverse_pose
+from utils.transforms import inverse_pose, planar
 
 _START_SECONDS = 0.2  # in which a conveyor gets up to speed: what stands must not topple
 

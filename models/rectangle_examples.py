@@ -23,7 +23,6 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from scipy.optimize import least_squares
 from torch.utils.data import Dataset
 
 from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_input
@@ -33,6 +32,7 @@ from utils.augmentation import Augmentation, LabelledImage
 from utils.real_data import RealSample
 from utils.rectangles import GraspRectangle, intersection_over_union, rasterise, rectangle_match
 from utils.runs import write_atomic
+from utils.table_plane import robust_fit
 from utils.transforms import angle_difference
 
 FLAT = 0.005  # of the table's distance: noise, below which a pixel belongs to the table
@@ -101,10 +101,8 @@ def _inverse_table(depth: np.ndarray, side: int) -> np.ndarray:
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     seen = _central(terms * depth[..., None], side)[::TABLE_STEP, ::TABLE_STEP].reshape(-1, 6)
     start = np.linalg.lstsq(seen, np.ones(len(seen)), rcond=None)[0]
-    found = least_squares(
-        lambda x: seen @ x - 1, start, jac=lambda x: seen, loss="cauchy", f_scale=FLAT
-    )
-    return terms @ found.x
+    found, _ = robust_fit(lambda x: seen @ x - 1, start, FLAT, jac=lambda x: seen)
+    return terms @ found
 
 
 def _central(image: np.ndarray, side: int) -> np.ndarray:

@@ -24,8 +24,8 @@ from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbe
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.config_types import ScoredScenario
-from utils.table_plane import planar_part, table_plane
-from utils.transforms import inverse_pose, top_down_pose
+from utils.table_plane import fit_table_plane
+from utils.transforms import inverse_pose, planar_part, top_down_pose
 
 CLOSED = ("pbvs", "ibvs", "hybrid")
 
@@ -275,7 +275,7 @@ def test_levelling_finds_the_table_and_leaves_the_place(cell, scene):
     frame = cell.frame()
     wrong = wrong_calibration(cell, np.random.default_rng(0), 0.01, np.radians(2)).T_WC
     levelled = level(replace(frame, T_WC=wrong))
-    normal, offset = table_plane(frame.depth, frame.K, inverse_pose(levelled.T_WC))
+    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(levelled.T_WC))
     np.testing.assert_allclose(levelled.T_WC[:3, :3] @ normal, [0, 0, 1], atol=1e-9)
     assert levelled.T_WC[2, 3] == pytest.approx(0.8, abs=1e-3)  # as high as it truly is
     np.testing.assert_allclose(levelled.T_WC[:2, 3], wrong[:2, 3])  # as far off as it was

@@ -26,8 +26,7 @@ from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, disturbed
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
-from utils.table_plane import planar_part
-from utils.transforms import top_down_pose
+from utils.transforms import planar_part, top_down_pose
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -8,8 +8,8 @@ import pytest
 from envs.camera import Intrinsics
 from utils.errors import TargetLostError
 from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
-from utils.table_plane import planar, planar_part, table_plane
-from utils.transforms import Grasp, RGBDFrame, inverse_pose, look_at, project
+from utils.table_plane import fit_table_plane
+from utils.transforms import Grasp, RGBDFrame, inverse_pose, look_at, planar, planar_part, project
 
 OVERHEAD = Intrinsics(224, 224, 28.0)
 WRIST = Intrinsics(132, 180, 72.0)
@@ -111,7 +111,7 @@ def test_the_table_is_fitted_under_a_wrong_belief():
     depth = depth_of_block(WRIST, T_WC, planar(0.5, 0, 0))
     believed = T_WC @ planar(0, 0, 0)
     believed[2, 3] += 0.01
-    normal, offset = table_plane(depth, WRIST.K, inverse_pose(believed))
+    normal, offset = fit_table_plane(depth, WRIST.K, inverse_pose(believed))
     np.testing.assert_allclose(normal, T_WC[2, :3], atol=2e-3)
     np.testing.assert_allclose(offset, 0.5, atol=5e-4)
 

@@ -30,8 +30,8 @@ import cv2
 import numpy as np
 
 from utils.errors import TargetLostError
-from utils.table_plane import planar, planar_part, table_frame, table_plane
-from utils.transforms import Grasp, RGBDFrame, inverse_pose, transform_points
+from utils.table_plane import fit_table_plane, table_frame
+from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part, transform_points
 
 CELL = 0.002  # m, side of a template's cell
 LOWEST = 0.004  # m over the table from which a point counts as an object's
@@ -192,7 +192,7 @@ class TemplateMatcher:
         T_CO: (4, 4) where it is expected. T_CW: (4, 4) the world in the camera, as it is believed,
         for a first idea of the table. Raises TargetLostError.
         """
-        T_PC = table_frame(*table_plane(depth, self.K, T_CW, table))
+        T_PC = table_frame(*fit_table_plane(depth, self.K, T_CW, table))
         x, y, turn = planar_part(T_PC @ T_CO)
         expected = planar(x, y, turn)
         if self.seen_share(inverse_pose(T_PC) @ expected) < _SEEN:

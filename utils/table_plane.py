@@ -1,18 +1,12 @@
-"""The table under an object: where a depth image shows it, and motions in its plane.
+"""The table's plane in images of depth or of distance.
 
-Frames: C camera, W world, P the table as the camera sees it (origin below the camera, z up).
+Each situation has a fit of its own: `fit_table_plane` improves a plane that is known to a few
+centimetres; `dominant_plane` and `find_table` search the plane of an image of which nothing is
+known (RANSAC, then least squares); `find_table_camera` finds both the table and the place from
+which an image's distances are measured. All go through `fit_plane` or `robust_fit`.
 
-The table as the dominant plane of a depth image: RANSAC, then least squares on its points.
-
-"Dominant" is all that a depth image can tell: a wall that fills more of the image than the table
-would be taken for it. This module knows no network and no simulator.
-
-A camera over a table, found from how far each pixel's point is from a place that is not it.
-
-Cornell's depth images are of that kind. Its point clouds are given in the robot's frame, and the
-images made from them, as `DepthImage.from_pcd` of github.com/dougsm/ggcnn does, hold the length of
-each point's coordinates. Taken for depths they bend the table by centimetres; as distances from the
-robot they leave it flat, and say where camera and robot are. This module knows no file format.
+Frames: C camera, W world, P the table as the camera sees it (origin below the camera, z up). This
+module knows no file format, no network and no simulator.
 """
 
 from __future__ import annotations
@@ -26,15 +20,47 @@ from scipy.optimize import least_squares
 from utils.errors import TargetLostError, UserError
 from utils.transforms import inverse_pose, known_depth, transform_points
 
+
+def fit_plane(points: np.ndarray, fast: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) unit normal, of either sign, and (3,) centre of the plane with the least sum of squared
+    distances to points (N, 3).
+
+    fast: from the 3x3 scatter matrix, for control loops; the normal of the singular value
+    decomposition is exact to more digits.
+    """
+    centre = points.mean(axis=0)
+    if fast:
+        # Not one array used twice: NumPy would take another routine, with other last digits.
+        scatter = (points - centre).T @ (points - centre)
+        return np.linalg.eigh(scatter)[1][:, 0], centre
+    return np.linalg.svd(points - centre, full_matrices=False)[2][-1], centre
+
+
+def robust_fit(
+    errors: Callable[..., np.ndarray], start: np.ndarray, scale: float, args=(), jac="2-point"
+) -> tuple[np.ndarray, float]:
+    """The parameters that make most of the `errors` small, and the median of their absolute values.
+
+    errors: function of the parameters and `args`. scale: error beyond which a point counts ever
+    less (Cauchy's loss). jac: derivative of the errors, as in `scipy.optimize.least_squares`.
+    """
+    found = least_squares(errors, start, jac=jac, loss="cauchy", f_scale=scale, args=args)
+    return found.x, float(np.median(np.abs(found.fun)))
+
+
+# --- A plane that is roughly known ----------------------------------------------------------
+
 _PLANE_BANDS = (0.035, 0.012, 0.004)  # m around the expected table, narrower and narrower
 _PLANE_SHARE = 0.15  # of the known pixels that have to lie on the table
 
 
-def table_plane(depth: np.ndarray, K: np.ndarray, T_CW: np.ndarray, table: float = 0.0):
+def fit_table_plane(
+    depth: np.ndarray, K: np.ndarray, T_CW: np.ndarray, table: float = 0.0
+) -> tuple[np.ndarray, float]:
     """(3,) unit normal towards the camera and offset d (metres) of the table, n . p + d = 0 in C.
 
-    Least squares on the pixels near the plane z = `table` of W, which T_CW (4, 4) has to tell to a
-    few centimetres only. Raises TargetLostError where too little of it is seen.
+    Least squares on the pixels near the plane z = `table` of W; T_CW (4, 4) has to be right to a
+    few centimetres. Raises TargetLostError where the image shows too little of the table.
     """
     step = max(1, int(np.sqrt(depth.size / 8000)))
     z = depth[::step, ::step].astype(float)
@@ -47,15 +73,14 @@ def table_plane(depth: np.ndarray, K: np.ndarray, T_CW: np.ndarray, table: float
         near = points[np.abs(points @ normal + offset) < band]
         if len(near) < max(50, _PLANE_SHARE * len(points)):
             raise TargetLostError("target lost: the table it stands on is not in the depth image")
-        centre = near.mean(axis=0)
-        axis = np.linalg.eigh((near - centre).T @ (near - centre))[1][:, 0]
+        axis, centre = fit_plane(near, fast=True)
         normal = axis if axis @ normal > 0 else -axis
         offset = -normal @ centre
     return normal, float(offset)
 
 
 def table_frame(normal: np.ndarray, offset: float) -> np.ndarray:
-    """(4, 4) T_PC of a table n . p + d = 0 in C: P lies on it below the camera, z up."""
+    """(4, 4) T_PC of a table n . p + d = 0 in C: the origin of P lies on it below the camera."""
     x = np.array([1.0, 0, 0]) - normal[0] * normal
     x /= np.linalg.norm(x)
     T_CP = np.eye(4)
@@ -64,23 +89,14 @@ def table_frame(normal: np.ndarray, offset: float) -> np.ndarray:
     return inverse_pose(T_CP)
 
 
-def planar(x: float, y: float, turn: float) -> np.ndarray:
-    """(4, 4) motion in the plane: a turn about z, then a shift."""
-    T = np.eye(4)
-    c, s = np.cos(turn), np.sin(turn)
-    T[:2, :2], T[:2, 3] = [[c, -s], [s, c]], (x, y)
-    return T
+# --- The dominant plane ---------------------------------------------------------------------
 
-
-def planar_part(T: np.ndarray) -> tuple[float, float, float]:
-    """x, y and turn about z of a (4, 4) pose whose z axis is nearly that of its parent."""
-    return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
-
-
+# "Dominant" is all that a depth image can tell: a wall that fills more of the image than the table
+# is taken for it.
 TOLERANCE = 0.01  # of the median distance: depth noise, and tables that are not quite flat
 SMALLEST_SHARE = 0.2  # of the known points that the table has to hold
-TRIALS = 300  # with a fifth of the points on the plane, 91 % to draw it; with a third, 99.999 %
-POINTS = 4000  # that are looked at; they are spread over the image
+TRIALS = 300  # they find a plane with a fifth of the points in 91 % of cases, a third in 99.999 %
+POINTS = 4000  # spread over the image, on which the search works
 REFITS = 5
 SPREADS = 2.5  # robust standard deviations within which a point belongs to the refitted plane
 
@@ -117,7 +133,7 @@ class Plane:
 
 
 def dominant_plane(points: np.ndarray, seed: int = 0) -> Plane:
-    """The plane that most points (..., 3) in the camera's frame lie on; rows of NaN are unknown.
+    """The plane on which most points (..., 3) in the camera's frame lie; rows of NaN are unknown.
 
     Raises UserError where no plane holds a fifth of the points.
     """
@@ -130,10 +146,11 @@ def dominant_plane(points: np.ndarray, seed: int = 0) -> Plane:
     sample = known[random.permutation(len(known))[:POINTS]]
     best = _ransac(sample, tolerance, random)
     near = sample[np.abs(sample @ best[:3] + best[3]) < tolerance]
-    for _ in range(REFITS):  # nearer and nearer points, so that low objects do not tilt it
+    for _ in range(REFITS):  # with ever nearer points, so that low objects do not tilt the plane
         if len(near) < 3:
             break
-        best = _least_squares(near)
+        normal, centre = fit_plane(near)
+        best = np.append(normal, -normal @ centre)
         residual = sample @ best[:3] + best[3]
         spread = 1.4826 * np.median(np.abs(residual[np.abs(residual) < tolerance]))
         near = sample[np.abs(residual) < min(SPREADS * spread + 1e-4, tolerance)]
@@ -164,13 +181,6 @@ def _ransac(points: np.ndarray, tolerance: float, random: np.random.Generator) -
     return np.append(normals[chosen], offsets[chosen])
 
 
-def _least_squares(points: np.ndarray) -> np.ndarray:
-    """(4,) the plane with the least sum of squared distances."""
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][-1]
-    return np.append(normal, -normal @ centre)
-
-
 # --- The table in a world -------------------------------------------------------------------
 
 LARGEST_TILT = 15.0  # degrees between the plane found and the world's horizontal
@@ -180,7 +190,7 @@ DEEPEST = 0.05  # m that the typical point of a scene may lie below its table
 @dataclass(frozen=True)
 class Table:
     """T_WC: (4, 4) the camera in the world. height: z of the table in it, metres. share: of the
-    known points that lie on the table, or None if the height was told."""
+    known points that lie on the table, or None if the user gave the height."""
 
     T_WC: np.ndarray
     height: float
@@ -190,7 +200,7 @@ class Table:
         """One line for the user."""
         below = self.T_WC[2, 3] - self.height
         tilt = np.rad2deg(np.arccos(np.clip(-self.T_WC[2, 2], -1, 1)))
-        source = "as told" if self.share is None else f"found, {self.share:.0%} of the depth image"
+        source = "as given" if self.share is None else f"found, {self.share:.0%} of the depth image"
         return (
             f"{source}; {below:.3f} m below the camera, whose view is {tilt:.0f} degrees "
             "from straight down"
@@ -198,10 +208,10 @@ class Table:
 
 
 def find_table(points: np.ndarray, T_WC: np.ndarray | None = None) -> Table:
-    """The table that points (..., 3) in the camera's frame show; rows of NaN are unknown.
+    """The table in points (..., 3) of the camera's frame; rows of NaN are unknown.
 
-    Without T_WC (4, 4) the plane itself is the world, at height 0. With it, the plane has to be
-    level there; UserError otherwise, which is what a pose in another convention gives.
+    Without T_WC (4, 4) the plane itself defines the world, at height 0. With it, the plane has to
+    be level in the world; a pose in another convention is recognised by a UserError here.
     """
     plane = dominant_plane(points)
     if T_WC is None:
@@ -218,7 +228,7 @@ def find_table(points: np.ndarray, T_WC: np.ndarray | None = None) -> Table:
 
 
 def table_at_height(height: float, points: np.ndarray, T_WC: np.ndarray) -> Table:
-    """The table that the user tells; UserError if most of the scene would lie under it."""
+    """The table at the user's height; UserError if most of the scene would lie under it."""
     above = np.nanmedian(transform_points(T_WC, points)[..., 2]) - height
     if above < -DEEPEST:
         raise UserError(
@@ -228,15 +238,21 @@ def table_at_height(height: float, points: np.ndarray, T_WC: np.ndarray) -> Tabl
     return Table(T_WC, height, None)
 
 
-SIDE = 400  # pixels of the square in the image's middle that the table is looked for in
-STEP = 8  # pixels between those that are looked at
+# --- The camera of an image of distances ----------------------------------------------------
+
+# Cornell's depth images are of that kind. Its point clouds are given in the robot's frame, and the
+# images made from them, as `DepthImage.from_pcd` of github.com/dougsm/ggcnn does, hold the length
+# of each point's coordinates. Taken for depths they bend the table by centimetres; as distances
+# from the robot they leave it flat, and reveal where camera and robot are.
+SIDE = 400  # pixels of the square in the image's middle in which the table is searched
+STEP = 8  # pixels between the pixels that the fit uses
 FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel counts ever less
 # Where the search starts: a camera one metre from the table that looks at it from half above, and
 # the robot on the camera's side of the table.
 STEEP = np.array([0.0, 0.8, 1.0])
 ROBOT = np.array([0.0, 0.8, 0.2])
-# Beside and behind a camera that sees less than 50 degrees: no ray comes nearer to it than at its
-# start. It is above any table 0.4 m away or more, unless the camera is tilted by 60 degrees.
+# An origin above and behind a camera that sees less than 50 degrees: every ray leads away from it.
+# It is above any table 0.4 m away or more, unless the camera is tilted by 60 degrees.
 BEHIND = np.array([0.0, 0.6, -0.1])
 # What an image of distances in metres may hold.
 FROM_BASE = "distances from a robot's base"
@@ -246,9 +262,11 @@ FROM_CAMERA = "distances from the camera"
 
 @dataclass(frozen=True)
 class TableCamera:
-    """In the camera's optical frame, metres. table: (3,) normal of the table's plane over its
-    distance, so that points on it are those with table @ point = 1. origin: (3,) from where the
-    distances are measured."""
+    """A table and an origin of distances in the camera's optical frame, metres.
+
+    table: (3,) normal of the plane divided by its distance: the plane's points have
+    table @ point = 1. origin: (3,) the place from which the distances are measured.
+    """
 
     table: np.ndarray
     origin: np.ndarray
@@ -279,13 +297,13 @@ class TableCamera:
         return np.where(known_depth(distance), depth, 0).astype(np.float32)
 
     def least_depth(self, rays: np.ndarray) -> np.ndarray:
-        """(...) metres along the optical axis where rays (..., 3) are nearest to the origin: their
-        points are as far from it before as behind, and the distance tells least there."""
+        """(...) metres along the optical axis where rays (..., 3) are nearest to the origin: points
+        before and behind that place are equally far from it."""
         return rays @ self.origin / (rays**2).sum(axis=-1)
 
     def sees(self, shape: tuple[int, int], K: np.ndarray, height: float) -> bool:
-        """Whether whatever lies on the table or up to `height` metres above it is farther than
-        `least_depth` in the middle of an image of `shape`."""
+        """Whether all matter up to `height` metres above the table is farther than `least_depth` in
+        the middle of an image of `shape`."""
         rays = _middle_rays(shape, K)
         over = (1 - height * np.linalg.norm(self.table)) / (rays @ self.table)
         return bool((over > self.least_depth(rays)).all())
@@ -294,9 +312,9 @@ class TableCamera:
 def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
     """The camera of an image of distances (H, W) metres, most of whose middle shows a table.
 
-    A robust fit (Cauchy's loss), for which objects and walls hardly count. An origin and its mirror
-    image in the table explain it alike, for every point of the table is as far from either; of the
-    two the one on the camera's side is given, as a robot's base is there.
+    Objects and walls hardly count in the robust fit. An origin and its mirror image in the table
+    explain the image equally well, for every point of the table is as far from either; the result
+    is the one on the camera's side, where a robot's base stands.
     """
     found, _ = _fit_distances(*_middle(distance, K))
     table, origin = found[:3], found[3:]
@@ -305,11 +323,12 @@ def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
 
 
 def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
-    """By what an image (H, W) of metres may hold: how far, in metres, the typical pixel of its
-    middle is from the table that explains it best as that (the median of the absolute values).
+    """How badly a table explains an image (H, W) of metres, for each thing that it may hold.
 
-    Six numbers explain an image of distances from a base, three one of depths or of distances from
-    the camera; so the former can be no worse by much even where one of the latter is the truth.
+    The value is the median distance, in metres, of the middle's pixels from the table that fits
+    best. Six parameters explain an image of distances from a base, three an image of depths or of
+    distances from the camera; so the former is never much worse, even where one of the latter is
+    the truth.
     """
     rays, seen = _middle(image, K)
     slant = np.linalg.norm(rays, axis=1)
@@ -319,16 +338,16 @@ def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
 
     misses = {FROM_BASE: _fit_distances(rays, seen)[1]}
     for reading, stretch in ((DEPTHS, np.ones_like(slant)), (FROM_CAMERA, slant)):
-        misses[reading] = _robust(off, STEEP, stretch)[1]
+        misses[reading] = robust_fit(off, STEEP, FLAT, args=(stretch,))[1]
     return misses
 
 
 def distances(depth: np.ndarray, K: np.ndarray, origin: np.ndarray = BEHIND) -> np.ndarray:
-    """(H, W) float32 metres from an origin (3,) in the optical frame, not the camera itself, of
-    what is seen at depths (H, W); 0 where the depth is unknown (see `known_depth`).
+    """(H, W) float32 metres from an origin (3,) in the optical frame, other than the camera's, to
+    the points at depths (H, W); 0 where the depth is unknown (see `known_depth`).
 
-    The inverse of `TableCamera.depth`, beyond its `least_depth`; so the origin has to be on the
-    camera's side of the table, and is best behind the camera.
+    This is the inverse of `TableCamera.depth` beyond its `least_depth`; so the origin has to lie on
+    the camera's side of the table, and best lies behind the camera.
     """
     known = known_depth(depth)
     points = _rays(depth.shape, K) * np.where(known, depth, 0)[..., None]
@@ -336,23 +355,17 @@ def distances(depth: np.ndarray, K: np.ndarray, origin: np.ndarray = BEHIND) -> 
 
 
 def _fit_distances(rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, float]:
-    """(6,) table and origin, and how far the typical pixel is from them."""
+    """(6,) table and origin, and the median error in metres."""
 
     def off(guess: np.ndarray) -> np.ndarray:
         points = rays / (rays @ guess[:3])[:, None]
         return np.linalg.norm(points - guess[3:], axis=1) - seen
 
-    return _robust(off, np.concatenate([STEEP, ROBOT]))
-
-
-def _robust(off: Callable[..., np.ndarray], start: np.ndarray, *given) -> tuple[np.ndarray, float]:
-    """What makes most of the errors `off` small, and the median of their absolute values there."""
-    found = least_squares(off, start, loss="cauchy", f_scale=FLAT, args=given)
-    return found.x, float(np.median(np.abs(found.fun)))
+    return robust_fit(off, np.concatenate([STEEP, ROBOT]), FLAT)
 
 
 def _middle(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) rays of pixels in the middle of an image, and what it holds there (n,)."""
+    """(n, 3) rays of pixels in the middle of an image, and its values (n,) there."""
     return _middle_rays(image.shape, K), image[_middle_of(image.shape)].ravel().astype(float)
 
 
@@ -367,6 +380,6 @@ def _middle_of(shape: tuple[int, ...]) -> tuple[slice, ...]:
 
 
 def _rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
-    """(H, W, 3) what leads from the camera to the points that the pixels show at depth 1."""
+    """(H, W, 3) vectors from the camera to the pixels' points at depth 1."""
     v, u = np.mgrid[: shape[0], : shape[1]]
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T

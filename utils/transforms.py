@@ -232,6 +232,19 @@ def image_to_grasp(grasp: ImageGrasp, K: np.ndarray, T_WC: np.ndarray) -> Grasp:
     return Grasp(position, np.arctan2(closing[1], closing[0]), grasp.width, grasp.quality)
 
 
+def planar(x: float, y: float, turn: float) -> np.ndarray:
+    """(4, 4) motion in the plane: a turn about z, then a shift."""
+    T = np.eye(4)
+    c, s = np.cos(turn), np.sin(turn)
+    T[:2, :2], T[:2, 3] = [[c, -s], [s, c]], (x, y)
+    return T
+
+
+def planar_part(T: np.ndarray) -> tuple[float, float, float]:
+    """x, y and turn about z of a (4, 4) pose whose z axis is nearly that of its parent."""
+    return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
+
+
 SMALL_ANGLE = 1e-4  # below it the series to second order are exact to the last digit
 
 
