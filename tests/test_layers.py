@@ -25,13 +25,6 @@ SIMULATORS = {
     "mujoco": "envs.mujoco_",
 }
 STILL_TO_BE_MOVED = {
-    ("envs.board", "pybullet"),
-    ("envs.board_servo", "pybullet"),
-    ("envs.cell_layout", "pybullet"),
-    ("envs.cell_scenes", "pybullet"),
-    ("envs.mujoco_panda", "pybullet_data"),
-    ("envs.objects", "pybullet"),
-    ("envs.objects", "pybullet_data"),
     ("envs.studio", "pybullet"),
     ("utils.domain_randomization", "pybullet"),
     ("utils.random_physics", "pybullet"),
