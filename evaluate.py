@@ -28,8 +28,9 @@ from typing import NamedTuple
 from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.execution import GraspOutcome, check_bin
-from envs.objects import ObjectSet, load_object_set, prepare
+from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
 from envs.policy_approach import approach_by, check_learned, is_learned, nowhere_yet
+from envs.registries import check_names
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import in_world, make_cell
@@ -38,7 +39,6 @@ from models.photographs import judge_as_taken, judge_photographs, photographs
 from models.planners import make_planner, needs_truth
 from models.rectangle_examples import draw_rectangles
 from utils.config import (
-    OBJECT_SETS,
     Config,
     TransferPolicy,
     parse_args,
@@ -84,6 +84,7 @@ PHOTOGRAPHS = {"cornell": judge_photographs, "cornell_as_taken": judge_as_taken}
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
+    check_names(config)
     if config.transfer.policies is not None:
         return report_transfer(config, options.resume, options.results)
     check_policies(config)

@@ -43,6 +43,7 @@ from tqdm import tqdm
 
 from envs.camera import camera_intrinsics
 from envs.data_generation import generate
+from envs.registries import check_names
 from models.graspnet import GraspNet, create_model
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, simulated_data
@@ -72,6 +73,7 @@ FREE_TO_CHANGE = ("train.name", "train.device", "train.workers", "data.workers")
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train GraspNet.", _add_options)
+    check_names(config)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
     check_network(config)

@@ -36,6 +36,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from envs.registries import check_names
 from envs.studio import film_episode
 from envs.vector_env import VectorEnvs, WorkerError, full_difficulty, make_env, vector_envs
 from models.grasp_policy import GraspPPO, load_policy, policy_for, save_policy
@@ -75,6 +76,7 @@ LOOKS = 32  # of an environment, before they are learned from: two scenes
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train a policy by PPO.", _add_options)
+    check_names(config)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
     with (

@@ -56,6 +56,7 @@ from utils.errors import (
     ServoError,
     TargetLostError,
 )
+from utils.result_records import OPEN_LOOP
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
 from utils.servo_loop import ServoView, VisualServo
@@ -215,6 +216,14 @@ _FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitme
 _SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
 _NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
 
+# By controller: the visual servo of the near stage, and its own arguments. Another entry is another
+# name for `closed_loop.controller`.
+LAWS = {
+    "pbvs": (PositionBasedVisualServo, {}),
+    "ibvs": (ImageBasedVisualServo, {"interaction": "mean"}),
+    "hybrid": (HybridVisualServo, {"scheme": "2.5d"}),
+}
+CONTROLLERS = (OPEN_LOOP, *LAWS)
 _TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are told as they look to the camera
 
 
@@ -236,12 +245,8 @@ class LoopRecord:
 def make_law(controller: str, K: np.ndarray, T_EC: np.ndarray, gain: float, dt: float):
     """The visual servo of a controller's near stage; T_EC as it is believed."""
     config = {"intrinsics": K, "mounting": "eye_in_hand", "T_EC": T_EC}
-    options = {"lambda_": gain, "dt": dt, "damping": 0.0}
-    if controller == "pbvs":
-        return PositionBasedVisualServo(config, **options)
-    if controller == "ibvs":
-        return ImageBasedVisualServo(config, interaction="mean", **options)
-    return HybridVisualServo(config, scheme="2.5d", **options)
+    servo, own = LAWS[controller]
+    return servo(config, lambda_=gain, dt=dt, damping=0.0, **own)
 
 
 class ClosedLoop:

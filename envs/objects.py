@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,8 +25,9 @@ from envs.object_files import FineVisual, fine_visual, object_files, read_object
 from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
-from utils.config_types import OBJECT_SETS
+from utils.errors import UserError, did_you_mean
 from utils.geometry import ConvexSolid, GripperGeometry
+from utils.plugins import is_import_path, load_plugin
 
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
@@ -112,6 +113,18 @@ class ObjectPart(ObjectSet):
         return self._whole[self._indices[index]]
 
 
+@dataclass(frozen=True)
+class SetSettings:
+    """What an object set is made with; `load_object_set` describes each field."""
+
+    split: Literal["train", "test"]
+    scale: float | None
+    fit: float | None
+    density: float
+    max_opening: float
+    cache_dir: Path
+
+
 def load_object_set(
     name_or_path: str,
     *,
@@ -122,9 +135,11 @@ def load_object_set(
     max_opening: float = GripperGeometry().max_opening,
     cache_dir: str | Path,
 ) -> ObjectSet:
-    """A named set, or every URDF and mesh file below a folder (whose units must be metres).
+    """A set of `OBJECT_SETS`, every URDF and mesh file below a folder (in metres), or a plug-in.
 
-    split: of `primitives` and `random_urdfs`; the others hold the same objects in both.
+    name_or_path: a name, a folder, or an import path `module:name` of an `ObjectSet`, of a folder's
+        path, or of a function that takes `SetSettings` and returns one of the two.
+    split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in both.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
     fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
         so that the middle side of its oriented bounding box has this many metres.
@@ -133,39 +148,59 @@ def load_object_set(
     max_opening: m, of the gripper; a warning names the first object of a folder that is too wide
         for it.
     cache_dir: where convex parts are kept.
-    Raises ObjectError for an unknown name, a missing or empty folder, a split or number that is
-    not allowed; a broken mesh raises it when its object is asked for.
+    Raises UserError for an unknown name, a missing or empty folder, a plug-in that cannot be used,
+    a split or number that is not allowed; a broken mesh raises it when its object is asked for.
     """
-    cache_dir = Path(cache_dir)
     if split not in ("train", "test"):
         raise ObjectError(f"objects.split is {split!r}; allowed are 'train' and 'test'")
     for key, value in {"scale": scale, "fit": fit, "density": density}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ObjectError(f"objects.{key} is {value}; it must be a number above 0")
-    if name_or_path in ("box", "primitives"):
-        if fit is not None:
+    settings = SetSettings(split, scale, fit, density, max_opening, Path(cache_dir))
+    check_object_set(name_or_path, "objects")
+    if name_or_path in OBJECT_SETS:
+        return OBJECT_SETS[name_or_path](settings)
+    if Path(name_or_path).expanduser().is_dir():
+        return _folder(Path(name_or_path), settings)
+    return _plugin(name_or_path, settings)
+
+
+def check_object_set(name_or_path: str, where: str) -> None:
+    """Raise UserError for what `load_object_set` does not know; `where` is the config's key."""
+    if name_or_path in OBJECT_SETS or Path(name_or_path).expanduser().is_dir():
+        return
+    if is_import_path(name_or_path):
+        load_plugin(name_or_path, where, must_be_callable=False)
+        return
+    raise ObjectError(
+        f"{where}: got {name_or_path!r}, expected one of {', '.join(OBJECT_SETS)}, an existing "
+        f"folder or an import path module:name{did_you_mean(name_or_path, OBJECT_SETS)}"
+    )
+
+
+def _folder(folder: Path, settings: SetSettings) -> ObjectSet:
+    folder = folder.expanduser()
+    return FileSet(folder.resolve().name, object_files(folder), settings.scale or 1.0, settings)
+
+
+def _plugin(path: str, settings: SetSettings) -> ObjectSet:
+    found = load_plugin(path, "objects", must_be_callable=False)
+    if callable(found):
+        try:
+            found = found(settings)
+        except UserError:
+            raise
+        except Exception as error:  # whatever the plug-in raises is its author's to mend
             raise ObjectError(
-                f"objects.fit does not apply to the set {name_or_path!r}, whose sizes are known; "
-                "leave it out or use objects.scale"
-            )
-        if name_or_path == "box":
-            return BoxSet(scale or 1.0)
-        return PrimitiveSet(split, scale or 1.0, cache_dir)
-    if name_or_path == "random_urdfs":
-        default = RANDOM_URDFS_SCALE if fit is None else 1.0
-        return FileSet(
-            "random_urdfs", _random_urdf_files(split), scale or default, fit, density, max_opening,
-            cache_dir,
-        )
-    folder = Path(name_or_path).expanduser()
-    if not folder.is_dir():
-        raise ObjectError(
-            f"objects: {str(folder)!r} is neither one of the sets {', '.join(OBJECT_SETS)} nor an "
-            "existing folder"
-        )
-    files = object_files(folder)
-    return FileSet(
-        folder.resolve().name, files, scale or 1.0, fit, density, max_opening, cache_dir
+                f"objects: {path!r} raised {type(error).__name__}: {' '.join(str(error).split())}"
+            ) from error
+    if isinstance(found, ObjectSet):
+        return found
+    if isinstance(found, str | Path) and Path(found).expanduser().is_dir():
+        return _folder(Path(found), settings)
+    raise ObjectError(
+        f"objects: {path!r} gives {found!r:.80}, expected an envs.objects.ObjectSet or the path of "
+        "an existing folder"
     )
 
 
@@ -188,9 +223,10 @@ def prepare(objects: ObjectSet, workers: int) -> None:
 class BoxSet(ObjectSet):
     """The tutorial's red cube: half extent 0.03 m, 0.1 kg."""
 
-    def __init__(self, scale: float = 1.0) -> None:
+    def __init__(self, settings: SetSettings) -> None:
+        _refuse_fit("box", settings)
         super().__init__("box")
-        self.scale = scale
+        self.scale = settings.scale or 1.0
 
     def __len__(self) -> int:
         return 1
@@ -202,13 +238,15 @@ class BoxSet(ObjectSet):
 
 
 class PrimitiveSet(ObjectSet):
-    """Procedural solids of eleven families, see `envs.object_primitives`: 900 to train, 100 to test."""
+    """Procedural solids of the eleven families of `envs.object_primitives`: 900 for training, 100
+    for tests."""
 
-    def __init__(self, split: str, scale: float, cache_dir: Path) -> None:
+    def __init__(self, settings: SetSettings) -> None:
+        _refuse_fit("primitives", settings)
         super().__init__("primitives")
         train, test = range(PRIMITIVES_TRAIN), range(PRIMITIVES_TRAIN, PRIMITIVES_TOTAL)
-        self.indices = train if split == "train" else test
-        self.scale, self.cache_dir = scale, cache_dir
+        self.indices = train if settings.split == "train" else test
+        self.scale, self.cache_dir = settings.scale or 1.0, settings.cache_dir
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -237,22 +275,16 @@ class PrimitiveSet(ObjectSet):
 
 
 class FileSet(ObjectSet):
-    """URDF and mesh files, one object each."""
+    """URDF and mesh files, one object each. scale: factor on their lengths, in place of the
+    settings' own."""
 
     def __init__(
-        self,
-        name: str,
-        files: Sequence[Path],
-        scale: float,
-        fit: float | None,
-        density: float,
-        max_opening: float,
-        cache_dir: Path,
+        self, name: str, files: Sequence[Path], scale: float, settings: SetSettings
     ) -> None:
         super().__init__(name)
-        self.files = tuple(files)
-        self.scale, self.fit, self.density, self.cache_dir = scale, fit, density, cache_dir
-        self.max_opening = max_opening
+        self.files, self.scale = tuple(files), scale
+        self.fit, self.density = settings.fit, settings.density
+        self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
         self._warned = False
 
     def __len__(self) -> int:
@@ -277,11 +309,36 @@ class FileSet(ObjectSet):
         return model
 
 
+def _random_urdfs(settings: SetSettings) -> ObjectSet:
+    nominal = RANDOM_URDFS_SCALE if settings.fit is None else 1.0
+    files = _random_urdf_files(settings.split)
+    return FileSet("random_urdfs", files, settings.scale or nominal, settings)
+
+
 def _random_urdf_files(split: str) -> list[Path]:
     """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
     folder = data_folder() / "random_urdfs"
     numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
     return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
+
+
+def _refuse_fit(name: str, settings: SetSettings) -> None:
+    if settings.fit is not None:
+        raise ObjectError(
+            f"objects.fit does not apply to the set {name!r}, whose sizes are known; "
+            "leave it out or use objects.scale"
+        )
+
+
+# The names of object sets in a config. A new set is a function of the settings, and an entry here.
+OBJECT_SETS: dict[str, Callable[[SetSettings], ObjectSet]] = {
+    "box": BoxSet,
+    "primitives": PrimitiveSet,
+    "random_urdfs": _random_urdfs,
+}
+
+
+# --- One object -----------------------------------------------------------------------------
 
 
 def load_object(

@@ -32,6 +32,7 @@ from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
+from envs.registries import check_names
 from utils.config import parse_args, run_script
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at
@@ -131,6 +132,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
+    check_names(config)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )

@@ -104,11 +104,6 @@ def test_override_values(text, expected):
         assert getattr(getattr(config, section), key) == expected
 
 
-def test_object_set_may_be_a_folder(tmp_path):
-    config = load_config(None, [f"evaluate.object_sets=box,{tmp_path}"])
-    assert config.evaluate.object_sets == ("box", str(tmp_path))
-
-
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
@@ -133,11 +128,9 @@ def test_object_set_may_be_a_folder(tmp_path):
         ("camera.mount=overhed", ["one of overhead, wrist", "did you mean overhead?"]),
         ("camera.near=5", ["camera: near (5.0) must be smaller than far (2.0)", "command line"]),
         ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),
-        ("evaluate.scenarios=pil", ["scenarios[0]", "isolated, packed, pile", "mean pile?"]),
         ("evaluate.scenarios=[]", ["evaluate.scenarios", "got []"]),
         ("evaluate.scenarios=pile,pile", ["repeated"]),
-        ("evaluate.object_sets=random_urdf", ["existing folder", "did you mean random_urdfs?"]),
-        ("env.objects=bx", ["env.objects", "got 'bx'", "did you mean box?"]),
+        ("env.observations=dept", ["observations[0]", "rgb, depth, state", "mean depth?"]),
         ("objects.scale=-1", ["got -1", "a number > 0, or null"]),
         ("evaluate.rounds", ["KEY=VALUE", "did you mean evaluate.rounds?"]),
         ("=5", ["KEY=VALUE"]),

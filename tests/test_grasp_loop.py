@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 import pybullet
@@ -23,7 +22,6 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbed
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
-from utils.config_types import ScoredScenario
 from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, planar_part, top_down_pose
 
@@ -187,10 +185,6 @@ def test_an_approach_that_does_not_end_is_stopped(cell, scene, monkeypatch):
 
 
 # What disturbs
-
-
-def test_every_scored_scenario_is_in_the_registry():
-    assert set(get_args(ScoredScenario)) == set(SCENARIOS)
 
 
 def test_a_displacement_ends_where_it_says(cell, scene):

@@ -1,5 +1,7 @@
 """Object sets: known masses, hollow things that are hollow, clear errors, and repeatability."""
 
+import importlib
+import sys
 import warnings
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import trimesh
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
 from envs.pybullet_bodies import spawn
+from utils.errors import UserError
 
 DATA = Path(pybullet_data.getDataPath())
 IDENTITY = (0, 0, 0, 1)
@@ -323,13 +326,76 @@ def test_objects_in_wrong_units_warn_once(tmp_path):
 
 
 def test_an_unknown_set_names_what_is_allowed(tmp_path):
-    with pytest.raises(ObjectError, match="'boxes' .* box, primitives, random_urdfs .* folder"):
+    with pytest.raises(ObjectError, match="'boxes', .* box, primitives, random_urdfs, .* folder"):
         load_object_set("boxes", cache_dir=tmp_path)
 
 
 def test_an_empty_folder_names_the_suffixes(tmp_path):
     with pytest.raises(ObjectError, match=r"holds no object.*\.urdf, \.obj, \.stl, \.ply, \.glb"):
         load_object_set(str(tmp_path), cache_dir=tmp_path)
+
+
+# --- Plug-ins -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plug_in(tmp_path, monkeypatch):
+    """Writes the module `my_objects` into the current folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))  # loading a plug-in adds the folder
+
+    def write(text: str) -> None:
+        sys.modules.pop("my_objects", None)
+        (tmp_path / "my_objects.py").write_text(text)
+        importlib.invalidate_caches()
+
+    yield write
+    sys.modules.pop("my_objects", None)
+
+
+def test_an_object_set_by_import_path(plug_in, tmp_path):
+    """A function of the settings, a set, or a folder: what a name of `OBJECT_SETS` could be."""
+    (tmp_path / "cups").mkdir()
+    trimesh.creation.box((0.03, 0.04, 0.05)).export(tmp_path / "cups" / "cup.stl")
+    plug_in(
+        "from envs.objects import OBJECT_SETS, ObjectPart, SetSettings\n"
+        "def three(settings):\n"
+        "    return ObjectPart(OBJECT_SETS['primitives'](settings), range(3))\n"
+        "folder = 'cups'\n"
+        "def of_folder(settings):\n"
+        "    return 'cups'\n"
+        "box = OBJECT_SETS['box'](SetSettings('test', None, None, 1000.0, 0.08, '.'))\n"
+    )
+    own = {
+        name: load_object_set(f"my_objects:{name}", split="train", scale=2.0, cache_dir=tmp_path)
+        for name in ("three", "folder", "of_folder", "box")
+    }
+    whole = load_object_set("primitives", split="train", scale=2.0, cache_dir=tmp_path)
+    assert len(own["three"]) == 3
+    assert [model.name for model in own["three"]] == [whole[i].name for i in range(3)]
+    for name in ("folder", "of_folder"):
+        np.testing.assert_allclose(own[name][0].extents, [0.06, 0.08, 0.10], rtol=1e-6)
+    assert own["box"][0].name == "cube"
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("my_objects:nothing", "my_objects has no 'nothing'"),
+        ("my_objekts:sets", "there is no module 'my_objekts'"),
+        ("my_objects:number", "'my_objects:number' gives 3, expected an envs.objects.ObjectSet or"),
+        ("my_objects:missing", "gives 'no/such/folder', expected an envs.objects.ObjectSet or the"),
+        ("my_objects:fails", "'my_objects:fails' raised ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_plug_in_without_objects_is_named(plug_in, tmp_path, path, message):
+    plug_in("number = 3\nmissing = 'no/such/folder'\ndef fails(settings):\n    return 1 / 0\n")
+    with pytest.raises(UserError, match=message) as error:
+        load_object_set(path, cache_dir=tmp_path)
+    assert "\n" not in str(error.value)
+
+
+# --- What is refused ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

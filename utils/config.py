@@ -42,7 +42,7 @@ from utils.config_schema import (
     TransferPolicy,
     WorkspaceConfig,
 )
-from utils.config_types import OBJECT_SETS, RandomizationConfig, Section
+from utils.config_types import RandomizationConfig, Section
 from utils.errors import UserError, did_you_mean
 
 DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"
@@ -212,8 +212,6 @@ def _near_choice(value: object, schema: dict[str, Any]) -> str:
     choices: list[str] = []
     for part in alternatives(schema):
         part = part.get("items", part)
-        if "description" in part:
-            choices += OBJECT_SETS
         choices += part.get("enum", [])
     return did_you_mean(value, choices) if isinstance(value, str) else ""
 
@@ -240,7 +238,6 @@ def _shown(value: object) -> str:
 
 __all__ = [
     "DEFAULTS",
-    "OBJECT_SETS",
     "AdaptationConfig",
     "CameraConfig",
     "Config",

@@ -16,18 +16,15 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from utils.config_types import (
-    Controller,
     Count,
     JointVector,
     KeywordArguments,
     Mount,
     Name,
-    ObjectSet,
+    Names,
     Pixels,
     Positive,
     RandomizationConfig,
-    Scenario,
-    ScoredScenario,
     Section,
     Several,
     Share,
@@ -38,7 +35,6 @@ from utils.config_types import (
 from utils.depth import DEPTH_NOISES, make_depth_noise
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
-from utils.plugins import IMPORT_PATH
 from utils.transforms import look_at
 
 
@@ -154,7 +150,7 @@ class ServoConfig(Section):
 
 
 class ClosedLoopConfig(Section):
-    controller: Controller
+    controller: Name
     width: Pixels
     height: Pixels
     fov_deg: Annotated[float, Field(ge=1, le=170)]
@@ -180,10 +176,10 @@ class ClosedLoopConfig(Section):
 
 
 class EvaluateConfig(Section):
-    policies: Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
-    controllers: Annotated[tuple[Controller, ...], Several, AfterValidator(no_repeats)] | None
-    scenarios: Annotated[tuple[ScoredScenario, ...], Several, AfterValidator(no_repeats)]
-    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(no_repeats)]
+    policies: Names
+    controllers: Names | None
+    scenarios: Names
+    object_sets: Names
     rounds: Count
     randomise: bool
     workers: Count | None
@@ -209,7 +205,7 @@ class TransferPolicy(NamedTuple):
     train_with: str | None
 
 
-TransferScenes = Annotated[tuple[ScoredScenario, ObjectSet], Field(strict=False)]
+TransferScenes = Annotated[tuple[Name, Name], Field(strict=False)]
 TransferRow = Annotated[
     tuple[Name, Name, Name, TransferScenes | None, Name | None],
     Field(
@@ -236,7 +232,7 @@ class DataConfig(Section):
     repeats: Count
     frames: Count
     validation_frames: Count
-    object_sets: Annotated[tuple[ObjectSet, ...], Several, AfterValidator(no_repeats)]
+    object_sets: Names
     max_objects: Annotated[int, Field(ge=2, le=12)]
     randomise: bool
     randomise_physics: bool
@@ -282,8 +278,6 @@ class AdaptationConfig(Section):
     held_out: Annotated[float, Field(gt=0, lt=1)]
 
 
-Names = Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
-PluginPath = Annotated[str, Field(pattern=IMPORT_PATH, description="an import path module:name")]
 
 
 class EnvConfig(Section):
@@ -293,9 +287,9 @@ class EnvConfig(Section):
     gripper: Literal["opening", "change"]
     resolution: Pixels
     camera: Mount
-    objects: ObjectSet
-    scenario: Scenario
-    reward: Literal["dense", "sparse"] | PluginPath
+    objects: Name
+    scenario: Name
+    reward: Name
     goal: Literal["object", "grasp"]
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
@@ -396,7 +390,7 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
-    simulator: Literal["pybullet", "mujoco"]
+    simulator: Name
     sim: SimConfig
     robot: RobotConfig
     gripper: GripperConfig

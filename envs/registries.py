@@ -1,0 +1,58 @@
+"""What a config may name: the keys that choose an entry of a registry, and the registries.
+
+Each registry stands beside the code that it lists. A new entry there is all that a config needs to
+name it: `utils.config_schema` takes any text for these keys, because `utils` imports neither `envs`
+nor `models`, and each script calls `check_names` before it does any work. Planners and learned
+policies (`evaluate.policies`) also have names that are files: `models.planners` and
+`envs.policy_approach` check them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from envs.cell_scenes import LAYOUTS
+from envs.closed_loop import CONTROLLERS
+from envs.env_rewards import make_reward
+from envs.objects import check_object_set
+from envs.scenarios import SCENARIOS
+from envs.simulators import SIMULATORS
+from models.graspnet_backbones import BACKBONES
+from utils.config import Config
+from utils.errors import unknown_choice
+
+REGISTRIES: dict[str, Collection[str]] = {
+    "simulator": SIMULATORS,
+    "closed_loop.controller": CONTROLLERS,
+    "train.backbone": BACKBONES,
+    "evaluate.controllers": CONTROLLERS,
+    "evaluate.scenarios": SCENARIOS,
+    "env.scenario": LAYOUTS,
+}
+OBJECT_SET_KEYS = ("data.object_sets", "evaluate.object_sets", "env.objects")
+
+
+def check_names(config: Config) -> None:
+    """Raise UserError for a name in the config that is in none of the registries."""
+    for key, registry in REGISTRIES.items():
+        for name in _names(config, key):
+            if name not in registry:
+                raise unknown_choice(key, name, registry)
+    for key in OBJECT_SET_KEYS:
+        for name in _names(config, key):
+            check_object_set(name, key)
+    make_reward(config.env.reward)
+    for row in config.transfer.policies or ():
+        if row.scenes is not None:
+            scenario, objects = row.scenes
+            if scenario not in SCENARIOS:
+                raise unknown_choice("transfer.policies", scenario, SCENARIOS)
+            check_object_set(objects, "transfer.policies")
+
+
+def _names(config: Config, key: str) -> tuple[str, ...]:
+    section, _, name = key.rpartition(".")
+    value = getattr(getattr(config, section) if section else config, name)
+    if value is None:
+        return ()
+    return (value,) if isinstance(value, str) else value
