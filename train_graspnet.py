@@ -1,4 +1,4 @@
-"""Train GraspNet: simulated data (made first if they are not there), checkpoints, curves, pictures.
+"""Train GraspNet on simulated images, which are made first, or cross-validate it on real ones.
 
     python train_graspnet.py
     python train_graspnet.py --config configs/quick.yaml
@@ -7,18 +7,17 @@
     python train_graspnet.py data.kind=cornell data.root=path/to/cornell
     python train_graspnet.py train.initial=FILE.pt adaptation.target=path/to/photographs
 
-Leaves best.pt (chosen on held-out training objects), last.pt, graspnet.pt (the best one's weights
-alone), results.json, curves.png, predictions.png and TensorBoard events in
-runs/train_graspnet/<time>/. Ctrl-C stops early; --resume RUN goes on where it was, bit for bit on
-the same device and number of processes.
+The run folder runs/train_graspnet/<time>/ then holds best.pt (chosen on held-out training objects),
+last.pt, graspnet.pt (the weights of best.pt alone), results.json, curves.png, predictions.png and
+TensorBoard events (tensorboard --logdir runs/train_graspnet). Ctrl-C stops a training early;
+--resume RUN continues it, bit for bit on the same device and number of processes.
 
-On real data (data.kind cornell or jacquard) it cross-validates: every fold of the images is tested
-by a network that is trained on the other folds for a fixed schedule. The last weights count, so no
-test image chooses anything. Each fold has its folder in the run's; results.json holds every
-prediction.
+On real data (data.kind cornell or jacquard) every fold of the images is tested by a network that is
+trained on the other folds for a fixed schedule. The last weights count, so no test image chooses
+anything. Each fold has its folder in the run's; results.json holds every prediction.
 
-With adaptation.target, labelled simulated images and unlabelled photographs are shown in turn, and
-the checkpoint is chosen without a label of the latter; see docs/sim_to_real.md.
+With adaptation.target, every step takes labelled simulated images and as many unlabelled
+photographs, and the checkpoint is chosen without a label of these; see docs/sim_to_real.md.
 """
 
 from __future__ import annotations
@@ -29,15 +28,12 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import argparse
-import math
-import signal
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
-from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -46,28 +42,33 @@ from envs.data_generation import generate
 from envs.registries import check_names
 from models.graspnet import GraspNet, create_model
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
-from models.graspnet_data import TrainingData, simulated_data
-from models.graspnet_examples import EpochBatches
+from models.graspnet_data import TrainingData, epoch_loader, simulated_data, steps_per_epoch
 from models.graspnet_io import load_graspnet, load_initial, save_graspnet
-from models.graspnet_scores import check_graspable, draw_curves, draw_predictions
-from models.graspnet_training import Trainer
-from models.rectangle_examples import Judged, draw_rectangles
+from models.graspnet_scores import (
+    check_graspable,
+    describe_scores,
+    draw_curves,
+    draw_predictions,
+    write_curves,
+)
+from models.graspnet_training import Trainer, mean_of
+from models.rectangle_examples import Judged
 from models.rectangle_folds import (
-    Fold,
     cross_validation_results,
     describe_fold,
     describe_folds,
     real_folds,
+    save_fold,
 )
 from utils.config import Config, parse_args, run_script
 from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
-from utils.runs import check_resume, check_writable, new_run_folder, save_results, write_atomic
+from utils.runs import check_resume, check_writable, new_run_folder, save_results
 
+WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
-WEIGHTS_HELP = "also write graspnet.pt here, once the training has reached its end"
 FREE_TO_CHANGE = ("train.name", "train.device", "train.workers", "data.workers")
 
 
@@ -76,267 +77,173 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_names(config)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
-    check_network(config)
+    make_network(config, max_width=1.0)  # an impossible network fails here, before data are made
     photographs = open_target(config)
-    with team(config.train.device, dict(os.environ)) as us:
+    with team(config.train.device, os.environ) as processes:
         if config.data.kind != "simulated":
-            return cross_validate(config, options.resume, options.weights, us)
+            return cross_validate(config, options, processes)
         if photographs is not None:
-            check_alone(us)  # before work is put into the data
-        data = make_data(config, us)
+            check_alone(processes)
+        data = make_data(config, processes)
         if photographs is not None:
             data = with_target(config, data, photographs)
-        trainer = make_trainer(config, data, us)
-        run = options.resume or Path(us.broadcast(us.is_main and open_run(config)))
-        history, losses = load_progress(trainer, run / "last.pt")
-        if us.is_main:
-            announce(config, run, data, trainer)
+        trainer = make_trainer(config, data, processes)
+        run = options.resume or open_run(config, processes)
 
-        finished = train(config, run, data, trainer, history, losses)
+        history, finished = train(config, run, data, trainer)
 
-        if us.is_main:
-            # A network that is half trained must not replace one that is not.
-            save_training(run, data, history, options.weights if finished else None)
+        if processes.is_main:
+            # A half-trained network must not replace a finished one: no --weights then.
+            save_best(run, data, history, options.weights if finished else None)
             if not finished:
                 print(f"stopped after {trainer.step} steps; go on with --resume {run}")
     return 0 if finished else 130
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS_HELP)
+    parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS)
 
 
-def check_network(config: Config) -> None:
-    """Raise UserError for a network that cannot be made, before work is put into its data."""
-    make_network(config, max_width=1.0)
-
-
-def make_data(config: Config, us: Team) -> TrainingData:
-    """What to train on; simulated images are made here as far as they lack.
+def make_data(config: Config, processes: Team) -> TrainingData:
+    """Make the simulated images that are still missing, and open them.
 
     Raises UserError if the validation images could not tell a good network from a bad one.
     """
-    folder = generate(config, us.rank, us.ranks)
-    us.wait()
+    folder = generate(config, processes.rank, processes.ranks)
+    processes.wait()
     truth = label_truth(read_trials(folder))
-    if us.is_main and truth.positives:
-        low, high = truth.precision_ci95
-        print(
-            f"labels against physics: {truth.executed} executed, precision "
-            f"{100 * truth.precision:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of "
-            f"{truth.positives} positive ones, recall {100 * truth.recall_weighted:.0f} %"
-        )
-    camera = config.camera
-    focal, distance = camera_intrinsics(camera).K[0, 0], math.dist(camera.position, camera.target)
-    data = simulated_data(config, folder, float(focal), distance)
+    if processes.is_main and truth.positives:
+        print(truth.describe())
+    data = simulated_data(config, folder, float(camera_intrinsics(config.camera).K[0, 0]))
     check_graspable(data.validation)
     return data
 
 
-def open_run(config: Config) -> str:
-    return str(new_run_folder("train_graspnet", config.train.name, config))
-
-
-def make_trainer(config: Config, data: TrainingData, us: Team) -> Trainer:
-    """A new network, or one that starts from train.initial, and its optimiser."""
+def make_trainer(config: Config, data: TrainingData, processes: Team) -> Trainer:
+    """Make a network with seeded weights, or those of train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
     model = make_network(config, config.train.max_width or data.max_width)
     total_steps = steps_per_epoch(config, data) * config.train.epochs
     if config.adaptation.target is not None:
-        return AdaptingTrainer(model, config.train, total_steps, us, config.adaptation)
-    return Trainer(model, config.train, total_steps, us)
+        return AdaptingTrainer(model, config.train, total_steps, processes, config.adaptation)
+    return Trainer(model, config.train, total_steps, processes)
 
 
 def make_network(config: Config, max_width: float) -> GraspNet:
-    """The network that the config asks for. Only simulated images tell centres of mass, so only a
-    network that learns from them has a head for these."""
-    model = create_model(
-        name=config.train.backbone,
-        max_width=max_width,
-        centre_head=config.data.kind == "simulated" and config.train.centre_weight > 0,
-    )
+    """Make the network that the config describes; raises UserError if that is impossible."""
+    # Only simulated images are labelled with centres of mass.
+    centre_head = config.data.kind == "simulated" and config.train.centre_weight > 0
+    model = create_model(name=config.train.backbone, max_width=max_width, centre_head=centre_head)
     if config.train.initial is not None:
         load_initial(model, config.train.initial)
     return model
 
 
-def steps_per_epoch(config: Config, data: TrainingData) -> int:
-    batch = config.train.batch_size
-    if len(data.train) < batch:
-        raise UserError(f"train.batch_size is {batch}, but there are only {len(data.train)} images")
-    return len(data.train) // batch
-
-
-def announce(config: Config, run: Path, data: TrainingData, trainer: Trainer) -> None:
-    parameters = sum(p.numel() for p in trainer.model.parameters())
-    to = f", adapted to {config.adaptation.target}" if config.adaptation.target else ""
-    print(
-        f"GraspNet {config.train.backbone}, {parameters:,} parameters, on {len(data.train)} "
-        f"{config.data.kind} images{to}, for {config.train.epochs} epochs, {trainer.team.ranks} "
-        f"process(es), {trainer.team.device}, {str(trainer.precision).removeprefix('torch.')}, "
-        f"seed {config.seed}; results in {run}",
-        flush=True,
-    )
-
-
-def load_progress(trainer: Trainer, last: Path) -> tuple[list[dict], list[dict]]:
-    """History and losses (see `train`) of a checkpoint that the trainer goes on from, if there is
-    one."""
-    saved = trainer.load(last) if last.is_file() else {}
-    return saved.get("history", []), saved.get("losses", [])
+def open_run(config: Config, processes: Team) -> Path:
+    """Make the run folder, in the main process alone."""
+    run = new_run_folder("train_graspnet", config.train.name, config) if processes.is_main else None
+    return Path(processes.broadcast(str(run)))
 
 
 def train(
-    config: Config, run: Path, data: TrainingData, trainer: Trainer,
-    history: list[dict], losses: list[dict],
-) -> bool:  # fmt: skip
-    """Train to the end of the schedule, or until Ctrl-C; whether the end was reached.
+    config: Config, run: Path, data: TrainingData, trainer: Trainer
+) -> tuple[list[dict[str, float]], bool]:
+    """Train from the folder's last.pt, if it is there, to the end of the schedule or to Ctrl-C.
 
-    history gets a row an epoch: mean losses and the scores on the validation images. losses: of
-    the steps already taken in the epoch that history lacks.
+    Returns the history, with a row of mean losses and validation scores for every epoch, and
+    whether the end was reached.
     """
-    us, steps = trainer.team, steps_per_epoch(config, data)
-    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if us.is_main else None
-    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not us.is_main)
+    processes, steps = trainer.team, steps_per_epoch(config, data)
+    history, losses = trainer.resume(run / "last.pt")  # losses: of steps after history's last row
+    save = partial(
+        trainer.save, config=config, metres_per_pixel=data.metres_per_pixel, history=history
+    )
+    main = processes.is_main
+    if main:
+        adapted = f", adapted to {config.adaptation.target}" if config.adaptation.target else ""
+        print(
+            f"{trainer.describe()}, on {len(data.train)} {config.data.kind} images{adapted}, for "
+            f"{config.train.epochs} epochs, seed {config.seed}; results in {run}",
+            flush=True,
+        )
+    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if main else None
+    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not main)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:
         for epoch in range(len(history), config.train.epochs):
-            for batch in batches(config, data, us, epoch, skip=trainer.step - epoch * steps):
+            skip = trainer.step - epoch * steps
+            for batch in epoch_loader(config, data, processes, epoch, skip):
                 losses.append(trainer.train_step(batch))
                 bar.update()
                 bar.set_postfix(loss=f"{losses[-1]['loss']:.3f}", epoch=epoch + 1)
-                if us.any(interrupted.is_set()):
-                    save_last(run, config, data, trainer, history, losses)
-                    return False
-                if time.monotonic() - last_save > SAVE_SECONDS:
-                    save_last(run, config, data, trainer, history, losses)
+                stop = processes.any(interrupted.is_set())
+                if main and (stop or time.monotonic() - last_save > SAVE_SECONDS):
+                    save(run / "last.pt", losses=losses)
                     last_save = time.monotonic()
-            if us.is_main:
+                if stop:
+                    return history, False
+            if main:
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
                 row |= data.score(trainer.model)
                 history.append(row)
-                keep_best(run, config, data, trainer, history)
-                save_last(run, config, data, trainer, history, losses=[])
-                for name, value in row.items():
-                    writer.add_scalar(name, value, trainer.step)
-                writer.add_scalar("lr", trainer.scheduler.get_last_lr()[0], trainer.step)
-                writer.flush()
+                data.keep_best(run, history, save)
+                save(run / "last.pt", losses=[])
+                write_curves(writer, row | {"lr": trainer.scheduler.get_last_lr()[0]})
                 bar.write(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
             losses = []
-            us.wait()
-    return True
+            processes.wait()
+    return history, True
 
 
-def keep_best(
-    run: Path, config: Config, data: TrainingData, trainer: Trainer, history: list[dict]
+def save_best(
+    run: Path, data: TrainingData, history: list[dict[str, float]], weights: Path | None
 ) -> None:
-    """Have best.pt hold the weights of the epoch that `data.chosen` names, if it names one."""
-    chosen = data.chosen(history)
-    if data.keeps_every_epoch:
-        this, best = (run / f"epoch{row['epoch']}.pt" for row in (history[-1], chosen))
-        trainer.save(this, config, data.metres_per_pixel, history=history)
-        write_atomic(run / "best.pt", best.read_bytes())
-    elif chosen is history[-1]:
-        trainer.save(run / "best.pt", config, data.metres_per_pixel, history=history)
-
-
-def batches(config: Config, data: TrainingData, us: Team, epoch: int, skip: int) -> DataLoader:
-    """This process's part of the batches of one epoch from number `skip` on."""
-    sampler = EpochBatches(
-        len(data.train), config.train.batch_size, config.seed, epoch, skip, us.rank, us.ranks
-    )
-    workers = config.train.workers
-    workers = max(1, (os.cpu_count() or 1) // us.ranks) if workers is None else workers
-    return DataLoader(
-        data.train,
-        batch_sampler=sampler,
-        num_workers=workers,
-        worker_init_fn=ignore_interrupt,
-        pin_memory=us.device.type == "cuda",
-    )
-
-
-def save_last(
-    run: Path, config: Config, data: TrainingData, trainer: Trainer,
-    history: list[dict], losses: list[dict],
-) -> None:  # fmt: skip
-    if trainer.team.is_main:
-        progress = {"history": history, "losses": losses}
-        trainer.save(run / "last.pt", config, data.metres_per_pixel, **progress)
-
-
-def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-def ignore_interrupt(worker: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-
-
-def save_training(run: Path, data: TrainingData, history: list[dict], weights: Path | None) -> None:
-    """The best network alone, its scores, and pictures of how it came about and what it does."""
+    """Save the best network alone, its scores, curves and pictures, and print how good it is."""
     if not history:  # stopped within the first epoch
         return
-    best = load_graspnet(run / "best.pt")
+    best, network = load_graspnet(run / "best.pt"), run / "graspnet.pt"
     scores = best.extra["history"][-1]
-    for path in filter(None, [run / "graspnet.pt", weights]):
+    for path in filter(None, [network, weights]):
         save_graspnet(path, best.model, best.metres_per_pixel, best.config, scores=scores)
     save_results(run / "results.json", {"best": scores, "history": history})
     draw_curves(run / "curves.png", history)
     for name, images in data.pictured().items():
         draw_predictions(run / f"{name}.png", best.model, images)
-    print(f"best after epoch {scores['epoch']}: {data.chosen_by} {scores[data.chosen_by]:.3f}")
-    print(f"score it: python evaluate.py evaluate.policies=heuristic,{run / 'graspnet.pt'}")
+    print(f"best after epoch {scores['epoch']}: {describe_scores(scores)}")
+    print(f"the same on test objects: python -m benchmarks.bench_graspnet --checkpoint {network}")
+    print("with the planner's search, which makes up for much that a weak network misses:")
+    print(f"  python evaluate.py evaluate.policies=heuristic,{network}")
 
 
-# --- Real data: cross-validation ------------------------------------------------------------
-
-
-def cross_validate(config: Config, resume: Path | None, weights: Path | None, us: Team) -> int:
-    """Train and test a network for every fold; results so far are saved after each."""
-    if weights is not None and config.data.fold is None:
+def cross_validate(config: Config, options: argparse.Namespace, processes: Team) -> int:
+    """Train and test a network for every fold of real images; returns the exit code."""
+    if options.weights is not None and config.data.fold is None:
         raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
     folds = real_folds(config)
-    run = resume or Path(us.broadcast(us.is_main and open_run(config)))
+    run = options.resume or open_run(config, processes)
     judged: dict[int, list[Judged]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"
-        trainer = make_trainer(config, fold.data, us)
-        history, losses = load_progress(trainer, folder / "last.pt")
-        if us.is_main:
+        trainer = make_trainer(config, fold.data, processes)
+        if processes.is_main:
             folder.mkdir(exist_ok=True)
-            announce(config, folder, fold.data, trainer)
-        us.wait()
-        if not train(config, folder, fold.data, trainer, history, losses):
-            if us.is_main:
+        processes.wait()
+        history, finished = train(config, folder, fold.data, trainer)
+        if not finished:
+            if processes.is_main:
                 print(f"stopped in fold {fold.number}; go on with --resume {run}")
             return 130
-        if us.is_main:
+        if processes.is_main:
             judged[fold.number] = fold.judge(trainer.model)
-            save_fold(config, folder, fold, judged[fold.number], trainer, history, weights)
+            save_fold(config, folder, fold, judged[fold.number], trainer.model, options.weights)
+            draw_curves(folder / "curves.png", history)
             print(describe_fold(fold, judged[fold.number]), flush=True)
-            results = cross_validation_results(folds, judged)
-            save_results(run / "results.json", results)
-        us.wait()
-    if us.is_main:
+            save_results(run / "results.json", cross_validation_results(folds, judged))
+        processes.wait()
+    if processes.is_main:
         print(describe_folds(config, judged))
         print(f"every prediction: {run / 'results.json'} and {run / 'fold*' / 'predictions.png'}")
     return 0
-
-
-def save_fold(
-    config: Config, folder: Path, fold: Fold, judged: Sequence[Judged], trainer: Trainer,
-    history: Sequence[dict], weights: Path | None,
-) -> None:  # fmt: skip
-    """A fold's network alone, its curves, and pictures of all its test images."""
-    right = sum(one.correct for one in judged)
-    for path in filter(None, [folder / "graspnet.pt", weights]):
-        save_graspnet(
-            path, trainer.model, fold.data.metres_per_pixel, config.model_dump(mode="json"),
-            scores={"correct": right, "images": len(judged)},
-        )  # fmt: skip
-    draw_curves(folder / "curves.png", history)
-    draw_rectangles(folder / "predictions.png", fold.test_samples, judged)
 
 
 if __name__ == "__main__":

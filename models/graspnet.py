@@ -1,9 +1,10 @@
 """GraspNet: from an RGB-D image to ranked grasps (the tutorial's chapter 3).
 
-In order: an image becomes the network's input; the network; labels become training targets and
-the loss. `models.graspnet_decoding` makes grasps of the network's maps. Angles on the image are those of
-the closing line from +u (right) towards +v (down), modulo pi; bin k of K is centred at k * 180 / K
-degrees. Widths are metres. This module knows no simulator.
+This module holds, in this order: the conversion of an image to the network's input, the network,
+the conversion of labels to training targets, and the loss. `models.graspnet_decoding` turns the
+network's maps into grasps. An angle on the image is that of the closing line from +u (right)
+towards +v (down), modulo pi; bin k of K is centred at k * 180 / K degrees. Widths are metres. This
+module knows no simulator.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ INPUT_CHANNELS = 4  # red, green, blue, depth
 PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
 DEPTH_UNIT = 0.1  # metres of depth that count 1 in the input: objects are about that high
 OFFSET_UNIT = 10.0  # pixels to a centre of mass that count 1 in the last layer
-DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is cut off
+DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is clipped
 
 
 def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
-    """The network's input (4, H, W) float32 of one image; the one place of normalisation.
+    """Return the network's input (4, H, W) float32 of one image; the one place of normalisation.
 
     rgb: (H, W, 3) uint8. depth: (H, W) metres; 0, negative or not finite means unknown.
     Colours become -0.5..0.5. Depth is filled from the nearest known pixel, centred by its median
-    (so that the camera's distance does not matter) and cut off at +-0.3 m, which become +-3.
-    Raises UserError for images that cannot be meant.
+    (so that the camera's distance does not matter) and clipped to +-0.3 m, which become +-3.
+    Raises UserError as `check_rgbd` does.
     """
     median = check_rgbd(rgb, depth)
     filled = fill_holes(depth)
@@ -52,8 +53,11 @@ def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
 
 
 def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
-    """The median of the known depths; one UserError that says what is wrong with an RGB-D image, if
-    anything is."""
+    """Return the median of the known depths, in metres.
+
+    Raises UserError for wrong shapes or types, for an image without known depth, and for a median
+    outside `PLAUSIBLE_DEPTH`.
+    """
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise UserError(f"rgb: got an array of shape {rgb.shape}, expected (H, W, 3) channels")
     if rgb.dtype != np.uint8:
@@ -85,13 +89,14 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
 
 
 class GraspNet(nn.Module):
-    """Quality, angle and width of the best grasp at every pixel.
+    """A network that predicts quality, angle and width of the best grasp at every pixel.
 
     input_channels: 4 for `to_input`. num_angle_bins: K bins over [0, pi). max_width: metres, the
-    largest width that can be told; 0.15 in the tutorial, 0.08 fits the Panda hand. backbone: one
-    of `models.graspnet_backbones.BACKBONES`; "tutorial" is the tutorial's encoder and decoder. centre_head:
-    a fourth head tells what leads from each pixel to the centre of mass of the object seen there.
-    `model_args` holds these five, so that `GraspNet(**model_args)` is the same architecture.
+    largest width that the network can predict; 0.15 in the tutorial, 0.08 fits the Panda hand.
+    backbone: one of `models.graspnet_backbones.BACKBONES`; "tutorial" is the tutorial's encoder and
+    decoder. centre_head: a fourth head predicts the offset from each pixel to the centre of mass of
+    the object seen there. `model_args` holds these five arguments, so that
+    `GraspNet(**model_args)` is the same architecture.
     """
 
     def __init__(
@@ -125,12 +130,12 @@ class GraspNet(nn.Module):
     def forward(
         self, x: torch.Tensor, logits: bool = False, centres: bool = False
     ) -> tuple[torch.Tensor, ...]:
-        """Maps of the input's height and width, whatever these are.
+        """Return maps of the input's height and width; any size is allowed.
 
         x: (B, C, H, W). Returns quality (B, 1, H, W) in [0, 1], angle logits (B, K, H, W) and
-        width (B, 1, H, W) in metres. With `logits` the quality comes before its sigmoid, which is
-        what GraspLoss wants. With `centres` a fourth map follows, of the centre head: (B, 2, H, W),
-        pixels (du, dv) to the centre of mass. Arguments, not methods, so that
+        width (B, 1, H, W) in metres. With `logits` the quality is returned before its sigmoid, as
+        GraspLoss needs it. With `centres` the map of the centre head follows: (B, 2, H, W), pixels
+        (du, dv) to the centre of mass. These are arguments, not methods, so that
         DistributedDataParallel sees the call.
         """
         if x.ndim != 4 or x.shape[1] != self.input_channels:
@@ -141,7 +146,7 @@ class GraspNet(nn.Module):
         return self.heads(self.features(x), logits, centres)
 
     def features(self, x: torch.Tensor) -> torch.Tensor:
-        """What the backbone makes of x (B, C, H, W): (B, out_channels, H, W)."""
+        """Return the backbone's feature map (B, out_channels, H, W) of x (B, C, H, W)."""
         height, width = x.shape[-2:]
         below, right = -height % self.backbone.stride, -width % self.backbone.stride
         if below or right:
@@ -151,7 +156,7 @@ class GraspNet(nn.Module):
     def heads(
         self, features: torch.Tensor, logits: bool = False, centres: bool = False
     ) -> tuple[torch.Tensor, ...]:
-        """The maps of `features`, see `forward`."""
+        """Return the heads' maps of a feature map, as `forward` does."""
         quality = self.quality_head(features)
         angle = self.angle_head(features)
         metres = torch.sigmoid(self.width_head(features)) * self.max_width
@@ -167,11 +172,12 @@ class GraspNet(nn.Module):
         depth: np.ndarray | None = None,
         **decoding,
     ) -> dict:
-        """The best pixel of one image as in the tutorial, and, given the camera, metric grasps.
+        """Return the best pixel of one image as in the tutorial and, with a camera, metric grasps.
 
-        x: (1, C, H, W). Returns x and y in fractions of the image, theta in fractions of 180
-        degrees (bin k is centred at k / num_angle_bins), width in metres, quality. With K, T_WC
-        and depth also `grasps`, what `decode_grasps(..., **decoding)` returns, best first.
+        x: (1, C, H, W). The returned dict holds `x` and `y` in fractions of the image, `theta` in
+        fractions of 180 degrees (bin k is centred at k / num_angle_bins), `width` in metres and
+        `quality`. With K, T_WC and depth it also holds `grasps`, the list that
+        `decode_grasps(..., **decoding)` returns, best first.
         """
         if len(x) != 1:
             raise ValueError(f"predict_grasp takes one image, got a batch of {len(x)}")
@@ -203,7 +209,7 @@ def create_model(
     max_width: float = 0.15,
     centre_head: bool = False,
 ) -> GraspNet:
-    """A GraspNet with the backbone `name`; UserError with the known ones if there is no such."""
+    """Make a GraspNet with the backbone `name`; an unknown one is a UserError that lists all."""
     return GraspNet(input_channels, num_angle_bins, max_width, name, centre_head)
 
 
@@ -211,12 +217,13 @@ def create_model(
 
 
 class GraspTargets(NamedTuple):
-    """What the network should say about B images.
+    """The maps that the network should predict for B images.
 
     quality: (B, 1, H, W) in [0, 1]. angle: (B, K, H, W), at each pixel a distribution over bins.
     width: (B, 1, H, W) metres. valid: (B, 1, H, W) weight of the pixel in the quality loss, 0 to
     leave it out. graspable: (B, 1, H, W) its weight in the angle and width losses. offset: (B, 2,
-    H, W) pixels to the centre of mass. on_object: (B, 1, H, W) weight of the pixel in its loss.
+    H, W) pixels to the centre of mass. on_object: (B, 1, H, W) weight of the pixel in the loss of
+    the offsets.
     """
 
     quality: torch.Tensor
@@ -235,15 +242,16 @@ def targets_from_labels(
     graspable_from: float = 0.5,
     offset: torch.Tensor | None = None,
 ) -> GraspTargets:
-    """Targets from dense labels: what a grasp at each pixel AND in each angle bin is worth.
+    """Make targets from dense labels: the quality of a grasp at each pixel AND in each angle bin.
 
     quality, width: (B, K, H, W), in [0, 1] and metres. valid: (B, 1, H, W) weights or None for 1.
-    At each pixel the quality is the best bin's, the width the best bin's, and the angle's target
-    gives every bin its share of the summed cubes of quality: where several angles are good, all of
-    them are right (one hard angle makes the head collapse, see notes/grasping.md), and the cube,
-    which is the labels' plain product of factors, keeps the barely feasible ones small. Pixels that
-    reach `graspable_from` teach angle and width. offset: (B, 2, H, W) pixels to the centre of mass
-    of the object seen, NaN where there is none; None: not known anywhere.
+    graspable_from: the quality from which on a pixel teaches angle and width. offset: (B, 2, H, W)
+    pixels to the centre of mass of the object seen, NaN where there is none; None if unknown.
+
+    The targets of quality and width are those of the pixel's best bin. The angle's target gives
+    every bin its share of the summed cubes of quality: where several angles are good, all of them
+    are right (with one hard angle per pixel the angle head collapses), and the cube, which is the
+    plain product of the label's factors, keeps the share of barely feasible bins small.
     """
     best, bin_ = quality.max(dim=1, keepdim=True)
     share = quality**3
@@ -262,11 +270,11 @@ def targets_from_labels(
 class GraspLoss(nn.Module):
     """Quality, angle and width losses, each averaged over its pixels in an image, then over images.
 
-    Binary cross-entropy of the quality; cross-entropy of the angle against the target's whole
-    distribution; L1 of the width in metres, so `width_weight` is per metre (10: one centimetre
-    counts 0.1); L1 of a centre head's offsets, so `centre_weight` is per pixel. Averaging image by
-    image makes every image count alike, and makes the mean over processes with batches of equal
-    size the loss of the joint batch.
+    The quality's loss is binary cross-entropy (nats); the angle's is cross-entropy against the
+    target's whole distribution (nats); the width's is L1 in metres, so `width_weight` is per metre
+    (10: one centimetre counts 0.1); the centre head's is L1 in pixels, so `centre_weight` is per
+    pixel. Averaging image by image makes every image count alike, and makes the mean over processes
+    with batches of equal size the loss of the joint batch.
     """
 
     def __init__(
@@ -289,12 +297,20 @@ class GraspLoss(nn.Module):
         width: torch.Tensor,
         targets: GraspTargets,
         offset: torch.Tensor | None = None,
+        *tutorial: torch.Tensor,
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The weighted sum, and its unweighted parts (detached scalars).
+        """Return the weighted sum, and its unweighted parts (detached scalars).
 
-        The first three, and `offset` of a network with a centre head, are what the network returns
-        with `logits` (and `centres`); half precision is widened here.
+        The first three arguments, and `offset` of a network with a centre head, are the maps that
+        the network returns with `logits` (and `centres`); half precision is widened here. Raises
+        TypeError for the tutorial's call with seven tensors.
         """
+        if tutorial or not isinstance(targets, GraspTargets):
+            raise TypeError(
+                "GraspLoss: expected (quality_logits, angle_logits, width, targets) with targets "
+                "of models.graspnet.targets_from_labels; the tutorial's seven tensors allow only "
+                "one angle per pixel, with which the angle head collapses"
+            )
         quality = F.binary_cross_entropy_with_logits(
             quality_logits.float(), targets.quality, reduction="none"
         )
@@ -317,13 +333,13 @@ class GraspLoss(nn.Module):
 
 
 def mean_per_image(value: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Weighted means of (B, ...) over each image, averaged; an image without weight counts 0."""
+    """Average (B, ...) over each image by weight, then over images; no weight counts as 0."""
     summed = (value * weight).flatten(1).sum(1)
     return (summed / weight.flatten(1).sum(1).clamp(min=1e-6)).mean()
 
 
 def main() -> None:
-    """Print the parameters and output shapes of every backbone, as in the tutorial."""
+    """Print the number of parameters and the output shapes of every backbone, as the tutorial."""
     x = torch.randn(2, INPUT_CHANNELS, 224, 224)
     for name in BACKBONES:
         model = create_model(name=name)

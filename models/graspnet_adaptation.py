@@ -1,19 +1,17 @@
-"""GraspNet trained on labelled images of one domain and unlabelled ones of another.
+"""Adaptation of GraspNet from labelled simulated images to unlabelled photographs.
 
-A domain classifier tells from the features which domain an image is of, and the backbone is
-trained against it by way of a gradient reversal (`utils.adaptation`), while the heads learn from
-the labelled images alone. Knows neither where the images come from nor how a checkpoint is chosen.
-
-Unlabelled photographs as what GraspNet is adapted to: examples, and the choice of a checkpoint.
-
-No label of theirs is read anywhere. Every example is a pure function of (seed, epoch, index), as in
-`models.graspnet_examples`, so that a run can be resumed exactly.
+A domain classifier predicts from the features which domain an image is of, and the backbone is
+trained against it through a gradient reversal (`utils.adaptation`), while the heads learn from the
+labelled images alone. No label of a photograph is read, for the choice of a checkpoint either. This
+module holds, in this order: the trainer, the check of a folder of photographs, the pairs of
+examples, and the choice of the checkpoint. Every pair is a pure function of (seed, epoch, index),
+so that a run can be resumed exactly.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -25,8 +23,7 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from models.graspnet import DEPTH_UNIT, GraspNet, to_input
-from models.graspnet_data import TrainingData
-from models.graspnet_examples import Example, LabelledImages
+from models.graspnet_data import Example, TrainingData
 from models.graspnet_scores import predict
 from models.graspnet_training import Trainer
 from models.photographs import K, frame_of, from_above
@@ -44,27 +41,50 @@ from utils.adaptation import (
     reversal_weight,
     select_domain,
 )
-from utils.augmentation import Augmentation, ColourJitter
+from utils.augmentation import Augmentation, ColourJitter, LabelledImages
 from utils.checkpoint import load_weights
 from utils.config import AdaptationConfig, Config, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.real_data import KEY, RealSample, UnlabelledImages
+from utils.runs import write_atomic
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 
-STATE = "adaptation"  # the entry of a checkpoint's `extra` from which a training goes on
+STATE = "adaptation"  # the entry of a checkpoint's `extra` that a resumed training needs
+# The photographs change in the same ways as the simulated training images, so that no change
+# reveals the domain.
+AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
+STANDS_OUT = (0.01, 0.15)  # m above the table: heights of the points that crops are laid around
+MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
+CHECKED = 12  # images of a folder, spread over it, whose distances are checked
+# How many times worse any other reading of an image has to explain the table for its numbers to be
+# distances from a base. For each of Cornell's 80 photographs in folder 01 that is 17 to 22 (0.8 to
+# 1.2 mm as distances, 16 to 22 mm as depths). For depths rendered in the cell, of cameras 0 to 37
+# degrees from straight down, with a Kinect's noise, it is below 1.1, for distances made of these
+# above 3. Tests hold both, and Cornell's.
+DISTINCT = 2.0
+# m: better fits count as this good, because the ratio of two fits that are exact but for rounding
+# and steps of depth means nothing: 0.03 mm and 0.01 mm, for depths in the cell.
+EXACT = 0.0005
+INFORMATION_STEP = 4  # pixels between the predictions that count; neighbours predict the same
+
+
+# --- Training -------------------------------------------------------------------------------
 
 
 class Pair(NamedTuple):
-    """source: a labelled example, or a batch of them. target: (4, h, w) or (B, 4, h, w), inputs of
-    the other domain, as many."""
+    """Examples of both domains.
+
+    source: a labelled example, or a batch of them. target: (4, h, w), or (B, 4, h, w), as many
+    inputs of the other domain.
+    """
 
     source: Example
     target: torch.Tensor
 
 
 class Features(nn.Module):
-    """The part of a GraspNet that is made to forget the domain: all before its heads."""
+    """The part of a GraspNet before its heads, whose features shall not depend on the domain."""
 
     def __init__(self, model: GraspNet):
         super().__init__()
@@ -75,7 +95,7 @@ class Features(nn.Module):
 
 
 class Heads(nn.Module):
-    """The part of a GraspNet that learns from labels alone, with all its maps."""
+    """The heads of a GraspNet, which learn from labels alone; they return all its maps."""
 
     def __init__(self, model: GraspNet):
         super().__init__()
@@ -87,9 +107,9 @@ class Heads(nn.Module):
 
 
 def domain_classifier(channels: int) -> nn.Module:
-    """From features (B, channels, H, W) to logits (B, 1) of coming from the target.
+    """Make a classifier from features (B, channels, H, W) to logits (B, 1) of the target domain.
 
-    The mean over the image comes last, so it judges textures and edges, not where things lie.
+    The mean over the image comes last, so it judges textures and edges, not their places.
     """
     return nn.Sequential(
         nn.Conv2d(channels, 64, 4, stride=4), nn.ReLU(),
@@ -110,8 +130,8 @@ def check_alone(team: Team) -> None:
 class AdaptingTrainer(Trainer):
     """A Trainer that takes batches of `Pair`.
 
-    From here on the model's batch norms have statistics for either domain; checkpoints hold an
-    ordinary network with those of the target. Raises UserError for more than one process.
+    It gives the model's batch norms statistics for each domain; checkpoints hold an ordinary
+    network with the statistics of the target. Raises UserError for more than one process.
     """
 
     def __init__(
@@ -128,14 +148,16 @@ class AdaptingTrainer(Trainer):
 
     @property
     def reversal(self) -> float:
-        """What the domain loss weighs in the features at this step."""
+        """The weight of the domain loss in the features at this step."""
         progress = self.step / max(self.total_steps - 1, 1)
         return self.weight * reversal_weight(min(progress, 1.0))
 
     def losses(self, batch: Pair) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The grasp loss on the source plus the domain loss, and their parts; `domain_accuracy`
-        is the classifier's on this batch. With weight 0 there is no classifier's loss: the target
-        only tells its batch norms' statistics."""
+        """Return the grasp loss on the source plus the domain loss, and their parts.
+
+        `domain_accuracy` is the classifier's on this batch. With weight 0 the domain loss does not
+        count: the target only updates the statistics of its batch norms.
+        """
         device = self.team.device
         source, target = (
             images.to(device, memory_format=torch.channels_last, non_blocking=True)
@@ -156,11 +178,11 @@ class AdaptingTrainer(Trainer):
         return (total + between if self.weight > 0 else total), parts
 
     def ordinary_model(self) -> GraspNet:
-        """A copy with the target's statistics in ordinary batch norms."""
+        """Return a copy with the target's statistics in ordinary batch norms."""
         return ordinary_norms(copy.deepcopy(self.model), TARGET)
 
     def more_state(self) -> dict[str, Any]:
-        """Statistics of both domains, with the weights that they belong to, and the classifier."""
+        """Return the model with the statistics of both domains, and the classifier."""
         classifier = self.trained.domain_classifier
         return {STATE: {"model": self.model.state_dict(), "classifier": classifier.state_dict()}}
 
@@ -170,28 +192,14 @@ class AdaptingTrainer(Trainer):
         self.trained.domain_classifier.load_state_dict(saved["classifier"])
 
 
-# Of a photograph, what simulated training images are changed by, too: no change tells the domain.
-AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
-STANDS_OUT = (0.01, 0.15)  # m above the table: what a crop is laid around, as on simulated images
-MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
-CHECKED = 12  # images of a folder, spread over it, each of which has to hold what it says
-# How many times worse any other reading of an image has to explain the table for its numbers to be
-# distances from a base. For each of Cornell's 80 photographs in folder 01 that is 17 to 22 (0.8 to
-# 1.2 mm as distances, 16 to 22 mm as depths). For depths rendered in the cell, of cameras 0 to 37
-# degrees from straight down, with a Kinect's noise, it is below 1.1, for distances made of these
-# above 3. Tests hold both, and Cornell's.
-DISTINCT = 2.0
-# m: what fits better is taken to fit as well as this, for between two fits that are exact but for
-# rounding and steps of depth the ratio says nothing: 0.03 mm and 0.01 mm, for depths in the cell.
-EXACT = 0.0005
-INFORMATION_STEP = 4  # pixels between those whose predictions are asked; neighbours say the same
+# --- The photographs ------------------------------------------------------------------------
 
 
 def open_target(config: Config) -> Sequence[RealSample] | None:
-    """The images of `adaptation.target`, or None where nothing is adapted.
+    """Open the photographs of `adaptation.target`; returns None if the config names no folder.
 
-    Raises UserError for data that cannot be adapted from, and for a folder that cannot be used or
-    whose images hold something else than distances from a robot's base.
+    Raises UserError for training data other than simulated, for a folder that cannot be used, and
+    for images that do not hold distances from a robot's base.
     """
     folder = config.adaptation.target
     if folder is None:
@@ -207,9 +215,13 @@ def open_target(config: Config) -> Sequence[RealSample] | None:
 
 
 def check_distances(images: UnlabelledImages) -> None:
-    """Raise UserError naming the first of `CHECKED` images, spread over the folder, that would be
-    misread: each has to show a table that distances from a robot's base explain, far better than
-    depths or distances from the camera do, with the base where distances tell depths."""
+    """Raise UserError, naming the image, unless images hold distances from a robot's base.
+
+    `CHECKED` images are read, spread over the folder.
+
+    Each image has to show a table that such distances explain far better than depths or distances
+    from the camera do, with the base at a point from which distances determine depths.
+    """
     chosen = np.linspace(0, len(images) - 1, min(len(images), CHECKED)).round().astype(int)
     for record in (images.records[i] for i in chosen):
         _check_distances(images.read(record).depth, record.files["d.tiff"])
@@ -237,13 +249,13 @@ def _check_distances(image: np.ndarray, file: Path) -> None:
         raise UserError(
             f"{KEY}: {file} holds distances from a point that is too near to what is seen: some "
             f"rays of the camera are nearest to it less than {STANDS_OUT[1]:g} m above the table, "
-            "or below, where distances do not tell depths; make them of the depths by "
+            "or below, where distances do not determine depths; make them of the depths by "
             "utils.table_plane.distances, as docs/sim_to_real.md shows"
         )
 
 
 def seen_from_above(sample: RealSample, metres_per_pixel: float) -> RealSample:
-    """A photograph as a network sees it that learns at so many metres per pixel."""
+    """Return a photograph as the overhead camera would see it, at this scale."""
     view = from_above(frame_of(sample), metres_per_pixel)
     return replace(sample, rgb=view.rgb, depth=view.depth)
 
@@ -251,7 +263,7 @@ def seen_from_above(sample: RealSample, metres_per_pixel: float) -> RealSample:
 def split_target(
     samples: Sequence[RealSample], share: float, seed: int
 ) -> tuple[list[int], list[int]]:
-    """Numbers of the images to learn from, and of those held out to choose a checkpoint."""
+    """Return the indices of the images to learn from, and of those that choose a checkpoint."""
     order = np.random.default_rng(seed).permutation(len(samples)).tolist()
     count = min(max(round(share * len(order)), 1), len(order) - 1)
     return sorted(order[count:]), sorted(order[:count])
@@ -260,8 +272,8 @@ def split_target(
 class TargetPairs(Dataset):
     """Labelled examples, each with a crop of a random photograph, changed at random.
 
-    source: a data set of `Example`s by (epoch, index). view: how the photographs are seen, at the
-    source's scale. Crops are as large as the source's, around something that stands on the table.
+    source: a data set of `Example`s by (epoch, index). view: the view of the photographs, at the
+    source's scale. Crops are as large as the source's, around a point that is above the table.
     """
 
     def __init__(
@@ -288,8 +300,11 @@ class TargetPairs(Dataset):
 def corner_around(
     x: torch.Tensor, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[int, int]:
-    """Row and column at which a crop of `size` starts: around a random pixel of an input x (4, H,
-    W) that is in its `MIDDLE` and `STANDS_OUT` metres above the table; anywhere if none is."""
+    """Return the row and column at which a crop of `size` from the input x (4, H, W) starts.
+
+    The crop lies around a random pixel in the image's `MIDDLE` that is `STANDS_OUT` metres above
+    the table, or around any pixel if there is none.
+    """
     height = -DEPTH_UNIT * x[3].numpy()
     size, shape = np.array(size), np.array(height.shape)
     rows, columns = np.ogrid[: shape[0], : shape[1]]
@@ -306,12 +321,14 @@ def corner_around(
 
 
 def grasp_information(model: GraspNet, images: LabelledImages) -> float:
-    """Nats that a place in an image tells of what the network says there: nothing to grasp, or a
-    grasp in one of its K bins. 0 .. log(1 + K), see `utils.adaptation.mutual_information`. Of the
-    square `MIDDLE` around the centre; labels are not looked at. The model ends in evaluation mode.
+    """Return the mutual information of places and predictions, in nats: 0 .. log(1 + K).
+
+    A prediction is "nothing to grasp" or a grasp in one of the K bins; see
+    `utils.adaptation.mutual_information`. Places are those of the square `MIDDLE` around the
+    centre; labels are not used. The model ends in evaluation mode.
     """
     model.eval()
-    said = []
+    predicted = []
     for index in range(len(images)):
         quality, angle, _ = predict(model, images[index])
         rows, columns = (
@@ -319,30 +336,37 @@ def grasp_information(model: GraspNet, images: LabelledImages) -> float:
             for n in quality.shape[2:]
         )
         quality, angle = (maps[..., rows, columns].double() for maps in (quality, angle))
-        said.append(torch.cat([1 - quality, quality * angle.softmax(dim=1)], dim=1))
-    p = torch.cat(said).clamp_min(torch.finfo(torch.double).tiny)
+        predicted.append(torch.cat([1 - quality, quality * angle.softmax(dim=1)], dim=1))
+    p = torch.cat(predicted).clamp_min(torch.finfo(torch.double).tiny)
     return mutual_information(p.log())
 
 
 @dataclass(frozen=True)
 class AdaptationData(TrainingData):
-    """TrainingData whose `train` gives `Pair`s and whose `score` has an entry `information`.
+    """TrainingData whose `train` yields `Pair`s and whose `score` has an entry `information`.
 
-    target: the photographs that are held out.
+    target: the held-out photographs.
     """
 
     target: LabelledImages
 
-    keeps_every_epoch = True  # a later epoch can make an earlier one the choice
-
     def chosen(self, history: Sequence[dict[str, float]]) -> dict[str, float]:
-        """The row of the most information on the target, among those that do nearly as well as the
-        best on labelled images: `utils.adaptation.choose_check`."""
+        """Return the row with the most information on the target, among those whose score on
+        labelled images is nearly the best: `utils.adaptation.choose_check`."""
         checks = [
             Check(row["epoch"], row[self.chosen_by], row["information"], row["domain_accuracy"])
             for row in history
         ]
         return history[checks.index(choose_check(checks))]
+
+    def keep_best(
+        self, run: Path, history: Sequence[dict[str, float]], save: Callable[[Path], None]
+    ) -> None:
+        """Keep every epoch, because a later one can make an earlier one the choice."""
+        rows = history[-1], self.chosen(history)
+        newest, best = (run / f"epoch{row['epoch']}.pt" for row in rows)
+        save(newest)
+        write_atomic(run / "best.pt", best.read_bytes())
 
     def pictured(self) -> dict[str, LabelledImages]:
         return super().pictured() | {"target": self.target}
@@ -351,10 +375,10 @@ class AdaptationData(TrainingData):
 def with_target(
     config: Config, data: TrainingData, samples: Sequence[RealSample]
 ) -> AdaptationData:
-    """Simulated data, paired with photographs of `open_target`."""
+    """Pair simulated data with the photographs of `open_target`."""
     learnt, held_out = split_target(samples, config.adaptation.held_out, config.seed)
-    see = partial(seen_from_above, metres_per_pixel=data.metres_per_pixel)
-    samples = Changed(samples, see)
+    to_view = partial(seen_from_above, metres_per_pixel=data.metres_per_pixel)
+    samples = Changed(samples, to_view)
     side = samples[0].depth.shape[0]
     view = View(side, side, data.metres_per_pixel)
     if len(samples) <= IN_MEMORY:

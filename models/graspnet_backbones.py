@@ -1,8 +1,10 @@
 """Backbones of GraspNet: from an image to a feature map of the same resolution.
 
-Each has `stride` (image sides must be multiples of it), `out_channels` and `forward(x)` from
-(B, C, H, W) to (B, out_channels, H, W). They know nothing of grasps. All code is our own; the
-layer sizes of the last two are facts from the papers named at each.
+A backbone is a module with `stride` (image sides must be multiples of it), `out_channels` and
+`forward(x)` from (B, C, H, W) to (B, out_channels, H, W); it is made with the number of input
+channels and knows nothing of grasps. A new one is a class in this file and an entry in `BACKBONES`,
+whose names `train.backbone` accepts. All code is our own; the layer sizes of the last two backbones
+come from the papers named in their docstrings.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from torch import nn
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> list[nn.Module]:
-    """Convolution, batch normalisation, ReLU; an even kernel is meant to halve the image."""
+    """Convolution, batch normalisation, ReLU; with stride 2, an even kernel halves the image."""
     padding = (kernel - 1) // 2
     return [
         nn.Conv2d(inputs, outputs, kernel, stride, padding),

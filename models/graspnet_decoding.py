@@ -1,8 +1,8 @@
-"""From a network's maps of one image to ranked grasps: peaks of its quality, and what is there.
+"""From a network's maps of one image to ranked grasps at the peaks of the quality map.
 
 Angles on the image are those of the closing line from +u (right) towards +v (down), modulo pi; bin
-k of K is centred at k * 180 / K degrees. Widths are metres. This module knows no simulator and not
-where the maps come from.
+k of K is centred at k * 180 / K degrees. Widths are metres. This module knows neither a simulator
+nor the source of the maps.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ LABELS = LabelSettings()
 
 @dataclass(frozen=True)
 class PeakSettings:
-    """Which pixels become grasps."""
+    """The conditions under which a pixel becomes a grasp."""
 
     threshold: float = 0.5  # the quality that a peak has to exceed
-    count: int = 20  # most peaks returned
+    count: int = 20  # the largest number of peaks
     radius: int = 4  # pixels; no two peaks are this close in both u and v
-    blur: float = 1.0  # pixels, standard deviation of the Gaussian over the quality; 0: none
+    blur: float = 1.0  # pixels, standard deviation of the Gaussian over the quality; 0: no blur
 
 
 class Peaks(NamedTuple):
-    """N peaks of the quality, best first: pixel (N, 2) as (u, v), not rounded; angle (N,) on the
-    image in [0, pi); width (N,) metres; quality (N,)."""
+    """N peaks of the quality map, best first.
+
+    pixel: (N, 2) as (u, v), not rounded. angle: (N,) on the image, in [0, pi). width: (N,) metres.
+    quality: (N,) in [0, 1].
+    """
 
     pixel: np.ndarray
     angle: np.ndarray
@@ -55,12 +58,13 @@ def decode_grasps(
     labels: LabelSettings = LABELS,
     peaks: PeakSettings = PeakSettings(),
 ) -> list[Grasp]:
-    """Ranked top-down grasps in W, best first; an empty list if no quality exceeds the threshold.
+    """Return top-down grasps in W, best first; none if no quality exceeds the threshold.
 
-    quality, angle, width: what `GraspNet` returns for one image. K: (3, 3), T_WC: (4, 4), depth:
-    (H, W) metres, 0 = unknown. table_height: z of the table in W. The fingertips go as far straight
-    down from the surface point that the pixel shows as the labels say (`grasp_below_surface`), the
-    width ends at the gripper's. Peaks without known depth beside them are left out.
+    quality, angle, width: the maps that `GraspNet` returns for one image. K: (3, 3), T_WC: (4, 4),
+    depth: (H, W) metres, 0 = unknown. table_height: z of the table in W, metres. The fingertips go
+    straight down from the surface point that the pixel shows, as deep as the labels assume
+    (`grasp_below_surface`); the width is limited to the gripper's opening. Peaks without known
+    depth beside them are left out.
     """
     found = surface_grasps(find_peaks(quality, angle, width, peaks), depth, gripper)
     return [grasp_below_surface(grasp, K, T_WC, table_height, gripper, labels) for grasp in found]
@@ -69,8 +73,9 @@ def decode_grasps(
 def surface_grasps(
     found: Peaks, depth: np.ndarray, gripper: GripperGeometry = PANDA_HAND, radius: int = 1
 ) -> list[ImageGrasp]:
-    """The peaks on the visible surface: with the depth seen around them, and openings that the
-    gripper has. Peaks without known depth within `radius` pixels are left out."""
+    """Place peaks on the visible surface: the depth is the median around them, and the width is
+    limited to the gripper's opening. Peaks without known depth within `radius` pixels are left out.
+    """
     return [
         ImageGrasp(
             pixel, float(angle), surface, min(float(width), gripper.max_opening), float(quality)
@@ -88,10 +93,10 @@ def find_peaks(
     width: torch.Tensor,
     settings: PeakSettings = PeakSettings(),
 ) -> Peaks:
-    """Local maxima of one image's quality map, with the angle and width that belong to them.
+    """Find the local maxima of one image's quality map, with the angle and width there.
 
-    quality, width: (..., H, W) and angle: (..., K, H, W) with only ones in front. A peak is the
-    highest pixel of its window (max-pool non-maximum suppression); of equal ones, the first.
+    quality, width: (..., H, W) and angle: (..., K, H, W), whose leading dimensions are 1. A peak is
+    the highest pixel of its window (max-pool non-maximum suppression); of equal pixels the first.
     """
     shape = quality.shape[-2:]
     score = quality.detach().reshape(shape).float().cpu().numpy()
@@ -136,8 +141,8 @@ def _angles(probability: np.ndarray) -> np.ndarray:
 
     The cube root gives back the bins' qualities up to a factor (see `targets_from_labels`). They
     are smoothed around the circle by (1, 4, 6, 4, 1) / 16, which finds the middle of a range of
-    equally good ones, and a parabola through the logarithms of the highest and its neighbours tells
-    the place between bins; exact for Gaussian-shaped distributions.
+    equally good bins. A parabola through the logarithms of the highest bin and its neighbours gives
+    the place between bins, exactly for Gaussian-shaped distributions.
     """
     bins, quality = probability.shape[1], np.cbrt(probability)
     smooth = sum(

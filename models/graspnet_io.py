@@ -1,14 +1,8 @@
-"""GraspNet on disk: the one format that training, planner and `predict.py` share.
+"""GraspNet on disk: the checkpoint that training, planner and `predict.py` share, and ONNX.
 
-A file holds weights, architecture, config and the pixel size of the training images. This module
-knows neither how a network is trained nor what it is used for.
-
-GraspNet as an ONNX file for runtimes without PyTorch.
-
-The graph takes `image`, (B, 4, H, W) float32 as `models.graspnet.to_input` makes it, for any B and
-for H and W that are multiples of the backbone's stride; pad other sizes by repeating the last row
-and column and crop the maps. It gives `quality`, `angle_logits` and `width` as `GraspNet.forward`
-does; a centre head is left out. The file's metadata say what else has to be known.
+A checkpoint holds weights, architecture, config and the pixel size of the training images. An ONNX
+file holds the network for runtimes without PyTorch (`export_onnx`). This module knows neither how a
+network is trained nor what it is used for.
 """
 
 from __future__ import annotations
@@ -30,15 +24,22 @@ from utils.errors import UserError
 from utils.runs import write_atomic
 
 SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
-KIND = "graspnet"  # also of training checkpoints, which hold an optimiser besides
-CENTRE_HEAD = "centre_head."  # how the names of its weights begin
-PIXEL_SIZE = "metres_per_pixel"  # its entry in a checkpoint's `extra`
+KIND = "graspnet"  # also of training checkpoints, which hold an optimiser as well
+CENTRE_HEAD = "centre_head."  # the names of its weights begin so
+PIXEL_SIZE = "metres_per_pixel"  # the entry of the pixel size in a checkpoint's `extra`
+# Of ONNX files; the name marks those that `export_onnx` may replace.
+PRODUCER = "robot-grasping"
+OPSET = 18
+OUTPUTS = ("quality", "angle_logits", "width")
 
 
 class SavedGraspNet(NamedTuple):
-    """model: in evaluation mode. metres_per_pixel: what one pixel of a training image spans at the
-    image's median depth; convolutions know no other scale. config: the resolved config, plain.
-    extra: anything else plain that was saved, such as metrics."""
+    """A network and the facts that are needed to use it.
+
+    model: in evaluation mode. metres_per_pixel: the length that one pixel of a training image spans
+    at the image's median depth; convolutions know no other scale. config: the resolved config as
+    plain data. extra: other plain data that was saved, such as scores.
+    """
 
     model: GraspNet
     metres_per_pixel: float
@@ -47,7 +48,7 @@ class SavedGraspNet(NamedTuple):
 
 
 def metres_per_pixel(K: np.ndarray, depth: float) -> float:
-    """What one pixel of a camera with matrix K (3, 3) spans at a depth in metres."""
+    """Return the length that one pixel of a camera with matrix K (3, 3) spans at a depth in m."""
     return 2 * depth / float(K[0, 0] + K[1, 1])
 
 
@@ -58,10 +59,10 @@ def save_graspnet(
     config: dict[str, Any] | None = None,
     **extra: Any,
 ) -> None:
-    """Write a network for use, without what only training needs.
+    """Write a network for use, without the state of its training.
 
     model: the bare module, not its DistributedDataParallel. metres_per_pixel, config, extra: see
-    SavedGraspNet. Raises TypeError for what could not be loaded again.
+    SavedGraspNet. Raises TypeError for values that could not be loaded again.
     """
     if not 0 < metres_per_pixel < np.inf:
         raise ValueError(f"metres_per_pixel must be > 0 and finite, got {metres_per_pixel}")
@@ -76,11 +77,10 @@ def save_graspnet(
 
 
 def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") -> SavedGraspNet:
-    """The network in a file of `save_graspnet`, or in a training checkpoint of kind `KIND` whose
-    `extra` holds `PIXEL_SIZE`.
+    """Load a network from a file of `save_graspnet` or from a training checkpoint.
 
-    Raises UserError, naming the file, if it is missing, damaged, no GraspNet of ours, of another
-    version or architecture, or holds weights that are not finite.
+    Raises UserError, naming the file, if it is missing, damaged, no GraspNet of this project, of
+    another version or architecture, or holds weights that are not finite.
     """
     checkpoint = load_checkpoint(path, KIND, map_location=map_location)
     try:
@@ -93,15 +93,16 @@ def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") ->
     extra = dict(checkpoint["extra"])
     pixel_size = extra.pop(PIXEL_SIZE, None)
     if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
-        raise UserError(f"{path}: does not say the pixel size it was trained at ({PIXEL_SIZE})")
+        raise UserError(f"{path}: does not hold the pixel size of its images ({PIXEL_SIZE})")
     return SavedGraspNet(model.to(map_location).eval(), pixel_size, checkpoint["config"], extra)
 
 
 def load_initial(model: GraspNet, path: Path | str) -> None:
-    """Put the weights of a saved network into a new one of the same backbone.
+    """Copy the weights of a saved network into a new one of the same backbone.
 
-    A centre head that only the saved one has is left out; one that only the new one has keeps its
-    random weights. Raises UserError as `load_graspnet` does, and if the weights do not fit.
+    A centre head that only the saved network has is left out; one that only the new network has
+    keeps its random weights. Raises UserError as `load_graspnet` does, and if the weights do not
+    fit.
     """
     saved = load_graspnet(path).model
     weights = saved.state_dict()
@@ -113,10 +114,10 @@ def load_initial(model: GraspNet, path: Path | str) -> None:
 
 
 def for_inference(model: GraspNet) -> GraspNet:
-    """A faster copy that gives the same maps up to rounding; it cannot be trained or saved.
+    """Return a faster copy with the same maps up to rounding; it cannot be trained or saved.
 
-    Every batch normalisation is folded into the convolution before it, and weights lie channels
-    last, the order that CPU convolutions like best.
+    Every batch normalisation is folded into the convolution before it, and the weights are stored
+    channels last, the order in which CPU convolutions are fastest.
     """
     fast = copy.deepcopy(model).eval().requires_grad_(False)
     for sequence in [module for module in fast.modules() if isinstance(module, nn.Sequential)]:
@@ -129,15 +130,14 @@ def for_inference(model: GraspNet) -> GraspNet:
     return fast.to(memory_format=torch.channels_last)
 
 
-PRODUCER = "robot-grasping"
-OPSET = 18
-OUTPUTS = ("quality", "angle_logits", "width")
-
-
 def export_onnx(saved: SavedGraspNet, path: Path) -> None:
-    """Write the network whole or not at all; an older export at `path` is replaced.
+    """Write the network as an ONNX file; an older export at `path` is replaced.
 
-    Raises UserError if something else lies there.
+    The graph takes `image`, (B, 4, H, W) float32 as `models.graspnet.to_input` makes it, for any B
+    and for H and W that are multiples of the backbone's stride; pad other sizes by repeating the
+    last row and column, and crop the maps. It returns `quality`, `angle_logits` and `width` as
+    `GraspNet.forward` does; a centre head is left out. The file's metadata hold the architecture,
+    the stride and the pixel size. Raises UserError if another file lies at `path`.
     """
     check_export_path(path)
     model = saved.model.cpu().eval()
@@ -171,14 +171,14 @@ def export_onnx(saved: SavedGraspNet, path: Path) -> None:
 
 
 def check_export_path(path: Path) -> None:
-    """Raise UserError unless the path is free or holds an export of ours."""
-    import onnx  # takes a second to import and is needed for nothing else
+    """Raise UserError unless the path is free or holds an export of this project."""
+    import onnx  # takes a second to import and is needed here alone
 
     if not path.exists():
         return
     try:
         ours = onnx.load(path, load_external_data=False).producer_name == PRODUCER
-    except Exception:  # protobuf and onnx raise several types for what is not ONNX
+    except Exception:  # protobuf and onnx raise several types for other files
         ours = False
     if not ours:
         raise UserError(f"{path}: exists and is no export of this program; give another name")

@@ -1,14 +1,14 @@
-"""How good a network's grasps are by the dense labels of images that it was not trained on.
+"""The scores of a network on labelled images, and the curves and pictures of a training.
 
-Pictures of a training: loss and score curves, and what the network says of some images.
+A score judges the network alone: the highest peak of its quality map against the dense labels of
+images that it was not trained on. No planner's search takes part.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,18 +16,41 @@ import torch
 
 from models.graspnet import GraspNet, to_input
 from models.graspnet_decoding import Peaks, PeakSettings, find_peaks
-from models.graspnet_examples import LabelledImages, offset_to
-from utils.augmentation import LabelledImage
+from utils.augmentation import LabelledImage, LabelledImages
 from utils.errors import UserError
 from utils.grasp_labels import LabelSettings
-from utils.runs import write_atomic
+from utils.runs import save_figure
 from utils.transforms import angle_difference, known_depth
 
-BEST = PeakSettings(threshold=0.0, count=1)
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+BEST = PeakSettings(threshold=0.0, count=1)  # the highest peak
+DRAWN = PeakSettings(threshold=0.3, count=5)  # the peaks in a picture
+NO_CURVES = ("epoch", "step", "images")  # entries of a history row that are no curves
+# Where each entry of a history row comes from, and its unit; "" has none.
+TRAINING, VALIDATION = "training", "validation"
+CURVES = {
+    "loss": (TRAINING, ""),
+    "quality_loss": (TRAINING, "nats"),
+    "angle_loss": (TRAINING, "nats"),
+    "width_loss": (TRAINING, "m"),
+    "centre_loss": (TRAINING, "px"),
+    "domain_loss": (TRAINING, "nats"),
+    "domain_accuracy": (TRAINING, ""),
+    "lr": (TRAINING, ""),
+    "label_quality": (VALIDATION, ""),
+    "precision": (VALIDATION, ""),
+    "angle_error": (VALIDATION, "rad"),
+    "width_error": (VALIDATION, "m"),
+    "distance": (VALIDATION, "px"),
+    "centre_error": (VALIDATION, "px"),
+    "information": (VALIDATION, "nats"),
+}
 
 
 class LabelScores(NamedTuple):
-    """Of the top grasps of N images that have something to grasp.
+    """Scores of the best grasps on N images that show something graspable.
 
     label_quality: mean label of the grasp's pixel and angle bin, 0 where none is feasible.
     precision: share whose label counts as positive. angle_error: mean, radians, to the nearest
@@ -44,8 +67,7 @@ class LabelScores(NamedTuple):
 
 
 def check_graspable(images: LabelledImages) -> None:
-    """Raise UserError if no image shows anything to grasp; looks no further than the first that
-    does."""
+    """Raise UserError if no image shows anything graspable; reads up to the first that does."""
     if not any(shows_a_grasp(images[index]) for index in range(len(images))):
         raise UserError(
             f"none of the {len(images)} validation images shows anything that can be grasped, so "
@@ -55,6 +77,7 @@ def check_graspable(images: LabelledImages) -> None:
 
 
 def shows_a_grasp(image: LabelledImage) -> bool:
+    """Whether any pixel and angle bin of the image has a positive label."""
     return bool((image.quality >= LabelSettings().positive).any())
 
 
@@ -62,7 +85,7 @@ def shows_a_grasp(image: LabelledImage) -> bool:
 def predict(
     model: GraspNet, image: LabelledImage, centres: bool = False
 ) -> tuple[torch.Tensor, ...]:
-    """The network's maps (1, C, H, W) of one labelled image."""
+    """Return the network's maps (1, C, H, W) of one labelled image."""
     device = next(model.parameters()).device
     rgb = np.ascontiguousarray(image.rgb.permute(1, 2, 0).numpy())
     x = to_input(rgb, image.depth.numpy())[None].to(device, memory_format=torch.channels_last)
@@ -70,7 +93,7 @@ def predict(
 
 
 def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
-    """Top grasps against dense labels; the model is left in evaluation mode."""
+    """Score the network's best grasps by dense labels; the model ends in evaluation mode."""
     model.eval()
     rows = []
     for index in range(len(images)):
@@ -88,23 +111,8 @@ def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
     )  # fmt: skip
 
 
-@torch.inference_mode()
-def centre_error(model: GraspNet, images: LabelledImages) -> float:
-    """How far from their object's centre of mass the pixels of objects point, in pixels: the median
-    in each image, averaged. The model needs a centre head, the images centres."""
-    model.eval()
-    errors = []
-    for image in (images[index] for index in range(len(images))):
-        on_object = image.centre.isfinite().all(dim=0)
-        if on_object.any():
-            *_, offset = predict(model, image, centres=True)
-            wrong = offset[0].cpu() - offset_to(image.centre)
-            errors.append(float(torch.linalg.norm(wrong[:, on_object], dim=0).median()))
-    return float(np.mean(errors))
-
-
 def score_peak(found: Peaks, image: LabelledImage) -> tuple[float, float, float, float]:
-    """Label quality, angle error, width error and distance of the first peak."""
+    """Return label quality, angle error, width error and distance of the first peak."""
     bins = image.quality.shape[0]
     centres = np.arange(bins) * np.pi / bins
     (u, v), angle, width = found.pixel[0], found.angle[0], found.width[0]
@@ -121,12 +129,56 @@ def score_peak(found: Peaks, image: LabelledImage) -> tuple[float, float, float,
     return label, float(turn.min()), abs(float(width) - labelled_width), float(distance.min())
 
 
-SHOWN = PeakSettings(threshold=0.3, count=5)
+@torch.inference_mode()
+def centre_error(model: GraspNet, images: LabelledImages) -> float:
+    """Return the error of a centre head in pixels: the median over the pixels on objects of each
+    image, averaged over the images. The images must hold centres of mass."""
+    model.eval()
+    errors = []
+    for image in (images[index] for index in range(len(images))):
+        on_object = image.centre.isfinite().all(dim=0)
+        if on_object.any():
+            *_, offset = predict(model, image, centres=True)
+            wrong = offset[0].cpu() - offset_to(image.centre)
+            errors.append(float(torch.linalg.norm(wrong[:, on_object], dim=0).median()))
+    return float(np.mean(errors))
+
+
+def offset_to(centre: torch.Tensor) -> torch.Tensor:
+    """Return the offsets (2, H, W) from each pixel (u, v) to the places `centre` (2, H, W)."""
+    rows, columns = centre.shape[1:]
+    v, u = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    return centre - torch.stack([u, v])
+
+
+def describe_scores(scores: Mapping[str, float]) -> str:
+    """Describe a history row's validation scores in one sentence."""
+    return (
+        f"the network alone, by the best grasp on each of {scores['images']:.0f} validation "
+        f"images: mean label {scores['label_quality']:.2f} of 1, "
+        f"{100 * scores['precision']:.0f} % positive; the nearest label is "
+        f"{np.degrees(scores['angle_error']):.1f} degrees, {1000 * scores['width_error']:.1f} mm "
+        f"of width and {scores['distance']:.1f} px away"
+    )
+
+
+def curve_tag(name: str) -> str:
+    """Return the TensorBoard tag of an entry of a history row: "validation/width_error_m"."""
+    origin, unit = CURVES[name]
+    return f"{origin}/{name}_{unit}" if unit else f"{origin}/{name}"
+
+
+def write_curves(writer: SummaryWriter, row: Mapping[str, float]) -> None:
+    """Write a history row to TensorBoard at its step."""
+    for name, value in row.items():
+        if name not in NO_CURVES:
+            writer.add_scalar(curve_tag(name), value, row["step"])
+    writer.flush()
 
 
 def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
-    """One small plot for every loss and score over the epochs."""
-    names = [name for name in history[-1] if name not in ("epoch", "step", "images")]
+    """Draw one small plot for every loss (training) and score (validation) over the epochs."""
+    names = [name for name in history[-1] if name not in NO_CURVES]
     columns = 4
     rows = -(-len(names) // columns)
     figure, axes = plt.subplots(
@@ -134,17 +186,20 @@ def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
     )
     epochs = [row["epoch"] for row in history]
     for axis, name in zip(axes.flat, names):
-        axis.plot(epochs, [row[name] for row in history], marker=".")
-        axis.set_title(name.replace("_", " "), fontsize=10)
+        origin, unit = CURVES[name]
+        colour = "tab:blue" if origin == TRAINING else "tab:orange"
+        axis.plot(epochs, [row[name] for row in history], marker=".", color=colour)
+        axis.set_title(f"{origin}: {name.replace('_', ' ')}", fontsize=10)
         axis.set_xlabel("epoch", fontsize=8)
+        axis.set_ylabel(unit, fontsize=8)
         axis.grid(alpha=0.3)
     for axis in list(axes.flat)[len(names) :]:
         axis.remove()
-    _save(figure, path)
+    save_figure(path, figure)
 
 
 def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count: int = 8) -> None:
-    """Rows of: colour with the best grasps, depth, labelled quality, the network's quality."""
+    """Draw rows of: colour with the best grasps, depth, labelled and predicted quality."""
     chosen = np.linspace(0, len(images) - 1, min(count, len(images))).astype(int)
     titles = ("grasps", "depth", "labelled quality", "predicted quality")
     figure, axes = plt.subplots(
@@ -160,7 +215,7 @@ def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count:
         row[1].imshow(depth, cmap="gray", vmin=known.min(), vmax=known.max())
         row[2].imshow(image.quality.amax(dim=0), vmin=0, vmax=1)
         row[3].imshow(torch.squeeze(quality).float().cpu(), vmin=0, vmax=1)
-        found = find_peaks(quality, angle, width, SHOWN)
+        found = find_peaks(quality, angle, width, DRAWN)
         for (u, v), direction, value in zip(found.pixel, found.angle, found.quality):
             du, dv = 12 * np.cos(direction), 12 * np.sin(direction)
             row[0].plot([u - du, u + du], [v - dv, v + dv], color="white", linewidth=3)
@@ -170,11 +225,4 @@ def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count:
             axis.set_axis_off()
     for axis, title in zip(axes[0], titles):
         axis.set_title(title, fontsize=10)
-    _save(figure, path)
-
-
-def _save(figure: plt.Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    plt.close(figure)
-    write_atomic(path, buffer.getvalue())
+    save_figure(path, figure)

@@ -1,20 +1,22 @@
-"""Training steps of GraspNet: precision, schedule, checkpoints that resume exactly.
+"""Training steps of GraspNet: precision, schedule, and checkpoints that resume exactly.
 
-Knows neither where batches come from nor how a trained network is judged.
+This module knows neither the source of the batches nor how a trained network is judged.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from models.graspnet import GraspLoss, GraspNet
-from models.graspnet_examples import Example
+from models.graspnet_data import Example
 from models.graspnet_io import KIND, PIXEL_SIZE
 from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
 from utils.config import Config, TrainConfig
@@ -25,8 +27,11 @@ GRADIENT_LIMIT = 5.0  # of the gradient's norm; only the first steps ever reach 
 
 
 def choose_precision(name: str, device: torch.device) -> torch.dtype:
-    """What matrix products are computed in. auto: float16 on a GPU, bfloat16 on a CPU that has
-    instructions for it, else float32."""
+    """Return the type in which matrix products are computed.
+
+    name: a type's name or auto, which is float16 on a GPU, bfloat16 on a CPU that has instructions
+    for it, else float32.
+    """
     if name != "auto":
         return getattr(torch, name)
     if device.type == "cuda":
@@ -36,8 +41,8 @@ def choose_precision(name: str, device: torch.device) -> torch.dtype:
 
 
 def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
-    """Factor on the learning rate: up in a line, then down to 0 as a half cosine (Loshchilov and
-    Hutter 2017, without restarts)."""
+    """Return the factor on the learning rate at a step: a linear warm-up, then a half cosine down
+    to 0 (Loshchilov and Hutter, "SGDR", 2017, without restarts)."""
     warmup = warmup_share * total
     if step < warmup:
         return (step + 1) / (warmup + 1)
@@ -47,10 +52,10 @@ def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
 class Trainer:
     """A network in training.
 
-    total_steps: length of the schedule. model is the bare network; trained: what the optimiser
-    steps, the model or something larger that holds it. Gradients are averaged over the processes of
-    `team`, so that together they take the step of the joint batch (with batch-normalisation
-    statistics of each process's part, except on GPUs).
+    total_steps: length of the schedule. model: the bare network. trained: the module whose
+    parameters the optimiser changes, by default the model, else a module that contains it.
+    Gradients are averaged over the processes of `team`, so that these together take the step of the
+    joint batch (with batch-normalisation statistics of each process's part, except on GPUs).
     """
 
     def __init__(
@@ -87,8 +92,20 @@ class Trainer:
             team.device.type, enabled=self.precision == torch.float16
         )
 
+    def describe(self) -> str:
+        """Describe the network and the processes that train it."""
+        parameters = sum(p.numel() for p in self.model.parameters())
+        return (
+            f"GraspNet {self.model.model_args['backbone']}, {parameters:,} parameters, "
+            f"{self.team.ranks} process(es), {self.team.device}, "
+            f"{str(self.precision).removeprefix('torch.')}"
+        )
+
     def train_step(self, batch: Example) -> dict[str, float]:
-        """One optimiser step; the loss and its parts. UserError if the loss is not finite."""
+        """Take one optimiser step; returns the loss and its parts.
+
+        Raises UserError, without changing a weight, if the loss is not finite.
+        """
         self._parallel.train()
         total, parts = self.losses(batch)
         if not torch.isfinite(total):
@@ -107,7 +124,7 @@ class Trainer:
         return {"loss": total.item(), **{name: value.item() for name, value in parts.items()}}
 
     def losses(self, batch: Example) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The loss of a batch and its parts, in the chosen precision."""
+        """Return the loss of a batch and its parts, in the chosen precision."""
         device = self.team.device
         image = batch.image.to(device, memory_format=torch.channels_last, non_blocking=True)
         targets = type(batch.targets)(*(t.to(device, non_blocking=True) for t in batch.targets))
@@ -118,8 +135,8 @@ class Trainer:
         return self.loss(quality, angle, width, targets, *offset)
 
     def save(self, path: Path, config: Config, metres_per_pixel: float, **extra: Any) -> None:
-        """Everything that `load` needs to go on as if nothing had happened, bit for bit on the
-        same device and number of processes."""
+        """Write a checkpoint from which `load` continues the training, bit for bit on the same
+        device and number of processes. extra: plain entries to keep beside it."""
         save_checkpoint(
             path,
             kind=KIND,
@@ -138,8 +155,13 @@ class Trainer:
             },
         )
 
+    def resume(self, path: Path) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+        """Continue from a checkpoint if it exists; returns its entries `history` and `losses`."""
+        saved = self.load(path) if path.is_file() else {}
+        return saved.get("history", []), saved.get("losses", [])
+
     def load(self, path: Path) -> dict[str, Any]:
-        """Go on from a checkpoint of `save`; returns its extra entries."""
+        """Continue from a checkpoint of `save`; returns its extra entries."""
         checkpoint = load_checkpoint(
             path, KIND, model_args=self.model.model_args, map_location=self.team.device
         )
@@ -155,13 +177,18 @@ class Trainer:
         return checkpoint["extra"]
 
     def ordinary_model(self) -> GraspNet:
-        """The network as a checkpoint holds it, for `load_graspnet`."""
+        """Return the network that a checkpoint holds for `load_graspnet`."""
         return self.model
 
     def more_state(self) -> dict[str, Any]:
-        """What a checkpoint has to hold of a training besides, plain."""
+        """Return further plain entries that a checkpoint needs to resume the training."""
         return {}
 
     def take_weights(self, checkpoint: dict[str, Any], path: Path) -> None:
-        """Put back what `ordinary_model` and `more_state` gave."""
+        """Load the weights that `ordinary_model` and `more_state` gave to the checkpoint."""
         load_weights(self.model, checkpoint, path)
+
+
+def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Average every entry over rows that have the same names."""
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

@@ -1,11 +1,12 @@
-"""How planners and networks that were made in simulation alone do on Cornell's photographs.
+"""Scores of planners and networks from simulation on Cornell's photographs.
 
-No label teaches anything, and nothing is fitted to one. A photograph becomes a frame: its distances
-become depths, the table tells where the camera is (`utils.table_plane`). The labels are for a hand
-that can hold a cereal box, which the Panda's cannot. A hand of the same shape that is k times as
-large does in its world what the Panda's does in one that is k times as small; so frames are shrunk,
-and everything else is as in the cell. The plates of a rectangle are half as long as its opening, as
-Morrison, Corke and Leitner ("Closing the loop for robotic grasping", RSS 2018) draw theirs.
+No planner or network is trained or fitted on the photographs' labels. A photograph becomes a frame:
+its distances are converted to depths, and the table gives the camera's pose (`utils.table_plane`).
+The labels are for a hand that can hold a cereal box, which the Panda's cannot. A hand of the same
+shape that is k times as large acts in its world as the Panda's does in a world that is k times as
+small; so frames are shrunk, and everything else is as in the cell. The plates of a rectangle are
+half as long as its opening, as Morrison, Corke and Leitner ("Closing the loop for robotic
+grasping", RSS 2018) draw theirs.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ HAND = GripperGeometry()
 OPENING = 0.15  # m, of the hand that photographs are judged for: the tutorial's widest
 SHRUNK = OPENING / HAND.max_opening  # how many times smaller a photograph's world becomes
 REACH = 0.04  # m outside a workspace that the planners' search still grasps (`SearchSettings`)
-# So that planners reach 0.30 m of the shrunk world, as large a square as the cell's.
+# With it planners reach 0.30 m of the shrunk world, as large a square as the cell's.
 WORKSPACE = Workspace((0.0, 0.0), 0.30 - 2 * REACH)
-PIXEL = 0.002  # m, of the view that tells how high a planner's grasp lies
+PIXEL = 0.002  # m, of the view from which the height of a planner's grasp is read
 BEST = PeakSettings(threshold=-1.0, count=1)
 
 
 def photographs(root: Path) -> list[RealSample]:
-    """Cornell's images in a folder. Raises UserError naming what is wrong with it."""
+    """Read Cornell's images in a folder; raises UserError for a missing or broken file."""
     samples = list(open_real_data("cornell", existing_folder(root, "transfer.cornell")))
     for sample in samples:
         if sample.depth.shape != SHAPE:
@@ -58,8 +59,10 @@ def photographs(root: Path) -> list[RealSample]:
 
 
 def frame_of(sample: RealSample, shrunk: float = SHRUNK) -> RGBDFrame:
-    """What planners see of a photograph, in a world that is `shrunk` times as small: z = 0 is the
-    table, and the camera looks at the middle of WORKSPACE. Pixels are the photograph's."""
+    """Return a photograph as a frame for planners, in a world that is `shrunk` times as small.
+
+    The table is z = 0, and the camera looks at the middle of WORKSPACE. The pixels stay the same.
+    """
     camera = find_table_camera(sample.depth, K)
     T_WC = camera.T_WC
     T_WC[:3, 3] /= shrunk
@@ -70,8 +73,11 @@ def frame_of(sample: RealSample, shrunk: float = SHRUNK) -> RGBDFrame:
 def judge_photographs(
     planner: str, samples: Sequence[RealSample], seed: int
 ) -> list[Judged | None] | None:
-    """The rectangle metric of a planner's best grasp, or a network's, on every photograph; None
-    where it finds none, and for a planner that needs more than a frame."""
+    """Score the best grasp of a planner, or of a network alone, on every photograph.
+
+    An entry is None where the planner finds no grasp. The result is None for a planner with an
+    attribute `needs_truth` that is true: a photograph has no true scene.
+    """
     planned = make_planner(planner, HAND, WORKSPACE, seed)
     if needs_truth(planned):
         return None
@@ -89,9 +95,11 @@ def judge_photographs(
 def judge_as_taken(
     planner: str, samples: Sequence[RealSample], seed: int
 ) -> list[Judged | None] | None:
-    """The same of a network that is given the photographs as one that is trained on them sees them:
-    levelled, at its own scale, but neither from above nor in a smaller world. None for planners of
-    another kind, which have to know where the camera is."""
+    """Score a network on the photographs in the view in which networks are trained on them.
+
+    They are levelled and at the network's scale, but neither seen from above nor in a smaller
+    world. Returns None for other planners, which need the camera's pose.
+    """
     planned = make_planner(planner, HAND, WORKSPACE, seed)
     if not isinstance(planned, GraspNetPlanner):
         return None
@@ -105,7 +113,7 @@ def judge_as_taken(
 
 
 def _as_taken(metres_per_pixel: float) -> View:
-    """Cornell's view in pixels that span `metres_per_pixel`, a multiple of 8 of them."""
+    """Return Cornell's view in pixels that span `metres_per_pixel`, a multiple of 8 of them."""
     view = VIEWS["cornell"]
     span = view.size * view.metres_per_pixel  # m
     size = 8 * round(span / metres_per_pixel / 8)
@@ -113,8 +121,8 @@ def _as_taken(metres_per_pixel: float) -> View:
 
 
 def best_grasp(planner: Planner, frame: RGBDFrame) -> Grasp | None:
-    """A network's best grasp, else the planner's first; on the surface that the image shows, below
-    which it does not tell how far the fingers go."""
+    """Return a network's best grasp or another planner's first, on the surface that the image
+    shows: a rectangle has no depth of the fingers below it."""
     if isinstance(planner, GraspNetPlanner):
         return network_grasp(planner.network, frame)
     planned = planner(frame)
@@ -128,13 +136,13 @@ def best_grasp(planner: Planner, frame: RGBDFrame) -> Grasp | None:
 
 
 def from_above(frame: RGBDFrame, metres_per_pixel: float) -> RGBDFrame:
-    """A photograph's frame as a network sees it whose pixels span `metres_per_pixel`."""
+    """Return a photograph's frame as the overhead camera would see it, at this scale."""
     return overhead_view(frame, WORKSPACE, metres_per_pixel, REACH)
 
 
 @torch.inference_mode()
 def network_grasp(saved: SavedGraspNet, frame: RGBDFrame) -> Grasp:
-    """The grasp at the best pixel of what a network sees from above, on the surface there."""
+    """Return the grasp at the best pixel of a network's view from above, on the surface there."""
     view = from_above(frame, saved.metres_per_pixel)
     maps = saved.model.eval()(to_input(view.rgb, view.depth)[None])
     (grasp,) = surface_grasps(find_peaks(*maps, BEST), view.depth, HAND)
@@ -142,7 +150,7 @@ def network_grasp(saved: SavedGraspNet, frame: RGBDFrame) -> Grasp:
 
 
 def rectangle_of(grasp: Grasp, frame: RGBDFrame) -> GraspRectangle:
-    """A grasp as a rectangle on the image: the opening is its projection."""
+    """Return a grasp as a rectangle on the image, whose opening is the projected one."""
     half = grasp.width / 2 * grasp.closing_direction
     (start, end), _ = project(grasp.position + np.stack([-half, half]), frame.K, frame.T_WC)
     du, dv = end - start

@@ -1,20 +1,14 @@
-"""From real images with labelled rectangles to what GraspNet sees and learns.
+"""Real images with labelled rectangles: the network's view, training examples, scores, pictures.
 
-Rectangles are moved with the image and drawn as dense targets last, so turned labels are exact and
-an example costs as much as its crop. Every example is a pure function of (seed, epoch, index), as
-in `models.graspnet_examples`. This module knows no file format and no network's weights.
-
-The rectangle metric of a network's best grasp on real images, as on Cornell and Jacquard.
-
-The network tells centre, angle and width of a grasp; the length of the plates, which the metric's
-rectangle has besides, is the median one of the labels that the network was trained on.
-
-Pictures of a network's best grasps on real images beside the labelled rectangles.
+Rectangles move with the image and are drawn as dense targets last, so turned labels are exact and
+an example costs as much as its crop. Every example is a pure function of (seed, epoch, index). A
+network's best grasp is scored by the rectangle metric of Cornell and Jacquard: the network predicts
+centre, angle and width; the length of the plates is the median of its training labels. This module
+knows no file format.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,28 +20,32 @@ import torch
 from torch.utils.data import Dataset
 
 from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_input
+from models.graspnet_data import Example
 from models.graspnet_decoding import PeakSettings, find_peaks
-from models.graspnet_examples import Example
 from utils.augmentation import Augmentation, LabelledImage
 from utils.real_data import RealSample
 from utils.rectangles import GraspRectangle, intersection_over_union, rasterise, rectangle_match
-from utils.runs import write_atomic
+from utils.runs import save_figure
 from utils.table_plane import robust_fit
 from utils.transforms import angle_difference
 
 FLAT = 0.005  # of the table's distance: noise, below which a pixel belongs to the table
-TABLE_STEP = 8  # pixels between those that the table is found from
+TABLE_STEP = 8  # pixels between those to which the table is fitted
 ANYWHERE = 0.5  # of the examples show any part of the view: its corners hold nothing to grasp
+BEST = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
+COLUMNS = 5  # of a picture's grid
+SHOWN = 60  # images in a picture at most; of more images, some evenly spread ones
+MARGIN = 40  # pixels around all rectangles
 
 
 @dataclass(frozen=True)
 class View:
-    """How the images of a camera become the network's: a central square, resampled.
+    """The central square of a camera's images, resampled for the network.
 
     side: pixels of the image that the square measures; it never depends on the labels. size: pixels
-    that it measures for the network. metres_per_pixel: what one of these spans at the image's
-    typical depth, which turns widths from pixels to metres and back. slanted: whether the camera
-    looks at the table from the side, so that its samples are to be `levelled`.
+    that it measures for the network. metres_per_pixel: the length that one of these spans at the
+    image's typical depth; it converts widths between pixels and metres. slanted: whether the camera
+    looks at the table from the side, so that its samples need `levelled`.
     """
 
     side: int
@@ -56,7 +54,7 @@ class View:
     slanted: bool = False
 
     def matrix(self, shape: tuple[int, int]) -> np.ndarray:
-        """(3, 3) that takes a pixel (u, v, 1) of an image of shape (H, W) to its place in here."""
+        """Return the (3, 3) matrix from a pixel (u, v, 1) of an image (H, W) to the view's."""
         zoom = self.size / self.side
         height, width = shape
         matrix = np.diag([zoom, zoom, 1.0])
@@ -66,8 +64,9 @@ class View:
     def warp(
         self, sample: RealSample, change: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, list[GraspRectangle]]:
-        """rgb (size, size, 3) uint8, depth (size, size) metres and the labelled rectangles in here,
-        after a `change` (3, 3) of the view's pixels. Beside the image its border goes on."""
+        """Return rgb (size, size, 3) uint8, depth (size, size) metres and the labelled rectangles
+        in the view, after a `change` (3, 3) of the view's pixels. The image's border is repeated
+        beyond it."""
         matrix = self.matrix(sample.depth.shape)
         matrix = matrix if change is None else change @ matrix
         rgb, depth = (
@@ -80,10 +79,10 @@ class View:
         return rgb, depth, [rectangle.transformed(matrix) for rectangle in sample.positives]
 
     def levelled(self, sample: RealSample) -> RealSample:
-        """The sample with depth as if every ray met the table at the same distance.
+        """Return the sample with depth as if every ray met the table at the same distance.
 
-        Seen at a slant, depth tells mostly where on the table something lies; levelled, how high it
-        is, as in images from above. The table is most of what the square shows.
+        In a slanted view depth depends mostly on the place on the table; levelled, it depends on
+        the height above the table, as in images from above. The square has to show mostly table.
         """
         inverse = _inverse_table(sample.depth, self.side)
         middle = float(np.median(_central(inverse, self.side)))
@@ -91,10 +90,10 @@ class View:
 
 
 def _inverse_table(depth: np.ndarray, side: int) -> np.ndarray:
-    """(H, W) one over the table's depth (H, W) metres, a quadratic of the pixel.
+    """Return one over the table's depth, (H, W) in 1/m: a quadratic of the pixel.
 
-    For a plane it is linear; the squares take lens distortion, and ranges in place of depths. A
-    robust fit over the central square: objects and walls lie far off the table and hardly count.
+    For a plane it is linear; the squares absorb lens distortion, and ranges in place of depths. The
+    fit over the central square is robust: objects and walls are far off the table and hardly count.
     """
     height, width = depth.shape
     v, u = (np.mgrid[:height, :width] - np.reshape([height / 2, width / 2], (2, 1, 1))) / side
@@ -106,7 +105,7 @@ def _inverse_table(depth: np.ndarray, side: int) -> np.ndarray:
 
 
 def _central(image: np.ndarray, side: int) -> np.ndarray:
-    """The square of `side` pixels in the middle of (H, W, ...), or what there is of it."""
+    """Return the square of `side` pixels in the middle of (H, W, ...), or less in small images."""
     top, left = (max(0, (length - side) // 2) for length in image.shape[:2])
     return image[top : top + side, left : left + side]
 
@@ -132,8 +131,8 @@ class RectangleImages:
 class RectangleExamples(Dataset):
     """Training examples of real samples, each changed at random and cropped around a label.
 
-    repeats: how often each sample comes in an epoch. crop: side of an example, pixels of the view.
-    max_width: metres; wider labels count as this. Indices are pairs (epoch, index).
+    repeats: the number of examples of each sample in an epoch. crop: side of an example, pixels of
+    the view. max_width: metres, the limit of the labels' widths. Indices are pairs (epoch, index).
     """
 
     def __init__(
@@ -174,7 +173,7 @@ class RectangleExamples(Dataset):
     def _corner(
         self, rectangles: Sequence[GraspRectangle], rng: np.random.Generator
     ) -> tuple[int, int]:
-        """Row and column at which a crop starts: anywhere, or to hold a random label somewhere."""
+        """Return the row and column of a crop: anywhere, or so that it holds a random label."""
         if rng.random() < ANYWHERE:
             middle = rng.uniform(0, self.view.size, size=2)
         else:
@@ -185,7 +184,7 @@ class RectangleExamples(Dataset):
         return int(row), int(column)
 
     def _targets(self, rectangles: Sequence[GraspRectangle]) -> GraspTargets:
-        """Targets (C, crop, crop) of rectangles in the crop's pixels."""
+        """Return targets (C, crop, crop) of rectangles in the crop's pixels."""
         quality, width = map(torch.from_numpy, rasterise(rectangles, (self.crop, self.crop)))
         metres = (width * self.view.metres_per_pixel).clamp(max=self.max_width)
         targets = targets_from_labels(
@@ -194,13 +193,16 @@ class RectangleExamples(Dataset):
         return GraspTargets(*(target[0] for target in targets))
 
 
-BEST = PeakSettings(threshold=-1.0, count=1)
+# --- Scores ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A network's best grasp on one image. rectangle: in pixels of the data set's image. iou,
-    angle_error: of the label with the largest IoU, the error in radians; correct: by the metric."""
+    """The score of a network's best grasp on one image.
+
+    rectangle: in pixels of the data set's image. iou, angle_error: to the label with the largest
+    IoU, the error in radians. correct: by the rectangle metric.
+    """
 
     name: str
     object_id: str
@@ -211,7 +213,7 @@ class Judged:
     angle_error: float
 
     def as_dict(self) -> dict:
-        """Plain numbers for a JSON file; angles in degrees."""
+        """Return plain numbers for a JSON file; angles in degrees."""
         return {
             "name": self.name,
             "object": self.object_id,
@@ -228,7 +230,7 @@ class Judged:
 
 
 def median_plate_length(samples: Sequence[RealSample]) -> float:
-    """Pixels, of all labels of some images."""
+    """Return the median length of the plates in all labels of some images, in pixels."""
     return float(np.median([r.height for sample in samples for r in sample.positives]))
 
 
@@ -236,10 +238,10 @@ def median_plate_length(samples: Sequence[RealSample]) -> float:
 def best_rectangle(
     model: GraspNet, sample: RealSample, view: View, plate_length: float
 ) -> tuple[GraspRectangle, float]:
-    """The network's best grasp on an image, in that image's pixels, and its quality.
+    """Return the network's best grasp on an image, in that image's pixels, and its quality.
 
-    plate_length: pixels of the image, what the rectangle measures across the closing line. The
-    model has to be in evaluation mode.
+    plate_length: pixels of the image, the rectangle's size across the closing line. The model has
+    to be in evaluation mode.
     """
     rgb, depth, _ = view.warp(sample)
     device = next(model.parameters()).device
@@ -255,7 +257,7 @@ def best_rectangle(
 def judge(
     model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float
 ) -> list[Judged]:
-    """The rectangle metric of the best grasp on every image; the model ends in evaluation mode."""
+    """Score the best grasp on every image; the model ends in evaluation mode."""
     model.eval()
     return [
         judged(sample, *best_rectangle(model, sample, view, plate_length)) for sample in samples
@@ -263,7 +265,7 @@ def judge(
 
 
 def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Judged:
-    """The rectangle metric of a grasp on an image, in that image's pixels."""
+    """Score a grasp on an image, in that image's pixels, by the rectangle metric."""
     overlaps = [intersection_over_union(rectangle, label) for label in sample.positives]
     nearest = int(np.argmax(overlaps))
     error = angle_difference(rectangle.angle, sample.positives[nearest].angle)
@@ -273,16 +275,14 @@ def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Jud
     )  # fmt: skip
 
 
-COLUMNS = 5
-SHOWN = 60  # most pictures; of more images, some evenly spread ones
-MARGIN = 40  # pixels around all rectangles
+# --- Pictures -------------------------------------------------------------------------------
 
 
 def draw_rectangles(
     path: Path, samples: Sequence[RealSample], judged: Sequence[Judged], shown: int = SHOWN
 ) -> None:
-    """A grid of images: labels green, the prediction blue where correct, else red; the thick sides
-    are the plates."""
+    """Draw a grid of images with their labels (green) and the prediction (blue if correct, else
+    red); the thick sides are the plates."""
     chosen = np.unique(np.linspace(0, len(judged) - 1, min(shown, len(judged))).astype(int))
     rows = -(-len(chosen) // COLUMNS)
     figure, axes = plt.subplots(
@@ -305,10 +305,7 @@ def draw_rectangles(
             f"{np.degrees(one.angle_error):.0f}°",
             fontsize=7,
         )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    plt.close(figure)
-    write_atomic(path, buffer.getvalue())
+    save_figure(path, figure)
 
 
 def _outline(axis: plt.Axes, rectangle: GraspRectangle, colour: str, width: float) -> None:

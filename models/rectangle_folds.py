@@ -1,14 +1,15 @@
 """Cornell and Jacquard as training data, in folds for cross-validation.
 
 Protocol: each fold's images are tested by a network trained on the other folds only, for a fixed
-schedule, with its last weights. No test image chooses anything, so there is no validation split
-besides. This module knows the data sets' cameras; not how the files are read.
+schedule, with its last weights. No test image chooses anything, so there is no separate validation
+split. This module knows the data sets' cameras (`VIEWS`, `CROPS`), but not their files.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,20 @@ import torch
 
 from models.graspnet import GraspNet
 from models.graspnet_data import TrainingData
+from models.graspnet_io import save_graspnet
 from models.rectangle_examples import (
     Judged,
     RectangleExamples,
     RectangleImages,
     View,
+    draw_rectangles,
     judge,
     median_plate_length,
 )
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
-from utils.real_data import RealSample, Split, image_folds, object_folds, open_real_data
+from utils.errors import UserError
+from utils.real_data import RealSample, open_real_data
 from utils.statistics import wilson_interval
 
 VIEWS = {
@@ -40,13 +44,14 @@ VIEWS = {
 }
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does
 CROPS = {"cornell": 128, "jacquard": 160}  # pixels of the view, side of a training example
-IN_MEMORY = 1000  # images that are decoded once: all of Cornell, 2 GB
-ASKED_FOR_PLATES = 500  # most images whose labels tell the plates' length
+IN_MEMORY = 1000  # data sets of up to so many images are decoded once: all of Cornell, 2 GB
+ASKED_FOR_PLATES = 500  # the labels of at most so many images give the length of the plates
+METRIC = "top-1, IoU > 0.25 and angle < 30 degrees"
 DEPTH_NOISE = 0.002  # m, standard deviation; real depth is noisy already
 
 
 def white_noise(depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-    """depth (H, W) metres with normal deviates added."""
+    """Add normal deviates to depth (H, W) metres."""
     noise = rng.standard_normal(tuple(depth.shape), dtype=np.float32)
     return depth + DEPTH_NOISE * torch.from_numpy(noise)
 
@@ -59,8 +64,11 @@ AUGMENTATION = Augmentation(
 )
 
 
+# --- Samples and folds ----------------------------------------------------------------------
+
+
 class Changed(Sequence[RealSample]):
-    """The samples of a data set, each changed by a function whenever it is asked for."""
+    """The samples of a data set, each changed by a function whenever it is read."""
 
     def __init__(
         self, samples: Sequence[RealSample], change: Callable[[RealSample], RealSample]
@@ -87,9 +95,62 @@ class Chosen(Sequence[RealSample]):
         return self.samples[self.indices[index]]
 
 
+@dataclass(frozen=True)
+class Split:
+    """Indices into a data set, each sorted; no index is in both."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+
+
+def object_folds(object_ids: Sequence[str], folds: int) -> list[Split]:
+    """Return k folds by object: no object of a test image is in a training image.
+
+    The objects stay in the order in which they first appear, so each test fold is one stretch of
+    them; the sizes of the folds differ by as little as whole objects in this order allow.
+    """
+    images: dict[str, list[int]] = {}
+    for index, name in enumerate(object_ids):
+        images.setdefault(name, []).append(index)
+    blocks = list(images.values())
+    if not 2 <= folds <= len(blocks):
+        raise UserError(f"folds: got {folds}, expected 2 to {len(blocks)} (the number of objects)")
+    ends = np.cumsum([len(block) for block in blocks])
+    cuts = [0]
+    for k in range(1, folds):  # the border nearest to k / folds of all images; no fold empty
+        low, high = cuts[-1] + 1, len(blocks) - (folds - k)
+        nearest = np.abs(ends[low - 1 : high] - k * len(object_ids) / folds).argmin()
+        cuts.append(low + int(nearest))
+    cuts.append(len(blocks))
+    return [_split(len(object_ids), sum(blocks[a:b], [])) for a, b in zip(cuts, cuts[1:])]
+
+
+def image_folds(count: int, folds: int, seed: int) -> list[Split]:
+    """Return k folds by image, drawn at random, whose sizes differ by at most one.
+
+    The object of a test image can be in training images.
+    """
+    if not 2 <= folds <= count:
+        raise UserError(f"folds: got {folds}, expected 2 to {count} (the number of images)")
+    order = np.random.default_rng(seed).permutation(count)
+    return [_split(count, test) for test in np.array_split(order, folds)]
+
+
+def _split(count: int, test: Sequence[int]) -> Split:
+    chosen = {int(i) for i in test}
+    return Split(tuple(i for i in range(count) if i not in chosen), tuple(sorted(chosen)))
+
+
+def folds_of(object_ids: Sequence[str], split: str, folds: int, seed: int) -> list[Split]:
+    """Return the folds by `object` or by `image`."""
+    if split == "object":
+        return object_folds(object_ids, folds)
+    return image_folds(len(object_ids), folds, seed)
+
+
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """One network's share of a cross-validation: what it learns from, what it is tested on.
+    """One network's part of a cross-validation: its training data and its test images.
 
     train, test: names of the images. plate_length: pixels, median of the training labels.
     """
@@ -103,12 +164,12 @@ class Fold:
     plate_length: float
 
     def judge(self, model: GraspNet) -> list[Judged]:
-        """The rectangle metric on the test images."""
+        """Score a network on the test images by the rectangle metric."""
         return judge(model, self.test_samples, self.view, self.plate_length)
 
 
 def real_folds(config: Config) -> list[Fold]:
-    """The folds that `config.data` names: all, or number `data.fold`.
+    """Return the folds that `config.data` names: all, or number `data.fold`.
 
     Raises UserError for missing or broken files, and folds that cannot be made.
     """
@@ -122,13 +183,6 @@ def real_folds(config: Config) -> list[Fold]:
     return [_fold(config, number, splits[number], samples, dataset.names) for number in numbers]
 
 
-def folds_of(object_ids: Sequence[str], split: str, folds: int, seed: int) -> list[Split]:
-    """Folds by `object` (those of a test image are never trained on) or by `image`."""
-    if split == "object":
-        return object_folds(object_ids, folds)
-    return image_folds(len(object_ids), folds, seed)
-
-
 def _fold(
     config: Config, number: int, split: Split, samples: Sequence[RealSample], names: Sequence[str]
 ) -> Fold:
@@ -140,9 +194,13 @@ def _fold(
         graspable_from=config.train.graspable_from,
     )  # fmt: skip
     data = TrainingData(
-        examples, RectangleImages(test, view), lambda model: {}, None, view.metres_per_pixel,
-        MAX_WIDTH,
-    )  # fmt: skip
+        train=examples,
+        validation=RectangleImages(test, view),
+        score=lambda model: {},
+        chosen_by=None,
+        metres_per_pixel=view.metres_per_pixel,
+        max_width=MAX_WIDTH,
+    )
     step = -(-len(train) // ASKED_FOR_PLATES)
     asked = Chosen(samples, split.train[::step])
     return Fold(
@@ -151,13 +209,25 @@ def _fold(
     )  # fmt: skip
 
 
-# --- What came out of it --------------------------------------------------------------------
+# --- Results --------------------------------------------------------------------------------
 
-METRIC = "top-1, IoU > 0.25 and angle < 30 degrees"
+
+def save_fold(
+    config: Config, folder: Path, fold: Fold, judged: Sequence[Judged], model: GraspNet,
+    weights: Path | None,
+) -> None:  # fmt: skip
+    """Save a fold's network alone (to `weights`, too, if given) and pictures of its test images."""
+    correct = sum(one.correct for one in judged)
+    for path in filter(None, [folder / "graspnet.pt", weights]):
+        save_graspnet(
+            path, model, fold.data.metres_per_pixel, config.model_dump(mode="json"),
+            scores={"correct": correct, "images": len(judged)},
+        )  # fmt: skip
+    draw_rectangles(folder / "predictions.png", fold.test_samples, judged)
 
 
 def describe_fold(fold: Fold, judged: Sequence[Judged]) -> str:
-    """Two lines: the accuracy, and which images it is of."""
+    """Describe a fold in two lines: the accuracy, and the names of its images."""
     right = sum(one.correct for one in judged)
     wrong = " ".join(one.name for one in judged if not one.correct)
     return (
@@ -168,7 +238,7 @@ def describe_fold(fold: Fold, judged: Sequence[Judged]) -> str:
 
 
 def describe_folds(config: Config, judged: Mapping[int, Sequence[Judged]]) -> str:
-    """One line for all folds together."""
+    """Describe all folds together in one line."""
     right, count, (low, high) = pooled(judged)
     which = f"{len(judged)} of {config.data.folds} folds by {config.data.split}"
     return (
@@ -178,7 +248,7 @@ def describe_folds(config: Config, judged: Mapping[int, Sequence[Judged]]) -> st
 
 
 def pooled(judged: Mapping[int, Sequence[Judged]]) -> tuple[int, int, tuple[float, float]]:
-    """How many are correct, of how many, and the Wilson interval, over all folds."""
+    """Return the number of correct images, of all, and the Wilson interval, over all folds."""
     every = [one for fold in judged.values() for one in fold]
     right = sum(one.correct for one in every)
     return right, len(every), wilson_interval(right, len(every))
@@ -187,7 +257,8 @@ def pooled(judged: Mapping[int, Sequence[Judged]]) -> tuple[int, int, tuple[floa
 def cross_validation_results(
     folds: Sequence[Fold], judged: Mapping[int, Sequence[Judged]]
 ) -> dict[str, Any]:
-    """Plain data for results.json: accuracy of the folds tested so far and every prediction."""
+    """Return plain data for results.json: the accuracy of the folds tested so far, and every
+    prediction."""
     right, count, interval = pooled(judged)
     return {
         "metric": METRIC,

@@ -16,13 +16,13 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from models.graspnet_examples import AtPixelSize, EpochBatches, GraspExamples
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
 import train_graspnet
 from models.graspnet import create_model
 from models.graspnet_decoding import Peaks
-from models.graspnet_examples import AtPixelSize, EpochBatches, GraspExamples
 from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores, check_graspable, score_labels, score_peak
 from models.graspnet_training import Trainer, choose_precision, warm_up_and_cosine

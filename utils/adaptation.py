@@ -1,9 +1,9 @@
-"""Unsupervised domain adaptation: a network that works on unlabelled images of another domain.
+"""Unsupervised domain adaptation: training for unlabelled images of another domain.
 
 Domain-adversarial training after Ganin et al., "Domain-adversarial training of neural networks"
-(JMLR 2016): a classifier tells source from target features, and the feature extractor is trained
-against it through a gradient reversal. Labels of the target are never asked for. Knows no data set,
-no robot and no task: networks and the task's loss are given.
+(JMLR 2016): a classifier separates source from target features, and the feature extractor is
+trained against it through a gradient reversal. No label of the target is needed. This module knows
+no data set, no robot and no task: networks and the task's loss are arguments.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from utils.errors import UserError
 
 SOURCE, TARGET = 0, 1
 _SHARPNESS = 10.0  # gamma of Ganin et al.'s schedules of the reversal and of the learning rate
-# A checkpoint may be chosen only if it still does its own domain's task this nearly as well as the
-# best one: what is confident but wrong everywhere is out.
+# A checkpoint may be chosen only if its source score is this close to the best one: that excludes
+# networks which are confident but wrong everywhere.
 _SOURCE_SLACK = 0.02
 
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -44,14 +44,14 @@ class GradientReversal(torch.autograd.Function):
 
 
 def reverse_gradient(values: torch.Tensor, weight: float) -> torch.Tensor:
-    """`values` (any shape) as they are, whose gradient is reversed and scaled by `weight`."""
+    """Return `values` (any shape) unchanged, with the gradient reversed and scaled by `weight`."""
     return GradientReversal.apply(values, weight)
 
 
 def reversal_weight(progress: float) -> float:
-    """2 / (1 + exp(-10 p)) - 1 for p from 0 (start) to 1 (end of all training): Ganin et al. 5.2.2.
+    """Return 2 / (1 + exp(-10 p)) - 1 for p from 0 (start) to 1 (end): Ganin et al., section 5.2.2.
 
-    From 0, while the domain classifier still knows nothing, to nearly 1.
+    The weight rises from 0, while the domain classifier still knows nothing, to nearly 1.
     """
     if not 0 <= progress <= 1:
         raise ValueError(f"reversal_weight: progress must be within 0..1, got {progress}")
@@ -62,8 +62,8 @@ class DomainBatchNorm(nn.Module):
     """Batch normalisation of (B, C, ...) with statistics for each domain and one weight and bias.
 
     Statistics of a mixture fit neither domain (Li et al., "Revisiting batch normalization for
-    practical domain adaptation", 2016). Which ones count is set by `select_domain`.
-    ordinary: the class of what it stands in for, see `ordinary_norms`.
+    practical domain adaptation", 2016). `select_domain` sets the domain in use. ordinary: the class
+    that `ordinary_norms` puts back.
     """
 
     def __init__(
@@ -89,10 +89,10 @@ class DomainBatchNorm(nn.Module):
 
 
 def per_domain_norms(module: nn.Module) -> nn.Module:
-    """The module with every BatchNorm1d and 2d in it turned into a DomainBatchNorm.
+    """Replace every BatchNorm1d and BatchNorm2d in the module by a DomainBatchNorm.
 
-    Weights are kept, and running statistics become those of both domains. Changes the module it is
-    given (unless that is a BatchNorm itself) and returns it.
+    The weights stay, and the running statistics become those of both domains. Changes the module in
+    place (unless it is a BatchNorm itself) and returns it.
     """
     if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
         if not (module.affine and module.track_running_stats and module.momentum is not None):
@@ -108,10 +108,10 @@ def per_domain_norms(module: nn.Module) -> nn.Module:
 
 
 def ordinary_norms(module: nn.Module, domain: int = TARGET) -> nn.Module:
-    """The inverse of `per_domain_norms`: every DomainBatchNorm becomes an ordinary one with the
-    statistics of one domain, so that the module needs nothing of this file any more.
+    """Replace every DomainBatchNorm by an ordinary norm with the statistics of one domain.
 
-    Changes the module it is given (unless that is a DomainBatchNorm itself) and returns it.
+    This is the inverse of `per_domain_norms`: the module then needs nothing of this file. Changes
+    the module in place (unless it is a DomainBatchNorm itself) and returns it.
     """
     if isinstance(module, DomainBatchNorm):
         norm = module.ordinary(len(module.weight), module.eps, module.momentum)
@@ -127,15 +127,15 @@ def ordinary_norms(module: nn.Module, domain: int = TARGET) -> nn.Module:
 
 
 def select_domain(module: nn.Module, domain: int) -> None:
-    """From now on every DomainBatchNorm in the module uses this domain's statistics."""
+    """Let every DomainBatchNorm in the module use this domain's statistics."""
     for part in module.modules():
         if isinstance(part, DomainBatchNorm):
             part.domain = domain
 
 
 class Outputs(NamedTuple):
-    """task: whatever the task head makes. domain: (B,) logits of coming from the target.
-    features: what the extractor makes."""
+    """task: the output of the task head. domain: (B,) logits of the target domain. features: the
+    output of the feature extractor."""
 
     task: torch.Tensor
     domain: torch.Tensor
@@ -145,10 +145,10 @@ class Outputs(NamedTuple):
 class DomainAdaptationNetwork(nn.Module):
     """A feature extractor with a task head and, behind a gradient reversal, a domain classifier.
 
-    feature_extractor: images (B, ...) to features (B, F, ...). task_head: features to whatever the
-    task's loss takes. domain_classifier: features to (B,) or (B, 1) logits. Each None makes the
-    default for small images (B, 3, H, W) and `classes` classes: features (B, feature_dim).
-    Batch norms of the extractor are made per domain; the heads should have none.
+    feature_extractor: images (B, ...) to features (B, F, ...). task_head: features to the input of
+    the task's loss. domain_classifier: features to (B,) or (B, 1) logits. None makes the default
+    for small images (B, 3, H, W) and `classes` classes, with features (B, feature_dim). The
+    extractor's batch norms become norms per domain; the heads should have none.
     """
 
     def __init__(
@@ -168,7 +168,15 @@ class DomainAdaptationNetwork(nn.Module):
         )
 
     def forward(self, images: torch.Tensor, domain: int = TARGET, reversal: float = 1.0) -> Outputs:
-        """images (B, ...) that all come from one domain, SOURCE or TARGET."""
+        """Return the outputs for images (B, ...) that all come from one domain, SOURCE or TARGET.
+
+        reversal: the weight of the reversed gradient, the tutorial's `alpha`.
+        """
+        if domain not in (SOURCE, TARGET):
+            raise ValueError(
+                f"domain: got {domain!r}, expected SOURCE (0) or TARGET (1); the tutorial's alpha "
+                "is the argument `reversal`"
+            )
         select_domain(self.feature_extractor, domain)
         features = self.feature_extractor(images)
         logits = self.domain_classifier(reverse_gradient(features, reversal))
@@ -185,8 +193,8 @@ def _small_cnn(feature_dim: int) -> nn.Module:
 
 
 def domain_loss(source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Binary cross-entropy of the domain classifier's logits (B,) of either domain's images, both
-    domains counting alike."""
+    """Return the binary cross-entropy of the domain classifier's logits (B,) on images of the
+    source and of the target; both domains count alike."""
     ours = F.binary_cross_entropy_with_logits(source, torch.zeros_like(source))
     theirs = F.binary_cross_entropy_with_logits(target, torch.ones_like(target))
     return (ours + theirs) / 2
@@ -197,11 +205,13 @@ def domain_loss(source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class AdaptationSettings:
-    """steps: of the optimiser. batch_size: images of each domain in a step. lr, weight_decay: of
-    AdamW, the rate falling as lr / (1 + 10 p)^0.75 (Ganin et al.). adversarial: weight of the
-    domain loss in the features, times `reversal_weight`; 0 trains on the source alone.
-    held_out: share of either domain that is kept for choosing the checkpoint. checks: how often
-    over the training the network is looked at for that.
+    """The settings of `train_domain_adaptation`.
+
+    steps: of the optimiser. batch_size: images of each domain in a step. lr, weight_decay: of
+    AdamW; the rate falls as lr / (1 + 10 p)^0.75 (Ganin et al.). adversarial: weight of the domain
+    loss in the features, times `reversal_weight`; 0 trains on the source alone. held_out: share of
+    each domain that is kept for choosing the checkpoint. checks: number of checkpoints, spread over
+    the training, of which one is chosen.
     """
 
     steps: int = 1000
@@ -224,11 +234,11 @@ class AdaptationSettings:
 
 @dataclass(frozen=True)
 class Check:
-    """A look at the network during training, without one target label.
+    """Scores of the network at one step of the training; no target label is used.
 
-    source_score: of the held-out source. information: nats, see `mutual_information`, of the
-    held-out target. domain_accuracy: of the domain classifier, on what is held out (or on batches,
-    where a training says so); 0.5 is chance.
+    source_score: on the held-out source. information: nats, see `mutual_information`, on the
+    held-out target. domain_accuracy: of the domain classifier on the held-out images (GraspNet's
+    training takes the batches instead); 0.5 is chance.
     """
 
     step: int
@@ -239,7 +249,7 @@ class Check:
 
 @dataclass
 class AdaptationHistory:
-    """checks, in order. chosen: the one whose weights the network has in the end."""
+    """checks: in order. chosen: the check whose weights the network has in the end."""
 
     checks: list[Check] = field(default_factory=list)
     chosen: Check | None = None
@@ -258,24 +268,26 @@ def train_domain_adaptation(
 ) -> AdaptationHistory:
     """Train the network in place on labelled source and unlabelled target images.
 
-    source: images (N, ...) and labels (N, ...). target: images (M, ...), of which there may be more
-    or fewer; each step takes equally many of both, and each domain starts over when it is used up.
-    task_loss: (task head's output, labels) to a scalar. source_score: the same to what should be
-    high; None takes the share of right classes.
+    source: images (N, ...) and labels (N, ...). target: images (M, ...); M may differ from N, each
+    step takes equally many images of both, and each domain starts over when it is used up.
+    task_loss: (task head's output, labels) to a scalar. source_score: the same arguments to a
+    score, higher is better; None takes the share of correct classes.
 
-    The weights that are kept are those of the check with the most `mutual_information` on
-    held-out target images, among the checks whose source score is within 0.02 of the best. No
-    target label is used: confidence alone would prefer a network that calls everything a 1, source
-    accuracy alone cannot see the target, and the information of the predictions is high only where
-    they are sure and differ. Every task head whose output is (B, classes, ...) logits has one.
+    The final weights are those of the check with the most `mutual_information` on held-out target
+    images, among the checks whose source score is within 0.02 of the best. No target label is used:
+    confidence alone would prefer a network that calls everything a 1, the source score alone
+    ignores the target, and the information of the predictions is high only where they are certain
+    and differ. Every task head whose output is (B, classes, ...) logits has this information.
 
-    Without an adversary (`settings.adversarial` 0) the target's images are only shown for its
-    batch-norm statistics, and the source score alone chooses.
-    Raises UserError where a domain has too few images.
+    Without an adversary (`settings.adversarial` 0) the target's images only update the statistics
+    of its batch norms, and the source score alone chooses. Raises UserError if a domain has too few
+    images, or if the source has no labels, as in the tutorial's call.
     """
     settings = settings or AdaptationSettings()
     rng = np.random.default_rng(seed)
     score = source_score or _accuracy
+    if isinstance(source, torch.Tensor):
+        raise UserError("source: got images alone, expected the pair (images, labels)")
     images, labels = source
     if len(images) != len(labels):
         raise UserError(f"source has {len(images)} images and {len(labels)} labels")
@@ -285,39 +297,39 @@ def train_domain_adaptation(
     optimiser = torch.optim.AdamW(
         model.parameters(), lr=settings.lr, weight_decay=settings.weight_decay
     )
-    history, best = AdaptationHistory(), []
-    looks = set(np.linspace(0, settings.steps, settings.checks + 1).round().astype(int)[1:])
+    history, weights = AdaptationHistory(), []
+    check_steps = set(np.linspace(0, settings.steps, settings.checks + 1).round().astype(int)[1:])
     model.train()
     for step in range(1, settings.steps + 1):
         progress = (step - 1) / max(settings.steps - 1, 1)
         for group in optimiser.param_groups:
             group["lr"] = settings.lr / (1 + _SHARPNESS * progress) ** 0.75
         chosen_s, chosen_t = next(batches)
-        weight = settings.adversarial * reversal_weight(progress)
-        ours = model(images[chosen_s], SOURCE, weight)
+        reversal = settings.adversarial * reversal_weight(progress)
+        ours = model(images[chosen_s], SOURCE, reversal)
         with torch.set_grad_enabled(bool(settings.adversarial)):
-            theirs = model(target[chosen_t], TARGET, weight)
+            theirs = model(target[chosen_t], TARGET, reversal)
         loss = task_loss(ours.task, labels[chosen_s])
         if settings.adversarial:
             loss = loss + domain_loss(ours.domain, theirs.domain)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        if step in looks:
-            check = _look(model, step, images[held_s], labels[held_s], target[held_t], score)
+        if step in check_steps:
+            check = _check(model, step, images[held_s], labels[held_s], target[held_t], score)
             history.checks.append(check)
-            best.append(deepcopy(model.state_dict()))
+            weights.append(deepcopy(model.state_dict()))
             if on_check is not None:
                 on_check(check)
     adversarial = bool(settings.adversarial)
     history.chosen = choose_check(history.checks, with_information=adversarial)
-    model.load_state_dict(best[history.checks.index(history.chosen)])
+    model.load_state_dict(weights[history.checks.index(history.chosen)])
     model.eval()
     return history
 
 
 def choose_check(checks: list[Check], with_information: bool = True) -> Check:
-    """The check whose weights to keep, see `train_domain_adaptation`; of equals the last."""
+    """Return the check whose weights to keep, see `train_domain_adaptation`; of equals the last."""
     if not with_information:
         return max(checks, key=lambda check: (check.source_score, check.step))
     enough = max(check.source_score for check in checks) - _SOURCE_SLACK
@@ -326,10 +338,11 @@ def choose_check(checks: list[Check], with_information: bool = True) -> Check:
 
 
 def mutual_information(logits: torch.Tensor) -> float:
-    """Nats that images' predicted classes tell of them: H(mean p) - mean H(p), 0 .. log(classes).
+    """Return the mutual information of images and predicted classes: H(mean p) - mean H(p), nats.
 
-    logits: (B, classes, ...), anything behind the classes counts as further images. From Bridle,
-    Heading and MacKay, "Unsupervised classifiers, mutual information and phantom targets" (1991).
+    It lies within 0 .. log(classes). logits: (B, classes, ...); dimensions behind the classes count
+    as further images. From Bridle, Heading and MacKay, "Unsupervised classifiers, mutual
+    information and phantom targets" (1991).
     """
     log_p = F.log_softmax(logits.double(), dim=1).transpose(0, 1).flatten(1)
     p = log_p.exp()
@@ -341,7 +354,7 @@ def mutual_information(logits: torch.Tensor) -> float:
 def predict(
     model: DomainAdaptationNetwork, images: torch.Tensor, domain: int = TARGET, batch: int = 512
 ) -> Outputs:
-    """Outputs of the network, in evaluation mode, for images (N, ...) of one domain."""
+    """Return the network's outputs in evaluation mode for images (N, ...) of one domain."""
     was_training = model.training
     model.eval()
     parts = [model(images[i : i + batch], domain) for i in range(0, len(images), batch)]
@@ -349,7 +362,11 @@ def predict(
     return Outputs(*(torch.cat(values) for values in zip(*parts)))
 
 
-def _look(model, step, images, labels, target, score) -> Check:
+def _check(
+    model: DomainAdaptationNetwork, step: int, images: torch.Tensor, labels: torch.Tensor,
+    target: torch.Tensor, score: Loss,
+) -> Check:  # fmt: skip
+    """Score the network on held-out images, labels and target images."""
     ours, theirs = predict(model, images, SOURCE), predict(model, target, TARGET)
     right = torch.cat([ours.domain <= 0, theirs.domain > 0]).double()
     # Both domains count alike, however many images are held out.
@@ -370,7 +387,7 @@ def _accuracy(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
 def _split(
     rng: np.random.Generator, count: int, settings: AdaptationSettings, domain: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the images to train on and of those held out."""
+    """Return the indices of the images to train on and of the held-out ones."""
     held_out = max(1, round(settings.held_out * count))
     if count - held_out < settings.batch_size:
         raise UserError(
@@ -384,7 +401,7 @@ def _split(
 def _batches(
     rng: np.random.Generator, numbers: np.ndarray, settings: AdaptationSettings
 ) -> Iterator[torch.Tensor]:
-    """For ever, full batches of shuffled numbers."""
+    """Yield full batches of shuffled indices, without end."""
     while True:
         order = rng.permutation(numbers)
         for i in range(0, len(order) - settings.batch_size + 1, settings.batch_size):

@@ -2,14 +2,15 @@
 
 Image, depth, mask, angle bins and widths move together, so that the labels of the changed image
 are the changed labels. Angles are image angles of the closing line, from +u (right) towards +v
-(down), modulo pi; bin k of B is centred at k x pi / B. This module knows no data set, no network
-and no simulator; torchvision resamples.
+(down), modulo pi; bin k of B is centred at k x pi / B. torchvision resamples. This module knows no
+data set, no network and no simulator.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -26,9 +27,9 @@ class LabelledImage:
 
     rgb: (3, H, W) uint8. depth: (H, W) float32 metres, 0 means unknown. quality: (B, H, W) float32
     in [0, 1]. width: (B, H, W) float32, the opening, metres. mask: (H, W) or (B, H, W) bool, where
-    labels hold. centre: (2, H, W) float32 or None where it is not known: the pixel (u, v) at which
-    the object that is seen has its centre of mass; NaN where none is seen.
-    width_in_pixels: the widths are pixels of this image instead (rasterised rectangles).
+    labels hold. centre: (2, H, W) float32, the pixel (u, v) of the centre of mass of the object
+    seen, NaN where no object is seen; None if unknown. width_in_pixels: the widths are pixels of
+    this image instead of metres (rasterised rectangles).
     """
 
     rgb: torch.Tensor
@@ -59,6 +60,14 @@ class LabelledImage:
             )
 
 
+class LabelledImages(Protocol):
+    """A sequence of labelled images."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> LabelledImage: ...
+
+
 @dataclass(frozen=True)
 class Similarity:
     """A change of the image: first mirrored, then turned and scaled about its centre, then shifted.
@@ -73,10 +82,10 @@ class Similarity:
     mirror: bool = False
 
     def matrix(self, shape: tuple[int, int]) -> np.ndarray:
-        """(3, 3) that takes an old pixel (u, v, 1) of an image of shape (H, W) to its new place.
+        """Return the (3, 3) matrix from an old pixel (u, v, 1) of an image (H, W) to its new place.
 
-        Also for rectangles (`GraspRectangle.transformed`). For pure shifts and scales,
-        `matrix @ K` is the pinhole matrix of the changed image.
+        `GraspRectangle.transformed` takes it, too. For pure shifts and scales, `matrix @ K` is the
+        pinhole matrix of the changed image.
         """
         height, width = shape
         centre = np.array([(width - 1) / 2, (height - 1) / 2])
@@ -89,11 +98,11 @@ class Similarity:
 
 
 def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
-    """The changed image with its labels. Same size; what comes from outside is black, has depth 0
-    and mask False.
+    """Return the changed image with its labels.
 
-    Colour is resampled bilinearly; depth, labels and mask take the nearest pixel, because between
-    an object and the table there is no surface, and quarter turns of square images stay exact.
+    The size stays; pixels from outside the image are black, with depth 0 and mask False. Colour is
+    resampled bilinearly; depth, labels and mask take the nearest pixel, because between an object
+    and the table there is no surface, and quarter turns of square images stay exact.
 
     Scaling is a change of the focal length: depth and widths in metres do not change, while the
     opening measured in pixels grows by `scale` (and `width_in_pixels` widths are multiplied by it).
@@ -101,7 +110,7 @@ def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
     point.
     """
     rgb, size = image.rgb, image.depth.shape
-    # Where each new pixel comes from, as the changed image of pixel numbers counted from 1.
+    # The origin of each new pixel: the changed image of pixel numbers counted from 1.
     source = torch.arange(1, image.depth.numel() + 1, dtype=torch.float32).reshape(1, *size)
     if change.mirror:
         rgb, source = F.horizontal_flip(rgb), F.horizontal_flip(source)
@@ -151,13 +160,14 @@ def turn_bins(
     turn: float,
     mirror: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Labels (B, ...) moved along the circle of angle bins: angle a becomes (+-a) + turn modulo pi.
+    """Move labels (B, ...) along the circle of angle bins: angle a becomes (+-a) + turn modulo pi.
 
     Mirroring takes a to pi - a, before the turn. A turn of n + f bins, 0 <= f < 1, moves by whole
     bins if f = 0; otherwise new bin k mixes old bins k - n and k - n - 1 with the weights 1 - f
-    and f, across the 0/180 seam too. Widths are mixed with weight times quality, so that the
-    width of a bin without a grasp never leaks in; where neither has quality, by weight alone. A
-    mask (B, ...) holds where both bins' do; a mask (1, ...) for all bins is left as it is.
+    and f, also across the seam between 180 and 0 degrees. Widths are mixed with weight times
+    quality, so that the width of a bin without a grasp has no influence; where neither bin has
+    quality, by weight alone. A mask (B, ...) holds where both bins' masks hold; a mask (1, ...) for
+    all bins stays.
     """
     bins = quality.shape[0]
     if mirror:
@@ -189,7 +199,7 @@ class ColourJitter:
     hue: float = 0.02
 
     def __call__(self, rgb: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-        """(3, H, W) uint8 with colours changed; geometry untouched."""
+        """Return the image (3, H, W) uint8 with changed colours."""
         for adjust, half in (
             (F.adjust_brightness, self.brightness),
             (F.adjust_contrast, self.contrast),
@@ -204,11 +214,11 @@ class ColourJitter:
 class Augmentation:
     """Draws a change from its ranges and applies it: `augment(image, rng)`.
 
-    max_turn: radians, either way. turn_step: turns are rounded to multiples of it; pi / B (10
-    degrees) keeps hard labels hard, because no bins are mixed; None turns freely. max_shift: part
-    of the image's side, either way. scale: lowest and highest, drawn evenly in its logarithm.
-    mirror: probability. colour: None leaves colours alone. depth_noise: called last with (depth
-    (H, W) metres, rng), returns the noisy depth; it sees 0 where depth is unknown.
+    max_turn: radians, in both directions. turn_step: turns are rounded to multiples of it; pi / B
+    (10 degrees) mixes no bins and so keeps hard labels hard; None does not round. max_shift: share
+    of the image's side, in both directions. scale: lowest and highest, drawn uniformly in its
+    logarithm. mirror: probability. colour: None keeps the colours. depth_noise: called last with
+    (depth (H, W) metres, rng), returns the noisy depth; unknown depth is 0.
     """
 
     max_turn: float = np.pi
@@ -222,8 +232,8 @@ class Augmentation:
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, int], zoom: float = 1.0
     ) -> Similarity:
-        """The change for an image of shape (H, W), whose scale is drawn around `zoom`; always the
-        same number of draws, whatever the ranges."""
+        """Draw a change for an image of shape (H, W), with its scale around `zoom`; the number of
+        random draws does not depend on the ranges."""
         turn = rng.uniform(-self.max_turn, self.max_turn)
         if self.turn_step:
             turn = np.round(turn / self.turn_step) * self.turn_step
@@ -235,7 +245,7 @@ class Augmentation:
     def __call__(
         self, image: LabelledImage, rng: np.random.Generator, zoom: float = 1.0
     ) -> LabelledImage:
-        """The changed image with its labels; the one given is left as it is."""
+        """Return the changed image with its labels; `image` itself does not change."""
         image = apply_similarity(image, self.draw(rng, tuple(image.depth.shape), zoom))
         if self.colour is not None:
             image = replace(image, rgb=self.colour(image.rgb, rng))

@@ -1,7 +1,7 @@
-"""Checkpoints: one file that alone rebuilds what it holds, and never runs code when loaded.
+"""Checkpoints: one file that alone rebuilds its model, and never runs code when loaded.
 
-The file is `torch.save` of a dict of tensors, numbers, strings and containers, marked as ours,
-with a kind ("graspnet", ...) and a format version. Loaded with `weights_only=True` on purpose:
+The file is `torch.save` of a dict of tensors, numbers, strings and containers, with this project's
+mark, a kind ("graspnet", ...) and a format version. It is loaded with `weights_only=True`, because
 a pickled object could run code. This module knows no network.
 """
 
@@ -22,7 +22,7 @@ from utils.runs import write_atomic
 
 MAGIC = "robot-grasping checkpoint"
 FORMAT_VERSION = 1  # raise when the meaning of an entry changes
-PLAIN = (bool, int, float, str, bytes, type(None), torch.Tensor)  # what `weights_only` lets through
+PLAIN = (bool, int, float, str, bytes, type(None), torch.Tensor)  # what `weights_only` loads
 
 Generators = Mapping[str, np.random.Generator | torch.Generator]
 
@@ -43,10 +43,10 @@ def save_checkpoint(
 ) -> None:
     """Write a checkpoint whole or not at all.
 
-    kind: what it holds, checked when loading. model_args: arguments that rebuild the architecture.
-    model: the bare module, not its DistributedDataParallel. step: optimiser steps taken. rng: from
-    `rng_states`. config: the resolved config as plain data. extra: anything else plain, such as
-    normalisers or metrics. Raises TypeError for what could not be loaded again.
+    kind: the kind of model, checked when loading. model_args: arguments that rebuild the
+    architecture. model: the bare module, not its DistributedDataParallel. step: optimiser steps
+    taken. rng: from `rng_states`. config: the resolved config as plain data. extra: other plain
+    data, such as normalisers or metrics. Raises TypeError for values that cannot be loaded again.
     """
     content = {
         "magic": MAGIC,
@@ -75,11 +75,11 @@ def load_checkpoint(
     format_version: int = FORMAT_VERSION,
     map_location: str | torch.device = "cpu",
 ) -> dict[str, Any]:
-    """The dict that `save_checkpoint` wrote, its entries named like that function's arguments.
+    """Return the dict that `save_checkpoint` wrote, with entries named like its arguments.
 
-    model_args: if given, the architecture that the checkpoint must hold.
-    Raises UserError, naming the file, if it is missing, damaged, no checkpoint of ours, or of
-    another kind, version or architecture.
+    model_args: if given, the architecture that the checkpoint must hold. Raises UserError, naming
+    the file, if it is missing, damaged, no checkpoint of this project, or of another kind, version
+    or architecture.
     """
     path = Path(path)
     try:
@@ -105,7 +105,7 @@ def load_checkpoint(
 
 
 def load_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path | str) -> None:
-    """Put a checkpoint's weights into a model; UserError, naming `path`, if they do not fit."""
+    """Load a checkpoint's weights into a model; UserError names `path` if they do not fit."""
     own, stored = model.state_dict(), checkpoint["model"]
     wrong = sorted(own.keys() ^ stored.keys())
     wrong += sorted(k for k in own.keys() & stored.keys() if own[k].shape != stored[k].shape)
@@ -118,7 +118,7 @@ def load_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path | str)
 
 
 def rng_states(generators: Generators) -> dict[str, Any]:
-    """States of torch's own generators (CPU, all GPUs) and of the named ones, as plain data."""
+    """Return the states of torch's generators (CPU, all GPUs) and of the named ones, plain."""
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -132,7 +132,7 @@ def rng_states(generators: Generators) -> dict[str, Any]:
 
 
 def restore_rng(states: dict[str, Any], generators: Generators) -> None:
-    """Put back what `rng_states` returned; the named generators continue where they were."""
+    """Restore the states that `rng_states` returned; the named generators continue from there."""
     torch.set_rng_state(states["torch"].cpu())
     if torch.cuda.is_available() and len(states["cuda"]) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all([state.cpu() for state in states["cuda"]])
@@ -145,7 +145,7 @@ def restore_rng(states: dict[str, Any], generators: Generators) -> None:
 
 
 def _unpack(data: bytes, path: Path, map_location: str | torch.device) -> Any:
-    """What torch.save packed, after the archive's checksums have been verified."""
+    """Verify the archive's checksums and return the object that torch.save packed."""
     if not data.startswith(b"PK"):
         raise UserError(f"{path}: not a checkpoint of this project")
     try:
@@ -164,7 +164,7 @@ def _unpack(data: bytes, path: Path, map_location: str | torch.device) -> Any:
 
 
 def _differences(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """'max_width is 0.15, expected 0.08' for every entry that differs."""
+    """Return 'max_width is 0.15, expected 0.08' for every entry that differs."""
     return ", ".join(
         f"{key} is {found.get(key)!r}, expected {expected.get(key)!r}"
         for key in sorted(found.keys() | expected.keys())
@@ -173,7 +173,7 @@ def _differences(found: dict[str, Any], expected: dict[str, Any]) -> str:
 
 
 def _check_plain(value: Any, where: str) -> None:
-    """Raise TypeError, with the place, for anything that `weights_only` would refuse to load."""
+    """Raise TypeError, with the place, for a value that `weights_only` would refuse to load."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             _check_plain(key, f"{where} key")

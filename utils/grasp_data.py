@@ -1,8 +1,9 @@
 """Simulated grasp data on disk: HDF5 shards of labelled RGB-D frames, and the data set over them.
 
 A data set is a folder with `config.yaml` and the folders `train` and `validation` of numbered
-shards. A shard is written whole or not at all, so whatever is there is good and an interrupted
-generation goes on with what is missing. This module knows no simulator and no network.
+shards. A shard is written whole or not at all, so every existing shard is complete and an
+interrupted generation continues with the missing ones. This module knows no simulator and no
+network.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from utils.grasp_labels import GraspLabels, Trial
 from utils.runs import write_atomic
 from utils.transforms import RGBDFrame, project
 
-# To be raised with the format of the files, and with what makes scenes, images or labels.
+# Raise it with every change of the files' format or of the code that makes scenes, images, labels.
 FORMAT_VERSION = 2
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
 _QUALITY_UNIT = 1 / 255
@@ -48,11 +49,11 @@ def write_shard(
 ) -> None:
     """Write labelled frames, and the label trials made on them, as one HDF5 file.
 
-    max_width: m, the gripper's widest opening; no label is wider. Depth, quality and width are
-    stored as whole numbers of their attribute `unit`, width in 255 steps; `instance` is
-    the number of the object at each pixel, -1 for none, and `centres` has the objects' centres of
-    mass in W. The frames carry segmentation and truth, of scenes in which nothing was retired: only
-    then do both number the objects alike.
+    max_width: metres, the gripper's widest opening; no label is wider. Depth, quality and width are
+    stored as whole numbers of their attribute `unit`, the width in 255 steps; `instance` is the
+    number of the object at each pixel, -1 for none, and `centres` holds the objects' centres of
+    mass in W. The frames must carry segmentation and truth, of scenes from which no object was
+    retired: only then do both number the objects in the same way.
     """
     units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": max_width / 255}
     stacked = {
@@ -94,7 +95,7 @@ def _whole(values: Sequence[np.ndarray], unit: float, kind: type) -> np.ndarray:
 
 
 def read_trials(folder: Path, split: str = "train") -> list[Trial]:
-    """All label trials of a data set."""
+    """Read all label trials of a data set."""
     trials = []
     for path in sorted((Path(folder) / split).glob("*.h5")):
         with _open(path) as file:
@@ -105,9 +106,9 @@ def read_trials(folder: Path, split: str = "train") -> list[Trial]:
 class SimulatedDataset(Dataset):
     """The labelled frames of one split as `LabelledImage`s, read one at a time.
 
-    frames: at most as many; None for all. cameras: K (3, 3) and T_WC (4, 4) of each frame; scenes:
-    what each shows, e.g. "pile random_urdfs 17": layout, object set and scene seed.
-    Raises UserError if there are none, or a shard is damaged or of another format.
+    frames: the largest number of frames; None for all. cameras: K (3, 3) and T_WC (4, 4) of each
+    frame. scenes: the scene of each frame, e.g. "pile random_urdfs 17": layout, object set, seed.
+    Raises UserError if there is no shard, or if one is damaged or of another format.
     """
 
     def __init__(self, folder: Path, split: str, frames: int | None = None):
@@ -143,14 +144,14 @@ class SimulatedDataset(Dataset):
         )
 
     def _centre(self, index: int, instance: np.ndarray, centres: np.ndarray) -> np.ndarray:
-        """(2, H, W) where each pixel's object has its centre of mass; NaN where there is none."""
+        """Return (2, H, W) the pixel of the object's centre of mass; NaN where there is none."""
         K, T_WC = self.cameras[index]
         pixels, _ = project(centres, K, T_WC)
         nowhere = np.full((1, 2), np.nan)
         return np.moveaxis(np.vstack([pixels, nowhere])[instance], -1, 0).astype(np.float32)
 
     def table_distance(self, index: int) -> float:
-        """From the camera to the table (z = 0) along the optical axis, metres."""
+        """Return the distance from the camera to the table (z = 0) along the optical axis, m."""
         _, T_WC = self.cameras[index]
         return float(-T_WC[2, 3] / T_WC[2, 2])
 

@@ -1,14 +1,12 @@
-"""Dense grasp labels: quality and opening for every pixel and angle bin, from the true geometry.
+"""Dense grasp labels from the true geometry, and their comparison with executed grasps.
 
-A label answers "what if the hand came straight down here?": fingertips `grasp_depth` below the
-pixel's surface point, closing line along the bin's image angle. It is judged by `utils.grasp_quality`
-on the exact height map (vertical lines against the true solids). Whoever turns a pixel into a grasp
-must use `grasp_below_surface`, so that hand and label agree on the depth.
-
-This module knows no simulator and no network.
-
-Grasp labels against physics: labelled (pixel, angle) pairs that were carried out, and what they
-say of the labels. This module knows no simulator.
+A label holds quality and opening for every pixel and angle bin. It predicts the outcome of a hand
+that comes straight down: fingertips `grasp_depth` below the pixel's surface point, closing line
+along the bin's image angle. `utils.grasp_quality` computes it on the exact height map (vertical
+lines against the true solids). Code that converts a pixel to a grasp must use
+`grasp_below_surface`, so that hand and label agree on the depth. A share of the labelled pairs
+(pixel, angle) is executed by the arm; `label_truth` computes precision and recall from these
+trials. This module knows no simulator and no network.
 """
 
 from __future__ import annotations
@@ -28,14 +26,18 @@ from utils.transforms import Grasp, ImageGrasp, RGBDFrame, image_to_grasp
 SETTINGS = LabelSettings()
 _ROBOT = -2  # in RGBDFrame.segmentation
 ANGLE_BINS = 18  # bin k is centred at k * 10 degrees of ImageGrasp.angle
+STRATA = (0.0, 1e-6, 0.3, 0.5, 0.6, 0.7, 0.8, 1.01)  # edges in quality
+PER_STRATUM = 3  # pairs drawn from each stratum of a frame; twice as many of quality 0
 
 
 @dataclass(frozen=True)
 class GraspLabels:
-    """quality: (18, H, W) float32 in [0, 1], 0 where a grasp is infeasible. Its cube is the product
-        of all factors: contacts, lever arms, margins, and feasible pixels and bins around.
-    width: (18, H, W) float32 metres, the opening before closing; 0 where quality is 0.
-    valid: (H, W) bool, the pixels that carry a label: depth known, within the map.
+    """Labels of one frame.
+
+    quality: (18, H, W) float32 in [0, 1], 0 where a grasp is infeasible. Its cube is the product of
+    all factors: contacts, lever arms, margins, and feasible pixels and bins around. width: (18, H,
+    W) float32 metres, the opening before closing; 0 where quality is 0. valid: (H, W) bool, the
+    pixels that carry a label: depth known, within the map.
     """
 
     quality: np.ndarray
@@ -51,9 +53,10 @@ def grasp_below_surface(
     gripper: GripperGeometry,
     settings: LabelSettings = SETTINGS,
 ) -> Grasp:
-    """The world grasp that a label stands for; `grasp.depth` is that of the visible surface.
+    """Return the grasp in W that a label describes; `grasp.depth` is that of the visible surface.
 
-    Straight below the surface point by `grasp_depth`; the angle is that of `image_to_grasp`.
+    The fingertips are `grasp_depth` straight below the surface point; the angle is that of
+    `image_to_grasp`.
     """
     at_surface = image_to_grasp(grasp, K, T_WC)
     position = at_surface.position.copy()
@@ -63,7 +66,7 @@ def grasp_below_surface(
 
 
 def bin_angles() -> np.ndarray:
-    """(18,) image angles of the bins' centres, radians."""
+    """Return the (18,) image angles of the bins' centres, radians."""
     return np.arange(ANGLE_BINS) * np.pi / ANGLE_BINS
 
 
@@ -75,14 +78,15 @@ def dense_labels(
     cell: float = 0.001,
     margin: float = 0.08,
 ) -> GraspLabels:
-    """Labels of every pixel and angle bin of a noise-free frame that carries its true geometry.
+    """Label every pixel and angle bin of a noise-free frame that carries its true geometry.
 
-    cell: resolution along the closing line, metres. margin: how far outside the workspace grasps
-    are labelled. Raises ValueError when the frame holds no truth.
+    cell: resolution along the closing line, metres. margin: distance outside the workspace up to
+    which grasps are labelled, metres. Raises ValueError if the frame holds no truth.
 
-    Table pixels have quality 0: a grasp is centred on what it takes; robot pixels are not valid.
-    Angles are judged in steps of 10 degrees in W from bin 0 at the principal point. These are the
-    bins of a camera that looks straight down; for another one each pixel takes the nearest angle.
+    Table pixels have quality 0, because a grasp is centred on its object; robot pixels are not
+    valid. Angles are computed in steps of 10 degrees in W from bin 0 at the principal point. These
+    are the bins of a camera that looks straight down; for another camera each pixel takes the
+    nearest angle.
     """
     if frame.truth is None:
         raise ValueError("dense_labels needs frame.truth; this frame holds none")
@@ -115,14 +119,14 @@ def dense_labels(
 
 
 def _support(feasible: np.ndarray) -> np.ndarray:
-    """(18, H, W) share of the 3 x 3 pixels and 3 bins around that are feasible as well."""
+    """Return the share (18, H, W) of the 3 x 3 pixels and 3 bins around that are feasible, too."""
     share = np.stack([cv2.blur(plane, (3, 3)) for plane in feasible.astype(np.float32)])
     return (np.roll(share, 1, axis=0) + share + np.roll(share, -1, axis=0)) / 3
 
 
 def _world_turns(frame: RGBDFrame, u: np.ndarray, v: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """World angle of bin 0 at the principal point, the signed step to the next bin, and (18, N)
-    which of those 18 world angles is nearest to each bin at each pixel."""
+    """Return the angle in W of bin 0 at the principal point, the signed step to the next bin, and
+    the index (18, N) of the nearest of those 18 angles for each bin at each pixel."""
     K, bins = frame.K, bin_angles()
     u, v = np.append(u, K[0, 2]), np.append(v, K[1, 2])
     centre = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(len(u))], axis=-1)
@@ -136,13 +140,12 @@ def _world_turns(frame: RGBDFrame, u: np.ndarray, v: np.ndarray) -> tuple[float,
     return start, step, np.mod(turns, ANGLE_BINS)
 
 
-STRATA = (0.0, 1e-6, 0.3, 0.5, 0.6, 0.7, 0.8, 1.01)  # edges in quality
-PER_STRATUM = 3  # pairs drawn from each stratum of a frame; twice as many of quality 0
+# --- Executed labels ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One executed pair; it stands for `weight` pairs of its frame and stratum."""
+    """One executed pair (pixel, angle); it represents `weight` pairs of its frame and stratum."""
 
     quality: float
     weight: float
@@ -156,9 +159,9 @@ def draw_pairs(
     rng: np.random.Generator,
     per_stratum: int = PER_STRATUM,
 ) -> Iterator[tuple[Grasp, float, float]]:
-    """Grasps of pairs drawn from every stratum of quality, each with its quality and its weight.
+    """Yield grasps of pairs drawn from every stratum of quality, with their quality and weight.
 
-    Pairs of quality 0 come from the objects' pixels and are tried with the hand wide open.
+    Pairs of quality 0 come from the objects' pixels and are executed with the hand wide open.
     """
     settings = LabelSettings()
     lowest = settings.table_clearance + settings.min_engagement
@@ -186,9 +189,9 @@ def draw_pairs(
 class LabelTruth:
     """Precision and recall of positive labels (quality `LabelSettings.positive` and above).
 
-    executed, positives: how many pairs were carried out, and how many of these were positive.
-    precision: of those drawn, with its 95 % interval; precision_weighted and recall_weighted: over
-    all pairs of the frames instead. by_stratum: (low, high, executed, success rate) in quality.
+    executed, positives: the number of executed pairs, and of the positive ones among them.
+    precision: of the drawn pairs, with its 95 % interval. precision_weighted, recall_weighted: over
+    all pairs of the frames. by_stratum: (low, high, executed, success rate) in quality.
     """
 
     executed: int
@@ -199,9 +202,18 @@ class LabelTruth:
     recall_weighted: float
     by_stratum: tuple[tuple[float, float, int, float], ...]
 
+    def describe(self) -> str:
+        """Describe precision and recall in one line."""
+        low, high = self.precision_ci95
+        return (
+            f"labels against physics: {self.executed} executed, precision "
+            f"{100 * self.precision:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of "
+            f"{self.positives} positive ones, recall {100 * self.recall_weighted:.0f} %"
+        )
+
 
 def label_truth(trials: Sequence[Trial]) -> LabelTruth:
-    """What the trials say of the labels; NaN where nothing was executed."""
+    """Compute precision and recall of the labels from trials; NaN where none was executed."""
     positive = [t for t in trials if t.quality >= LabelSettings().positive]
     hits = sum(t.success for t in positive)
     good = sum(t.weight for t in trials if t.success)

@@ -1,16 +1,8 @@
-"""What of a data set trains and what tests, without leaks: by image, by object, in folds.
+"""Real RGB-D images from disk: Cornell and Jacquard with labelled rectangles, and unlabelled ones.
 
-This module knows indices and the objects' names alone, no images.
-
-Real grasp data in the formats of Cornell and Jacquard.
-
-Both give RGB-D images of one object with labelled grasp rectangles. Whatever is missing or broken
-in a folder is a `UserError` that names the file. The data themselves are not part of this project.
-This module knows no network and no simulator.
-
-Unlabelled RGB-D photographs of another domain: what a network can be adapted to.
-
-A folder in Cornell's layout; whatever labels lie there are never opened. This module knows no
+A missing or broken file is a `UserError` that names the file. A new format is a `RealDataset` in
+this file and an entry in `FORMATS`, whose names `data.kind` accepts, and a view of its camera in
+`models.rectangle_folds`. The data themselves are not part of this project. This module knows no
 network and no simulator.
 """
 
@@ -18,7 +10,7 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,101 +22,11 @@ from utils.images import open_image
 from utils.rectangles import GraspRectangle, rectangles_from_corners
 from utils.transforms import known_depth
 
-
-@dataclass(frozen=True)
-class Split:
-    """Indices into a data set, each list sorted; no index is in both."""
-
-    train: tuple[int, ...]
-    test: tuple[int, ...]
-
-    def describe(self, names: Sequence[str]) -> str:
-        """Two lines with the counts and every name, to be printed: there is no official split."""
-        return "\n".join(
-            f"{part} ({len(indices)}): {' '.join(names[i] for i in indices)}"
-            for part, indices in (("train", self.train), ("test", self.test))
-        )
-
-
-def image_wise_split(count: int, test_fraction: float, seed: int) -> Split:
-    """Images drawn at random: test objects may be known from other images in training."""
-    order = np.random.default_rng(seed).permutation(count)
-    return _split(count, order[: _test_size(count, test_fraction)])
-
-
-def object_wise_split(object_ids: Sequence[str], test_fraction: float, seed: int) -> Split:
-    """Whole objects drawn at random: no test object is seen in training."""
-    objects = np.array(sorted(set(object_ids)))
-    drawn = np.random.default_rng(seed).permutation(objects)
-    test_objects = set(drawn[: _test_size(len(objects), test_fraction)])
-    return _split(len(object_ids), [i for i, o in enumerate(object_ids) if o in test_objects])
-
-
-def block_folds(object_ids: Sequence[str], folds: int, seed: int | None = None) -> list[Split]:
-    """k folds for cross-validation; consecutive images of one object are never torn apart.
-
-    A block is a run of equal object ids. Without a seed the blocks keep their order, so each test
-    fold is one stretch of the data set; with a seed they are shuffled first. Fold sizes differ by
-    as little as whole blocks in that order allow. An object photographed again later makes a
-    second block: where that happens, `object_wise_split` is the stricter one.
-    """
-    starts = [i for i in range(len(object_ids)) if i == 0 or object_ids[i] != object_ids[i - 1]]
-    blocks = np.split(np.arange(len(object_ids)), starts[1:])
-    if not 2 <= folds <= len(blocks):
-        raise UserError(f"folds: got {folds}, expected 2 to {len(blocks)} (the number of blocks)")
-    if seed is not None:
-        order = np.random.default_rng(seed).permutation(len(blocks))
-        blocks = [blocks[i] for i in order]
-    ends = np.cumsum([len(block) for block in blocks])
-    cuts = [0]
-    for k in range(1, folds):  # the border nearest to k / folds of all images; no fold empty
-        low, high = cuts[-1] + 1, len(blocks) - (folds - k)
-        nearest = np.abs(ends[low - 1 : high] - k * len(object_ids) / folds).argmin()
-        cuts.append(low + int(nearest))
-    cuts.append(len(blocks))
-    return [_split(len(object_ids), np.concatenate(blocks[a:b])) for a, b in zip(cuts, cuts[1:])]
-
-
-def object_folds(object_ids: Sequence[str], folds: int, seed: int | None = None) -> list[Split]:
-    """k folds for cross-validation by object: those of a test image are in no training image.
-
-    As `block_folds`, but with all images of an object in one block, wherever they stand in the data
-    set; objects come in the order in which they first appear.
-    """
-    first: dict[str, int] = {}
-    for index, name in enumerate(object_ids):
-        first.setdefault(name, index)
-    order = sorted(range(len(object_ids)), key=lambda i: first[object_ids[i]])
-    splits = block_folds([object_ids[i] for i in order], folds, seed)
-    return [_split(len(order), [order[i] for i in split.test]) for split in splits]
-
-
-def image_folds(count: int, folds: int, seed: int) -> list[Split]:
-    """k folds for cross-validation by image, drawn at random: a test image's object may be known
-    from training images. Fold sizes differ by at most one."""
-    if not 2 <= folds <= count:
-        raise UserError(f"folds: got {folds}, expected 2 to {count} (the number of images)")
-    order = np.random.default_rng(seed).permutation(count)
-    return [_split(count, test) for test in np.array_split(order, folds)]
-
-
-def _test_size(count: int, fraction: float) -> int:
-    """At least one on either side."""
-    if count < 2 or not 0 < fraction < 1:
-        raise UserError(f"cannot split {count} items with test fraction {fraction}")
-    return min(max(round(count * fraction), 1), count - 1)
-
-
-def _split(count: int, test: Sequence[int]) -> Split:
-    chosen = {int(i) for i in test}
-    return Split(tuple(i for i in range(count) if i not in chosen), tuple(sorted(chosen)))
-
-
 MIN_DEPTH, MAX_DEPTH = 0.3, 10.0  # m: outside, a pixel is a hole; a whole image, a unit error
 IMAGES_PER_OBJECT = 4  # Cornell's usual number of consecutive images of one object
 
-# The first image of each object in Cornell's folder 01, seen by eye on the 80 images 100..179
-# that this project measures on; used where the data set's own table z.txt is not at hand.
+# The first image of each object in Cornell's folder 01, found by eye on the 80 images 100..179
+# that this project measures on; used where the data set's own table z.txt is missing.
 FOLDER_01 = range(100, 180)
 OBJECT_STARTS_01 = (
     100, 102, 106, 110, 114, 118, 122, 126, 129, 133, 137, 141, 145, 149, 153, 157, 161, 165, 169,
@@ -139,9 +41,9 @@ CORNELL_HINT = (
 
 @dataclass(frozen=True, eq=False)
 class RealSample:
-    """One labelled image.
+    """One real image with its labels.
 
-    name: the image's id. object_id: images with the same one show the same object.
+    name: the image's id. object_id: images with the same id show the same object.
     rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis, holes filled.
     positives, negatives: rectangles in pixels of this image; Jacquard has no negatives.
     object_mask: (H, W) bool, the object's pixels, or None where the format has none.
@@ -160,7 +62,7 @@ class RealSample:
 
 @dataclass(frozen=True)
 class Record:
-    """Where one sample lies: its name, its object, and its files by their role's suffix."""
+    """The files of one sample, by the suffixes of their names, with its name and its object."""
 
     name: str
     object_id: str
@@ -168,10 +70,10 @@ class Record:
 
 
 class RealDataset(Sequence[RealSample]):
-    """A read-only sequence of samples, read from disk when asked for; order is by name.
+    """A read-only sequence of samples in the order of their names, read from disk on access.
 
-    All files are checked to exist when the data set is opened, so training never stops halfway
-    for a missing one.
+    Opening the data set checks that all files exist, so that no missing file stops a training
+    halfway.
     """
 
     def __init__(self, root: Path, records: Sequence[Record]) -> None:
@@ -197,7 +99,7 @@ class RealDataset(Sequence[RealSample]):
 
     @abstractmethod
     def read(self, record: Record) -> RealSample:
-        """Read one image; raises UserError naming the file that is at fault."""
+        """Read one image; raises UserError naming a broken file."""
 
 
 class CornellDataset(RealDataset):
@@ -265,29 +167,32 @@ class JacquardDataset(RealDataset):
         return RealSample(record.name, record.object_id, rgb, depth, positives, object_mask=mask)
 
 
-def open_real_data(kind: str, root: str | Path, depth: str = "perfect") -> RealDataset:
-    """The data set of `data.kind` ("cornell" or "jacquard") under `data.root`.
+FORMATS: dict[str, Callable[[str | Path], RealDataset]] = {
+    "cornell": CornellDataset,
+    "jacquard": JacquardDataset,
+}
 
-    depth: Jacquard's depth image, "perfect" or "stereo". Raises UserError for an unknown kind, a
-    missing folder, or missing files.
+
+def open_real_data(kind: str, root: str | Path) -> RealDataset:
+    """Open the data set of format `kind` in the folder `root`.
+
+    Raises UserError for an unknown format, a missing folder, or missing files.
     """
-    if kind == "cornell":
-        return CornellDataset(root)
-    if kind == "jacquard":
-        return JacquardDataset(root, depth)
-    raise unknown_choice("data.kind", kind, ("cornell", "jacquard"))
+    if kind not in FORMATS:
+        raise unknown_choice("data.kind", kind, FORMATS)
+    return FORMATS[kind](root)
 
 
-# Reading
+# --- Reading files --------------------------------------------------------------------------
 
 
 def fill_depth_holes(depth: np.ndarray) -> np.ndarray:
-    """(H, W) float32 metres in which every hole has the depth of the nearest measured pixel.
+    """Return depth (H, W) float32 metres in which every hole has the nearest measured depth.
 
     A hole is NaN, infinite, or outside MIN_DEPTH..MAX_DEPTH: the 0 or -1 of sensors, and the foot
     of the ramp that inpainting left at the border of Cornell's images. Nearest means Euclidean
     distance in the image; unlike inpainting this never invents a depth that was not measured.
-    Raises ValueError where nothing was measured.
+    Raises ValueError if no pixel was measured.
     """
     depth = np.asarray(depth, dtype=np.float32)
     hole = ~((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH))  # comparisons with NaN are False
@@ -302,7 +207,7 @@ def fill_depth_holes(depth: np.ndarray) -> np.ndarray:
 
 
 def read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) uint8 and (H, W) float32 metres without holes."""
+    """Read colour (H, W, 3) uint8 and depth (H, W) float32 metres, whose holes are filled."""
     rgb = np.array(open_image(rgb_file).convert("RGB"))
     depth = np.asarray(open_image(depth_file))
     if depth.ndim != 2:
@@ -321,7 +226,8 @@ def read_rgbd(rgb_file: Path, depth_file: Path) -> tuple[np.ndarray, np.ndarray]
 
 
 def _read_cornell_rectangles(file: Path) -> tuple[tuple[GraspRectangle, ...], int]:
-    """The rectangles of a cpos or cneg file, four `u v` rows each, and how many had a NaN."""
+    """Read a cpos or cneg file, four `u v` rows a rectangle; returns the rectangles, and how many
+    more have a NaN."""
     rows = _read_numbers(file, 2, None)
     if len(rows) % 4:
         raise UserError(f"{file}: {len(rows)} corner rows, not a multiple of 4; is it cut short?")
@@ -334,7 +240,7 @@ def _read_cornell_rectangles(file: Path) -> tuple[tuple[GraspRectangle, ...], in
 
 
 def _read_jacquard_rectangles(file: Path) -> tuple[GraspRectangle, ...]:
-    """The rectangles of a grasps file: rows `u;v;theta;opening;jaw size`, pixels and degrees.
+    """Read a grasps file: rows `u;v;theta;opening;jaw size` in pixels and degrees.
 
     Jacquard's theta already runs from +u towards +v (GG-CNN, whose angles run the other way,
     negates it in `load_from_jacquard_file`).
@@ -354,7 +260,7 @@ def _read_jacquard_rectangles(file: Path) -> tuple[GraspRectangle, ...]:
 
 
 def _read_numbers(file: Path, columns: int, separator: str | None) -> np.ndarray:
-    """(N, columns) float from a text file; blank lines are skipped, NaN is allowed."""
+    """Read a text file as (N, columns) float; blank lines are skipped, NaN is allowed."""
     rows = []
     try:
         text = file.read_text()
@@ -377,11 +283,11 @@ def _size(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]} px"
 
 
-# Finding files and objects
+# --- Finding files and objects --------------------------------------------------------------
 
 
 def existing_folder(root: str | Path, key: str = "data.root") -> Path:
-    """The folder that a config key names; UserError if there is none."""
+    """Return the folder that a config key names; raises UserError if it does not exist."""
     root = Path(root).expanduser()
     if not root.is_dir():
         raise UserError(f"{key}: no folder {root}")
@@ -389,7 +295,7 @@ def existing_folder(root: str | Path, key: str = "data.root") -> Path:
 
 
 def group_files(root: Path, pattern: str) -> dict[str, dict[str, Path]]:
-    """Files under root whose whole name fits (name)(suffix), as {name: {suffix: path}}."""
+    """Return the files under root whose names match (name)(suffix), as {name: {suffix: path}}."""
     groups: dict[str, dict[str, Path]] = {}
     for path in root.rglob("*"):
         fit = re.fullmatch(pattern, path.name)
@@ -409,7 +315,7 @@ def check_complete(
     prefix: str = "",
     hint: str = "",
 ) -> None:
-    """Raise UserError that names files of `group_files` which some name lacks."""
+    """Raise UserError, naming the missing files, if a group of `group_files` lacks a suffix."""
     missing = [
         f"{prefix}{name}{suffix}"
         for name in sorted(groups)
@@ -423,7 +329,7 @@ def check_complete(
 
 
 def _cornell_objects(root: Path, numbers: Sequence[int]) -> dict[int, str]:
-    """The object of each image number; see `CornellDataset` for where it comes from."""
+    """Return the object of each image number; `CornellDataset` describes the sources."""
     for table in (root / "z.txt", root / "processedData" / "z.txt"):
         if table.is_file():
             return _read_object_table(table, numbers)
@@ -449,18 +355,21 @@ def _read_object_table(table: Path, numbers: Sequence[int]) -> dict[int, str]:
     return objects
 
 
+# --- Unlabelled photographs -----------------------------------------------------------------
+
 KEY = "adaptation.target"  # the config key that names the folder
-SIZE = (640, 480)  # pixels, of a first Kinect: nothing else in the folder tells the camera's scale
+SIZE = (640, 480)  # pixels, of a first Kinect: the folder does not hold the camera's scale
 FEWEST = 5  # images: some are held out, and statistics of one or two mean nothing
 
 
 class UnlabelledImages(RealDataset):
-    """Pairs `NAMEr.png` (colour) and `NAMEd.tiff` (float32, metres from the robot's base as
-    Cornell's are, see `utils.table_plane`) in any subfolder.
+    """Unlabelled photographs of another domain, to which a network can be adapted.
 
-    Cornell's names `pcdNNNNr.png` are such names. Raises UserError, when it is opened, if there is
-    no such folder, if a file of a pair is missing, if there are fewer than `FEWEST` images, or
-    if one is not of `SIZE`. What the depths hold is for others to check (`models.graspnet_adaptation`).
+    They are pairs `NAMEr.png` (colour) and `NAMEd.tiff` (float32, metres from the robot's base as
+    Cornell's are, see `utils.table_plane`) in any subfolder, such as Cornell's `pcdNNNNr.png`;
+    labels beside them are never opened. Opening raises UserError if the folder or a file of a pair
+    is missing, if there are fewer than `FEWEST` images, or if one is not of `SIZE`.
+    `models.graspnet_adaptation` checks that the files hold distances.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -487,6 +396,6 @@ class UnlabelledImages(RealDataset):
         super().__init__(root, [Record(name, name, pair) for name, pair in sorted(files.items())])
 
     def read(self, record: Record) -> RealSample:
-        """An image without rectangles."""
+        """Read an image without rectangles."""
         rgb, depth = read_rgbd(record.files["r.png"], record.files["d.tiff"])
         return RealSample(record.name, record.object_id, rgb, depth, positives=())

@@ -1,4 +1,4 @@
-"""Grasp rectangles: what Cornell and Jacquard label, how they are scored and drawn as targets.
+"""Grasp rectangles, the labels of Cornell and Jacquard: their score, and dense targets from them.
 
 A grasp rectangle is two gripper plates seen from above. Its image angle is that of the closing
 line, from +u (right) towards +v (down), modulo pi, as in `utils.transforms.ImageGrasp`; lengths
@@ -18,7 +18,7 @@ from utils.transforms import angle_difference, wrap_to_pi_range
 NUM_ANGLE_BINS = 18  # design.md: bin k is centred at k x 10 degrees
 MATCH_IOU = 0.25  # Jiang, Moseson, Saxena, "Efficient grasping from RGBD images", ICRA 2011
 MATCH_ANGLE = np.pi / 6
-_ROUNDING = 1e-9  # so that a difference of exactly the limit never passes by a rounding error
+_ROUNDING = 1e-9  # margin: a difference of exactly the limit does not pass by a rounding error
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class GraspRectangle:
 
     @staticmethod
     def from_corners(corners: np.ndarray) -> GraspRectangle:
-        """The rectangle of four corners (4, 2) in (u, v), in Cornell's order.
+        """Return the rectangle of four corners (4, 2) in (u, v), in Cornell's order.
 
         Cornell's first edge (corner 0 to 1) is the opening and the second (1 to 2) lies along a
         plate; corners run either way round. Hand-drawn corners are not exactly rectangular:
@@ -74,34 +74,34 @@ class GraspRectangle:
         )
 
     def corners(self) -> np.ndarray:
-        """(4, 2) corners (u, v) in Cornell's order; inverse of `from_corners`."""
+        """Return the (4, 2) corners (u, v) in Cornell's order; the inverse of `from_corners`."""
         along, across = self.axes * [[self.width / 2], [self.height / 2]]
         return self.centre + np.stack(
             [-along - across, along - across, along + across, across - along]
         )
 
     def transformed(self, matrix: np.ndarray) -> GraspRectangle:
-        """The rectangle after a similarity of the image: (3, 3) matrix on (u, v, 1) columns.
+        """Return the rectangle after a similarity of the image: (3, 3) matrix on (u, v, 1) columns.
 
-        Turning, shifting, one scale for both axes, and mirroring keep it a rectangle; for
-        anything else this is the nearest one through the mapped edges' midpoints.
+        Turning, shifting, one scale for both axes, and mirroring keep it a rectangle; for other
+        matrices the result is the rectangle through the midpoints of the mapped edges.
         """
         corners = np.column_stack([self.corners(), np.ones(4)]) @ np.asarray(matrix).T
         return GraspRectangle.from_corners(corners[:, :2])
 
 
 def rectangles_from_corners(corners: np.ndarray) -> list[GraspRectangle]:
-    """Rectangles of (N, 4, 2) corners; those with a NaN corner, as Cornell has, are left out."""
+    """Return the rectangles of (N, 4, 2) corners, without those with a NaN, as Cornell has some."""
     corners = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
     return [GraspRectangle.from_corners(c) for c in corners if np.isfinite(c).all()]
 
 
 def intersection_over_union(a: GraspRectangle, b: GraspRectangle) -> float:
-    """Exact IoU of two rotated rectangles, in [0, 1].
+    """Return the exact IoU of two rotated rectangles, in [0, 1].
 
     a's outline is clipped by b's four sides in b's own frame (Sutherland and Hodgman 1974).
-    OpenCV's `rotatedRectangleIntersection` was tried: it is wrong for rectangles that share an
-    edge in about one case of fifty (opencv 5.0, float32).
+    OpenCV's `rotatedRectangleIntersection` is wrong for rectangles that share an edge in about one
+    case of fifty (opencv 5.0, float32).
     """
     outline = (a.corners() - b.centre) @ b.axes.T
     for axis, half in enumerate((b.width / 2, b.height / 2)):
@@ -113,7 +113,7 @@ def intersection_over_union(a: GraspRectangle, b: GraspRectangle) -> float:
 
 
 def _clip(outline: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """The part of a convex outline (N, 2) where the signed distance `inside` (N,) is >= 0."""
+    """Return the part of a convex outline (N, 2) with a signed distance `inside` (N,) >= 0."""
     kept = []
     for i in range(len(outline)):
         j = (i + 1) % len(outline)
@@ -131,11 +131,11 @@ def rectangle_match(
     iou: float = MATCH_IOU,
     angle: float = MATCH_ANGLE,
 ) -> bool:
-    """The rectangle metric: does the prediction agree with at least one label?
+    """Whether the prediction agrees with at least one label, by the rectangle metric.
 
-    It agrees when their IoU is over `iou` and their angles, as undirected lines, differ by less
-    than `angle` radians; both with the same label, both strict. Jiang et al. 2011; Lenz, Lee,
-    Saxena, "Deep learning for detecting robotic grasps", IJRR 2015.
+    It agrees if the IoU exceeds `iou` and the angles, as undirected lines, differ by less than
+    `angle` radians, both with the same label. Jiang et al. 2011; Lenz, Lee, Saxena, "Deep learning
+    for detecting robotic grasps", IJRR 2015.
     """
     return any(
         angle_difference(predicted.angle, label.angle) < angle - _ROUNDING
@@ -157,14 +157,14 @@ def rasterise(
     num_bins: int = NUM_ANGLE_BINS,
     falloff: float = np.pi / NUM_ANGLE_BINS,
 ) -> DenseTargets:
-    """Dense targets of rectangles on an image of shape (H, W).
+    """Draw rectangles as dense targets of an image of shape (H, W).
 
     Each rectangle labels the pixels of the central third along its closing line, over the whole
-    plate length, as GG-CNN does (Morrison, Corke, Leitner, RSS 2018, section V); one too thin to
-    cover a pixel's centre labels the pixel nearest to its own. At these pixels the nearest angle
-    bin gets quality 1, falling linearly to 0 over `falloff` radians beyond half a bin (0: nearest
-    bin only). Where labels overlap, each bin keeps the highest quality and the quality-weighted
-    mean width, so the order of the labels does not matter.
+    plate length, as GG-CNN does (Morrison, Corke, Leitner, RSS 2018, section V); a rectangle that
+    is too thin to cover a pixel's centre labels the pixel nearest to its own centre. There the
+    nearest angle bin gets quality 1, which falls linearly to 0 over `falloff` radians beyond half a
+    bin (0: nearest bin only). Where labels overlap, each bin keeps the highest quality and the
+    quality-weighted mean width, so the order of the labels does not matter.
     """
     height, width = shape
     step = np.pi / num_bins
@@ -188,7 +188,7 @@ def rasterise(
 def _central_third(
     rectangle: GraspRectangle, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels whose centres lie in the rectangle's central third."""
+    """Return rows and columns of the pixels whose centres lie in the rectangle's central third."""
     reach = np.hypot(rectangle.width / 6, rectangle.height / 2)
     last = np.array(shape[::-1]) - 1
     low = np.clip(np.floor(rectangle.centre - reach), 0, last + 1).astype(int)

@@ -7,6 +7,7 @@ This module knows nothing of what a run computes.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -21,10 +22,13 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from utils.config import Config, dump_config, load_config
 from utils.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = (
@@ -63,6 +67,16 @@ def write_json_atomic(path: Path, content: Mapping) -> None:
     """Indented strict JSON; raises ValueError on NaN or infinity before touching the file."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     write_atomic(path, text + "\n")
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a matplotlib figure as a PNG file and close it."""
+    import matplotlib.pyplot as plt  # takes long to import, and few need it
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    write_atomic(path, buffer.getvalue())
 
 
 # --- Run folders ---------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from models.graspnet import create_model, targets_from_labels
-from models.graspnet_examples import Example
+from models.graspnet_data import Example
 from models.graspnet_training import Trainer
 from utils.config import load_config
 from utils.distributed import Team, team
