@@ -1,4 +1,4 @@
-"""Loaders of the Cornell and Jacquard formats on tiny files made here, and the splits."""
+"""Loaders of the Cornell and Jacquard formats on tiny files made here."""
 
 from pathlib import Path
 
@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models.rectangle_folds import object_folds
 from utils.errors import UserError
 from utils.real_data import (
     CornellDataset,
     JacquardDataset,
-    Split,
-    block_folds,
     fill_depth_holes,
-    image_wise_split,
-    object_wise_split,
     open_real_data,
 )
 
@@ -114,7 +111,7 @@ def test_missing_folder_empty_folder_and_unknown_kind(tmp_path):
     with pytest.raises(UserError, match="did you mean cornell"):
         open_real_data("cornel", tmp_path)
     with pytest.raises(UserError, match="perfect, stereo"):
-        open_real_data("jacquard", tmp_path, depth="sterio")
+        JacquardDataset(tmp_path, depth="sterio")
 
 
 @pytest.mark.parametrize(
@@ -212,51 +209,6 @@ def test_jacquard_without_its_stereo_depth(tmp_path):
         JacquardDataset(tmp_path, "stereo")
 
 
-OBJECTS = [f"o{i // 4}" for i in range(40)]
-
-
-def covers(split: Split, count: int) -> bool:
-    return sorted(split.train + split.test) == list(range(count))
-
-
-def test_splits_come_from_their_seed():
-    for make in (
-        lambda seed: image_wise_split(40, 0.2, seed),
-        lambda seed: object_wise_split(OBJECTS, 0.2, seed),
-        lambda seed: block_folds(OBJECTS, 5, seed)[0],
-    ):
-        assert make(1) == make(1) != make(2)
-        assert covers(make(1), 40) and len(make(1).test) == 8
-
-
-def test_object_wise_split_shares_no_object():
-    split = object_wise_split(OBJECTS, 0.3, seed=0)
-    assert not {OBJECTS[i] for i in split.train} & {OBJECTS[i] for i in split.test}
-    assert len(split.test) == 12
-
-
-def test_folds_in_order_keep_blocks_whole():
-    objects = ["a"] * 3 + ["b"] * 2 + ["c"] * 4 + ["d"]
-    folds = block_folds(objects, 2)
-    assert [fold.test for fold in folds] == [(0, 1, 2, 3, 4), (5, 6, 7, 8, 9)]
-    assert all(covers(fold, 10) for fold in folds)
-    assert [len(fold.test) for fold in block_folds(objects, 4)] == [3, 2, 4, 1]
-    with pytest.raises(UserError, match="2 to 4"):
-        block_folds(objects, 5)
-
-
-@pytest.mark.parametrize("seed", [None, 0, 1])
-def test_every_image_is_tested_once(seed):
-    folds = block_folds(OBJECTS, 5, seed)
-    assert sorted(i for fold in folds for i in fold.test) == list(range(40))
-    for fold in folds:
-        assert not {OBJECTS[i] for i in fold.train} & {OBJECTS[i] for i in fold.test}
-
-
-def test_split_is_printed():
-    assert Split((0, 2), (1,)).describe("xyz") == "train (2): x z\ntest (1): y"
-
-
 @pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")
 def test_the_real_cornell_images():
     data = CornellDataset(CORNELL)
@@ -273,4 +225,4 @@ def test_the_real_cornell_images():
             skipped[sample.name] = sample.skipped
     assert skipped == {"pcd0132": 2, "pcd0165": 1}  # the NaN rows of the two cpos files
     # Objects begin at 114, 133, 149, 165 nearest to the fifths 116, 132, 148, 164.
-    assert [len(fold.test) for fold in block_folds(data.object_ids, 5)] == [14, 19, 16, 16, 15]
+    assert [len(fold.test) for fold in object_folds(data.object_ids, 5)] == [14, 19, 16, 16, 15]

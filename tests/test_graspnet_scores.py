@@ -1,0 +1,128 @@
+"""Scores of a network by dense labels, and the curves of a training."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from models.graspnet_decoding import Peaks
+from models.graspnet_scores import (
+    LabelScores,
+    check_graspable,
+    curve_tag,
+    describe_scores,
+    score_labels,
+    score_peak,
+)
+from utils.augmentation import LabelledImage
+from utils.errors import UserError
+
+BINS = 18
+
+
+def labelled(*labels: tuple[int, int, int, float, float], side: int = 20) -> LabelledImage:
+    """An image without pattern and with labels (bin, row, column, quality, width)."""
+    quality, width = torch.zeros(BINS, side, side), torch.zeros(BINS, side, side)
+    for k, row, column, q, w in labels:
+        quality[k, row, column], width[k, row, column] = q, w
+    return LabelledImage(
+        torch.full((3, side, side), 128, dtype=torch.uint8),
+        torch.full((side, side), 0.8),
+        quality,
+        width,
+        torch.ones(side, side, dtype=torch.bool),
+    )
+
+
+def peak(u: float, v: float, degrees: float, width: float) -> Peaks:
+    return Peaks(
+        np.array([[u, v]]), np.radians([degrees]), np.array([width], np.float32), np.array([0.9])
+    )
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        # Nearest bin 0 has no label; 170 and 2 degrees are 12 apart, over the seam.
+        (peak(6.0, 4.0, 2.0, 0.05), (0.0, 12.0, 0.02, 0.0)),
+        (peak(6.0, 4.0, 172.0, 0.03), (0.9, 2.0, 0.0, 0.0)),
+        # Between 176 and 180 the nearest bin is 0 again.
+        (peak(6.0, 4.0, 177.0, 0.03), (0.0, 7.0, 0.0, 0.0)),
+        # One pixel beside: no label there, but the labels of the neighbour count.
+        (peak(7.0, 4.0, 170.0, 0.03), (0.0, 0.0, 0.0, 1.0)),
+        # 3 right and 4 down: the nearest label, not the one of the nearest angle farther away.
+        (peak(9.0, 8.0, 90.0, 0.03), (0.0, 80.0, 0.0, 5.0)),
+        # A subpixel place belongs to the rounded pixel.
+        (peak(6.3, 4.4, 170.0, 0.04), (0.9, 0.0, 0.01, 0.5)),
+    ],
+)
+def test_a_peak_against_labels(found, expected):
+    image = labelled((17, 4, 6, 0.9, 0.03), (9, 15, 15, 0.8, 0.06), (0, 5, 6, 0.5, 0.01))
+    label, angle, width, distance = score_peak(found, image)
+    assert (label, np.degrees(angle), width, distance) == pytest.approx(expected, abs=1e-5)
+
+
+def test_of_several_good_angles_the_nearest_counts():
+    image = labelled((3, 4, 6, 0.7, 0.02), (6, 4, 6, 0.9, 0.05))
+    label, angle, width, distance = score_peak(peak(6, 4, 58, 0.05), image)
+    assert (label, np.degrees(angle), width, distance) == pytest.approx((0.9, 2, 0, 0), abs=1e-5)
+    label, angle, width, _ = score_peak(peak(6, 4, 36, 0.05), image)
+    assert (label, np.degrees(angle), width) == pytest.approx((0.0, 6, 0.03), abs=1e-5)
+
+
+class Always(nn.Module):
+    """A network that sees a bump of quality at row 10, column 12, bin 4 and width 0.04 m."""
+
+    def __init__(self):
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(1))
+
+    def forward(self, x: torch.Tensor, centres: bool = False):
+        rows, columns = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
+        quality = torch.exp(-((rows - 10) ** 2 + (columns - 12) ** 2) / 8.0)[None, None]
+        circle = 2 * np.pi * (torch.arange(BINS) - 4) / BINS
+        angle = (4 * torch.cos(circle))[None, :, None, None].expand(1, BINS, 20, 20)
+        return quality, angle, torch.full_like(quality, 0.04)
+
+
+def test_scores_are_means_over_images_with_something_to_grasp():
+    scores = score_labels(
+        Always(),
+        [
+            labelled((4, 10, 12, 0.9, 0.05)),
+            labelled((4, 10, 12, 0.3, 0.05), (5, 10, 16, 0.8, 0.01)),
+            labelled((4, 10, 12, 0.5, 0.05)),  # nothing that counts as a grasp
+            labelled(),
+        ],
+    )
+    assert scores.images == 2
+    assert scores.label_quality == pytest.approx(0.6)
+    assert scores.precision == pytest.approx(0.5)
+    assert np.degrees(scores.angle_error) == pytest.approx(5.0, abs=1e-3)  # 0 and 10 degrees
+    assert scores.width_error == pytest.approx(0.02)  # 1 and 3 cm
+    assert scores.distance == pytest.approx(2.0, abs=1e-4)  # 0 and 4 pixels
+    nothing = score_labels(Always(), [labelled()])
+    assert (nothing.images, nothing.label_quality, nothing.precision) == (0, 0.0, 0.0)
+
+
+def test_one_image_with_something_to_grasp_is_enough():
+    poor = labelled((4, 10, 12, 0.5, 0.05))
+    check_graspable([poor, labelled((4, 10, 12, 0.9, 0.05))])
+    with pytest.raises(UserError, match="none of the 2 validation images.*validation_frames"):
+        check_graspable([poor, labelled()])
+
+
+def test_curves_name_their_origin_and_unit():
+    assert curve_tag("width_error") == "validation/width_error_m"
+    assert curve_tag("width_loss") == "training/width_loss_m"
+    assert curve_tag("label_quality") == "validation/label_quality"
+
+
+def test_scores_are_described_in_degrees_and_millimetres():
+    scores = LabelScores(0.75, 0.83, np.radians(6.0), 0.0062, 1.23, 254)._asdict()
+    assert describe_scores(scores) == (
+        "the network alone, by the best grasp on each of 254 validation images: mean label 0.75 of "
+        "1, 83 % positive; the nearest label is 6.0 degrees, 6.2 mm of width and 1.2 px away"
+    )
