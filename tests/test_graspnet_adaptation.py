@@ -37,7 +37,7 @@ from models.graspnet_io import KIND, load_graspnet
 from models.photographs import K, frame_of
 from tests.helpers.compare import same
 from tests.helpers.one_step import BATCH, joint_batch
-from tests.test_real_training import write_cornell
+from tests.helpers.real_images import write_cornell
 from tests.test_train_graspnet import SMALL, labelled
 from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, select_domain
 from utils.checkpoint import load_checkpoint

@@ -13,8 +13,8 @@ from models.graspnet_io import SavedGraspNet
 from models.photographs import HAND, SHRUNK, WORKSPACE, K, frame_of, judge_photographs
 from models.planner_graspnet import GraspNetPlanner
 from tests.helpers.fixed_maps import FixedMaps
+from tests.helpers.real_images import write_cornell
 from tests.test_real_data import CORNELL
-from tests.test_real_training import write_cornell
 from utils.depth import KinectNoise
 from utils.errors import UserError
 from utils.images import overhead_view
