@@ -38,7 +38,7 @@ from models.photographs import K, frame_of
 from tests.helpers.compare import same
 from tests.helpers.one_step import BATCH, joint_batch
 from tests.helpers.real_images import write_cornell
-from tests.test_train_graspnet import SMALL, labelled
+from tests.helpers.trainings import SMALL, labelled
 from utils.adaptation import SOURCE, TARGET, ordinary_norms, per_domain_norms, select_domain
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config

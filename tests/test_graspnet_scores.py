@@ -16,24 +16,8 @@ from models.graspnet_scores import (
     score_labels,
     score_peak,
 )
-from utils.augmentation import LabelledImage
+from tests.helpers.trainings import BINS, labelled
 from utils.errors import UserError
-
-BINS = 18
-
-
-def labelled(*labels: tuple[int, int, int, float, float], side: int = 20) -> LabelledImage:
-    """An image without pattern and with labels (bin, row, column, quality, width)."""
-    quality, width = torch.zeros(BINS, side, side), torch.zeros(BINS, side, side)
-    for k, row, column, q, w in labels:
-        quality[k, row, column], width[k, row, column] = q, w
-    return LabelledImage(
-        torch.full((3, side, side), 128, dtype=torch.uint8),
-        torch.full((side, side), 0.8),
-        quality,
-        width,
-        torch.ones(side, side, dtype=torch.bool),
-    )
 
 
 def peak(u: float, v: float, degrees: float, width: float) -> Peaks:

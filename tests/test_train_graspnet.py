@@ -23,17 +23,12 @@ from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores
 from models.graspnet_training import Trainer
 from tests.helpers.compare import same
+from tests.helpers.trainings import SMALL
 from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
 from utils.grasp_data import shard_path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-
-
-SMALL = [
-    "train.backbone=tutorial_skip", "train.batch_size=8", "train.epochs=3", "train.lr=0.01",
-    "train.workers=0", "train.device=cpu", "train.precision=float32",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
