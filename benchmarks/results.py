@@ -32,9 +32,9 @@ from typing import Any
 from benchmarks.result_tables import write_tables
 from utils.config import run_script
 from utils.errors import UserError
-from utils.result_records import read_rounds
+from utils.result_records import read_rounds, write_sample
 from utils.results import compare
-from utils.runs import environment, write_atomic, write_json_atomic
+from utils.runs import environment, write_json_atomic
 
 SEED = 2027
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -290,16 +290,9 @@ def figures_of(run: Path) -> dict[str, Any]:
 
 
 def keep_rounds(part: Part, command: Command, run: Path) -> None:
-    """Copy the first rounds of each row of a run's journal to docs/results."""
-    kept = []
-    for line in (run / "rounds.jsonl").read_text().splitlines():
-        if json.loads(line)["seed"] - SEED * 100_000 < command.kept:
-            kept.append(line)
-    kept.sort(key=lambda line: [json.loads(line)[key] for key in _ROW])
-    write_atomic(FIGURES / f"{part.name}-{command.name}.jsonl", "\n".join(kept) + "\n")
-
-
-_ROW = ("objects", "scenario", "policy", "seed")
+    """Copy the first rounds of each row of a run's journal to docs/results, where
+    `python evaluate.py --replay FILE` plays them again."""
+    write_sample(run, FIGURES / f"{part.name}-{command.name}.jsonl", command.kept)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""A learned policy at work in the cell: it brings the hand around an object and closes it.
+"""Learned policies at work in the cell: they bring the hand around an object and close it.
 
-The rest of the attempt, and who says whether it succeeded, is the same as for planned grasps
-(`envs.execution`). A policy is any callable from an observation of `RobotGraspingEnv` to an action.
-
-The policies of train_rl.py among those that evaluate.py scores: `ppo` and `ppo:FILE.pt`.
+A policy is a callable from an observation of `RobotGraspingEnv` to an action. The rest of the
+attempt and its judgement are the same as for planned grasps (`envs.execution`). evaluate.py scores
+policies of train_rl.py (`ppo`, `ppo:FILE.pt`) and of Stable-Baselines3 (`sb3:FILE.zip`).
 """
 
 from __future__ import annotations
@@ -21,23 +20,28 @@ from envs.execution import ApproachResult, GraspFailure
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
 from models.grasp_policy import SavedPolicy, load_policy
-from utils.config import with_settings
+from models.sb3_policy import Sb3Policy, load_sb3
+from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.result_records import OPEN_LOOP
 from utils.transforms import Grasp, RGBDFrame
 
-TOLD_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
-_SURE = 3  # looks in a row at which something must be gripped: a first touch may slip
+KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
+_SURE = 3  # observations in a row with something gripped: a first touch may slip
 SCENARIOS = ("isolated", "static")  # one object, which stays where it is
+LEARNED = ("ppo", "sb3")  # the word before the colon, followed by a file
+SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"
 
 
 class PolicyApproach:
-    """An `envs.execution.Approach`. trained: sections env and camera of the config that the policy
-    was trained with, as plain data; everything else is the cell's, and so is the depth noise.
+    """An `envs.execution.Approach` by a policy that acts in turns.
 
-    It ends when both fingers have gripped something for a quarter of a second, which a gripper
-    feels; from there the object is held, lifted and judged as any other. closed_at: where that was,
-    None until then.
+    trained: sections env and camera of the config that the policy was trained with, as plain data;
+        the rest of the config is the cell's, and so is the depth noise.
+    closed_at: the hand's pose when it closed, None until then.
+
+    The approach ends when both fingers have gripped something for a quarter of a second, which a
+    gripper feels; then the object is held, lifted and judged like any other.
     """
 
     def __init__(
@@ -46,7 +50,7 @@ class PolicyApproach:
         policy: Callable[[dict[str, np.ndarray]], np.ndarray],
         trained: dict[str, dict[str, Any]],
     ):
-        # No reward is asked for; the objects are those of the cell.
+        # The reward is not used, and the cell has its objects already.
         plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
         noise = cell.config.camera.model_dump(include={"depth_noise", "depth_noise_args"})
         config = with_settings(cell.config, "camera", trained["camera"] | noise)
@@ -55,7 +59,7 @@ class PolicyApproach:
         self.closed_at: Grasp | None = None
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
-        """Raises GraspFailure when nothing is gripped in as many actions as in training."""
+        """Raises GraspFailure when nothing is gripped within the actions of a training episode."""
         self.closed_at, ended, gripped = None, False, 0
         try:
             observation, info = self.env.take_over()
@@ -76,8 +80,9 @@ class PolicyApproach:
         return ApproachResult(cell.step, None)
 
 
-def nowhere_yet(frame: RGBDFrame) -> list[Grasp]:
-    """The plan of a policy that makes none: something to be named until it has closed the hand."""
+def placeholder(frame: RGBDFrame) -> list[Grasp]:
+    """The planner beside a policy that plans nothing: a grasp that stands for the policy's own
+    until the hand has closed."""
     return [Grasp(np.array([0.5, 0.0, 0.0]), 0.0, 0.0, 0.0)]
 
 
@@ -88,30 +93,32 @@ def _grasp_of(cell: Cell) -> Grasp:
     return Grasp(T_WE[:3, 3].copy(), angle, cell.robot.opening, 1.0)
 
 
-LEARNED = "ppo"
-SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"
+# --- By name, as in evaluate.policies -----------------------------------------------------------
 
 
 def is_learned(name: str) -> bool:
-    """Whether a policy is one of train_rl.py's, which sees and moves in turns and plans nothing."""
-    return name == LEARNED or name.startswith(f"{LEARNED}:")
+    """Whether a policy acts in turns and plans nothing."""
+    return name == "ppo" or name.partition(":")[0] in LEARNED and ":" in name
 
 
 @functools.cache
-def learned(name: str) -> SavedPolicy:
-    """The policy `ppo`, as shipped, or `ppo:FILE.pt`. Raises UserError if it cannot be loaded."""
-    _, _, file = name.partition(":")
+def load_learned(name: str) -> SavedPolicy | Sb3Policy:
+    """Load `ppo` (the shipped one), `ppo:FILE.pt` or `sb3:FILE.zip`. Raises UserError."""
+    kind, _, file = name.partition(":")
+    if kind == "sb3":
+        return load_sb3(Path(file))
     return load_policy(Path(file) if file else SHIPPED)
 
 
-def check_learned(name: str, scenarios: Sequence[str], controllers: Sequence[str]) -> None:
-    """Raise UserError for a policy that cannot be loaded or cannot play what is asked for."""
-    told = [part.key for part in learned(name).layout.state if part.key not in TOLD_A_ROBOT]
-    if told:
-        raise UserError(
-            f"evaluate.policies: {name} was trained to be told {', '.join(told)}, which no robot "
-            "knows; score it with benchmarks.bench_policy"
-        )
+def check_learned(
+    name: str, scenarios: Sequence[str], controllers: Sequence[str], config: Config
+) -> None:
+    """Raise UserError for a policy that cannot be loaded, or not be scored in this evaluation."""
+    policy = load_learned(name)
+    if isinstance(policy, Sb3Policy):
+        _check_spaces(policy, config)
+    else:
+        _check_knowledge(name, policy)
     for scenario in scenarios:
         if scenario not in SCENARIOS:
             raise UserError(
@@ -125,8 +132,31 @@ def check_learned(name: str, scenarios: Sequence[str], controllers: Sequence[str
         )
 
 
+def _check_knowledge(name: str, policy: SavedPolicy) -> None:
+    """Raise UserError for a policy that observes what a robot cannot know."""
+    unknown = [part.key for part in policy.layout.state if part.key not in KNOWN_TO_A_ROBOT]
+    if unknown:
+        raise UserError(
+            f"evaluate.policies: {name} was trained to observe {', '.join(unknown)}, which no "
+            "robot knows; score it with benchmarks.bench_policy"
+        )
+
+
+def _check_spaces(policy: Sb3Policy, config: Config) -> None:
+    """Raise UserError for a policy whose spaces are not those of the config's section env."""
+    env = RobotGraspingEnv(config=config.model_copy(update={"simulator": "pybullet"}))
+    try:
+        policy.check_spaces(env.observation_space, env.action_space)
+    finally:
+        env.close()
+
+
 @functools.cache
-def approach_by(name: str, cell: Cell) -> PolicyApproach:
-    """How a learned policy brings the hand around an object in a cell."""
-    policy = learned(name)
+def learned_approach(name: str, cell: Cell) -> PolicyApproach:
+    """The approach of a learned policy in a cell. A policy of Stable-Baselines3 brings no config,
+    so that it acts in the environment of the cell's."""
+    policy = load_learned(name)
+    if isinstance(policy, Sb3Policy):
+        sections = {"env": cell.config.env, "camera": cell.config.camera}
+        return PolicyApproach(cell, policy, {key: sections[key].model_dump() for key in sections})
     return PolicyApproach(cell, policy, policy.config)

@@ -1,15 +1,17 @@
-"""One round of clutter removal: a policy picks until the scene is empty or it gives up.
+"""One round of clutter removal: a policy picks until the scene is empty or the policy gives up.
 
-The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when everything is cleared, when
-the policy finds no grasp, or after `max_failures` failed grasps in a row. What has just failed is
-not tried again as long as the policy names another grasp: often nothing has moved, and a
-deterministic planner would repeat itself.
+The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
+the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
+its planner raises an exception. A grasp that has just failed is not tried again while the planner
+offers another one: often nothing has moved, and a deterministic planner would repeat itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,51 +24,68 @@ from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
 from envs.policy_approach import PolicyApproach
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, disturbed
+from models.planners import Planner, needs_truth, reset_planner
 from utils.errors import TargetLostError
-from utils.result_records import NO_PLAN, OPEN_LOOP, AttemptRecord, RoundRecord, contestant
+from utils.result_records import (
+    NO_PLAN,
+    OPEN_LOOP,
+    PLANNER_ERROR,
+    AttemptRecord,
+    RoundRecord,
+    policy_name,
+)
 from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
-ROOM_OVER_TOUCH = 0.004  # m
+ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
+
+
+class PlannerError(Exception):
+    """A planner raised an exception or returned something else than grasps."""
 
 
 def run_round(
     cell: Cell,
     scene: Scene,
-    plan: Callable[[RGBDFrame], list[Grasp]],
+    plan: Planner,
     *,
     policy: str,
     objects: str,
     max_failures: int,
     scenario: str | None = None,
     controller: str = OPEN_LOOP,
-    with_truth: bool = False,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
     approach_by: PolicyApproach | None = None,
 ) -> RoundRecord:
-    """Load a scene and let a planner work on it; the record of what happened.
+    """Load a scene, let a planner work on it, and return the record.
 
-    policy, objects: names for the record. scenario: a key of SCENARIOS, what happens besides;
-    None: the scene's layout. controller: how the arm gets to the grasps. with_truth: the planner is
-    privileged. on_attempt is called after every executed grasp with the frame it was planned on
-    (for pictures). approach_by: a policy that finds its grasps on the way, whatever is planned.
+    plan: the planner, which is first reset with the scene's seed if it has `reset`.
+    policy, objects: the planner's and the object set's name in the record.
+    scenario: a key of SCENARIOS, the conditions of the round; None: the scene's layout.
+    controller: how the arm reaches the grasps.
+    on_attempt: called after every executed grasp with the frame that it was planned on.
+    approach_by: a policy that finds its own grasps on the way; the planned ones are ignored.
     """
     scenario = scenario or scene.layout
     conditions = SCENARIOS[scenario]
+    privileged = needs_truth(plan)
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
     calibration = conditions.calibration(cell)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
-    stops: list[float | None] = []  # of these, where something under the palm stopped them
+    stops: list[float | None] = []  # heights at which these met something under the palm
     plan_seconds, ended = 0.0, "cleared"
     try:
+        with planner_errors(policy):
+            reset_planner(plan, scene.seed)
         while cell.remaining and len(failed) < max_failures:
-            frame = calibrated(cell, calibration, cell.frame(with_truth))
+            frame = calibrated(cell, calibration, cell.frame(privileged))
             start = time.perf_counter()
-            grasps = plan(frame if with_truth else frame.without_truth())
+            with planner_errors(policy):
+                grasps = checked_grasps(plan(frame if privileged else frame.without_truth()))
             plan_seconds = time.perf_counter() - start
             if not grasps:
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
@@ -76,7 +95,7 @@ def run_round(
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
-                # What is worked out of an image late is what a late image would have been worth.
+                # The time to process an image counts as if the image had come later.
                 late = conditions.latency + cell.config.closed_loop.compute_seconds
                 approach = ClosedLoop(cell, controller, seen, calibration, taught, late)
             elif approach_by is not None:
@@ -85,23 +104,25 @@ def run_round(
                 outcome = execute_grasp(cell, grasp, approach)
             if approach_by is not None and approach_by.closed_at is not None:
                 grasp = approach_by.closed_at
-            on_image = grasp_to_image(grasp, frame.K, frame.T_WC)
             attempts.append(
                 AttemptRecord(
                     outcome.success,
                     outcome.reason,
                     plan_seconds,
                     outcome.sim_seconds,
-                    on_image,
+                    grasp_to_image(grasp, frame.K, frame.T_WC),
                     detail=outcome.detail,
                     held=_name_of(scene, outcome.object_index),
                     **_turn_ms(approach),
-                )  # fmt: skip
+                )
             )
             failed = [] if outcome.success else [*failed, grasp]
             stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
+    except PlannerError as error:
+        attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, 0.0, detail=str(error)))
+        ended = PLANNER_ERROR
     except PhysicsError:
         attempts.append(AttemptRecord(False, "physics", plan_seconds, 0.0))
         ended = "physics"
@@ -111,9 +132,28 @@ def run_round(
     if ended == "cleared" and cleared < len(scene.placements):
         ended = "lost"
     return RoundRecord(
-        contestant(policy, controller), scenario, objects, scene.seed, len(scene.placements),
+        policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample,
     )  # fmt: skip
+
+
+@contextlib.contextmanager
+def planner_errors(name: str) -> Iterator[None]:
+    """Turn any exception of a planner, which may be anyone's code, into a PlannerError with its
+    name and place."""
+    try:
+        yield
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{last.filename}, line {last.lineno}"
+        raise PlannerError(f"{name} raised {type(error).__name__}: {error} ({place})") from error
+
+
+def checked_grasps(grasps: object) -> Sequence[Grasp]:
+    """What a planner returned. Raises TypeError for anything but a list or tuple of grasps."""
+    if not isinstance(grasps, list | tuple) or not all(isinstance(g, Grasp) for g in grasps):
+        raise TypeError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
+    return grasps
 
 
 def calibrated(cell: Cell, calibration: CameraCalibration, frame: RGBDFrame) -> RGBDFrame:
@@ -142,8 +182,8 @@ def _turn_ms(approach: Approach) -> dict[str, float]:
 
 
 def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:
-    """The first grasp that is not about the same as one of those that failed; the first of all if
-    there is none."""
+    """The first grasp that is not near one of those that failed; the first of all if there is
+    none."""
     untried = (
         grasp
         for grasp in grasps
@@ -157,10 +197,10 @@ def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:
 
 
 def no_deeper(grasp: Grasp, failed: Sequence[Grasp], stops: Sequence[float | None]) -> Grasp:
-    """The grasp, raised over the heights (metres, of E) at which the palm met something there.
+    """The grasp, raised above the heights `stops` (m, of E) at which the palm met something there.
 
-    A camera may lose a thin part that stands up from an object; the palm that has come down on it
-    knows how high it is.
+    A camera may miss a thin part that stands up from an object; the contact with the palm tells how
+    high that part is.
     """
     lowest = max(
         (

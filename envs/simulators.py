@@ -5,7 +5,7 @@ from __future__ import annotations
 from envs.cell import Cell
 from envs.mujoco_cell import MujocoCell
 from envs.pybullet_cell import PybulletCell
-from utils.config import Config, with_settings
+from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
 
@@ -23,13 +23,6 @@ def make_cell(config: Config) -> Cell:
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
         cell.on_action = randomizer.act
     return cell
-
-
-def in_world(config: Config, world: str) -> Config:
-    """The config of an evaluation in a world of the transfer report: `pybullet`, `mujoco`, or
-    `outside`, which is PyBullet changed by the section `randomization`."""
-    config = with_settings(config, "evaluate", {"randomise": world == "outside"})
-    return config.model_copy(update={"simulator": "mujoco" if world == "mujoco" else "pybullet"})
 
 
 def check_simulator(config: Config) -> None:

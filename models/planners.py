@@ -8,16 +8,17 @@ also the colours, `oracle` the true geometry. A planner of your own is named by 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from models.planner_antipodal import SearchPlanner, SearchSettings
 from models.planner_contacts import buried_share, exact_quality
 from models.planner_graspnet import GraspNetPlanner
-from utils.errors import unknown_choice
+from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
 from utils.plugins import is_import_path, load_plugin
@@ -127,9 +128,8 @@ PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
 def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
     """The planner that `name` stands for.
 
-    name: a key of `PLANNERS`; a GraspNet checkpoint FILE.pt; or an import path `module:name`, which
-    names either a function `plan(frame)` or a class, of which one object is made as
-    `Class(gripper, workspace, seed)`. seed: starts the planner's own random generator.
+    name: a key of `PLANNERS`; a GraspNet checkpoint FILE.pt; or an import path `module:name`, see
+    `plugin_planner`. seed: starts the planner's own random generator.
 
     Raises UserError for any other name, and for a file or module that cannot be loaded.
     """
@@ -138,7 +138,38 @@ def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
     if is_import_path(name):
-        loaded = load_plugin(name, "evaluate.policies")
-        return loaded(gripper, workspace, seed) if isinstance(loaded, type) else loaded
-    others = ("a GraspNet checkpoint FILE.pt", "module:name", "ppo", "ppo:FILE.pt")
+        return plugin_planner(name, gripper, workspace, seed)
+    others = ("a GraspNet checkpoint FILE.pt", "module:name", "ppo", "ppo:FILE.pt", "sb3:FILE.zip")
     raise unknown_choice("evaluate.policies", name, [*PLANNERS, *others])
+
+
+def plugin_planner(path: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
+    """The planner that an import path `module:name` names: a function `plan(frame)`; or an object
+    that a class, or a function with the parameters gripper, workspace and seed, makes of these.
+
+    Raises UserError where it cannot be loaded or made.
+    """
+    loaded = load_plugin(path, "evaluate.policies")
+    if not (isinstance(loaded, type) or _makes_planners(loaded)):
+        return loaded
+    try:
+        planner = loaded(gripper, workspace, seed)
+    except Exception as error:  # whatever the module's own code raises is its author's to mend
+        raise UserError(
+            f"evaluate.policies: {path!r} raised {type(error).__name__}: {error}; it is called "
+            "with gripper, workspace and seed"
+        ) from error
+    if not callable(planner):
+        raise UserError(
+            f"evaluate.policies: {path!r} made a {type(planner).__name__}, expected a planner, "
+            "which can be called with a frame"
+        )
+    return planner
+
+
+def _makes_planners(function: Callable[..., Any]) -> bool:
+    try:
+        parameters = inspect.signature(function).parameters
+    except ValueError:  # a built-in function without a signature
+        return False
+    return list(parameters)[:3] == ["gripper", "workspace", "seed"]

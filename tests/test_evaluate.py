@@ -15,13 +15,13 @@ import trimesh
 
 import evaluate
 from envs.cell_scenes import make_scene
+from envs.evaluation_worker import load_objects
 from envs.pybullet_cell import PybulletCell
 from envs.rounds import run_round
 from models.planners import make_planner, needs_truth
 from utils.config import run_script as end_like_a_script
 from utils.geometry import GripperGeometry, Workspace
-from utils.result_records import append_round, read_rounds
-from utils.results import tasks
+from utils.result_records import read_rounds
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box"]
@@ -216,19 +216,11 @@ def test_own_meshes_are_picked(tmp_path):
     assert sum(row["successes"] for row in results["rows"]) >= 6
 
 
-def test_tasks_cover_the_plan_once(config):
-    plan = config.evaluate
-    listed = list(tasks(config, [], Path("run")))
-    assert len(listed) == plan.rounds * len(plan.scenarios) * len(plan.object_sets)
-    pairs = tuple((policy, "open_loop") for policy in plan.policies)
-    assert all(task.policies == pairs for task in listed)
-
-
 @pytest.mark.slow
 def test_piles_of_unseen_objects_are_cleared(config):
     """The scoreboard's headline on a few fixed scenes, with room for scatter: the README's table of
     50 rounds has random at 23 %, heuristic at 95 %, oracle at 100 % success."""
-    objects = evaluate.load_objects("random_urdfs", config)
+    objects = load_objects("random_urdfs", config)
     scenes = [make_scene("pile", objects, 700_000 + i, config) for i in range(8)]
     rates = {}
     with PybulletCell(config) as cell:
@@ -281,16 +273,6 @@ def test_an_impossible_scene_ends_the_run_but_not_the_results(tmp_path):
     results = json.loads((only_run(tmp_path) / "results.json").read_text())
     assert results["complete"] is False and results["rows"][0]["rounds"] >= 1
     assert (only_run(tmp_path) / "report.html").exists()
-
-
-def test_a_torn_last_line_of_the_journal_is_taken_off(finished, tmp_path):
-    folder, _ = finished
-    whole = (only_run(folder) / "rounds.jsonl").read_text()
-    journal = tmp_path / "rounds.jsonl"
-    journal.write_text(whole + whole.splitlines()[0][:40])
-    before = read_rounds(journal)
-    append_round(journal, before[0])
-    assert len(read_rounds(journal)) == len(before) + 1
 
 
 def test_a_filmed_round_without_an_attempt_has_a_picture(tmp_path):

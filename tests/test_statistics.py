@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from utils.statistics import paired_difference_interval, wilson_interval
+from utils.statistics import (
+    mean_maximum_rank_violation,
+    paired_difference_interval,
+    pearson_correlation,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -90,3 +95,43 @@ def test_paired_undefined_and_bad_input():
 def test_resamples_without_an_attempt_are_left_out():
     result = paired_difference_interval([(0, 0), (1, 1)], [(0, 1), (1, 1)])
     assert np.isfinite([result.low, result.high]).all()
+
+
+def test_pearson_by_hand():
+    # Deviations (-1, 0, 1) and (-1, 1, 0): 1 / 2.
+    assert pearson_correlation([1, 2, 3], [1, 3, 2]) == pytest.approx(0.5)
+    assert pearson_correlation([0.2, 0.4, 0.9], [0.1, 0.2, 0.45]) == pytest.approx(1.0)
+    assert pearson_correlation([1, 2], [5, 3]) == pytest.approx(-1.0)
+
+
+def test_pearson_agrees_with_numpy():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 30))
+    assert pearson_correlation(a, b) == pytest.approx(np.corrcoef(a, b)[0, 1])
+
+
+def test_pearson_is_undefined_without_change():
+    assert pearson_correlation([0.5], [0.5]) is None
+    assert pearson_correlation([0.5, 0.5], [0.1, 0.9]) is None
+
+
+def test_rank_violation_by_hand():
+    # Real 0.2 < 0.5 < 0.9; the simulation swaps the first two: each of them is violated by 0.3,
+    # the third by nothing.
+    real = [0.2, 0.5, 0.9]
+    assert mean_maximum_rank_violation(real, [0.5, 0.2, 0.9]) == pytest.approx(0.6 / 3)
+    # All turned round: 0.7, 0.4 (with the third) and 0.7.
+    assert mean_maximum_rank_violation(real, [0.9, 0.5, 0.2]) == pytest.approx(1.8 / 3)
+    assert mean_maximum_rank_violation(real, [0.01, 0.02, 0.03]) == 0.0
+
+
+def test_rank_violation_of_ties():
+    """Equal in the simulation, but really 0.4 apart: the lower one's rank is not predicted."""
+    assert mean_maximum_rank_violation([0.3, 0.7], [0.5, 0.5]) == pytest.approx(0.4 / 2)
+    assert mean_maximum_rank_violation([0.3, 0.3], [0.5, 0.5]) == 0.0
+
+
+def test_lists_that_do_not_pair_up_are_refused():
+    for measure in (pearson_correlation, mean_maximum_rank_violation):
+        with pytest.raises(ValueError, match="one length"):
+            measure([0.1, 0.2], [0.1])

@@ -8,6 +8,7 @@ network and no data.
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from threading import Event
@@ -133,10 +134,17 @@ def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> 
 
 
 @contextmanager
-def stop_on_interrupt() -> Iterator[Event]:
-    """Yield an event that Ctrl-C sets, so that a training stops between two whole steps."""
+def stop_on_interrupt(message: str | None = None) -> Iterator[Event]:
+    """Yield an event that Ctrl-C sets, so that the work stops between two whole steps; `message`
+    is then printed at once."""
     interrupted = Event()
-    before = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+
+    def stop(*_: object) -> None:
+        if message is not None and not interrupted.is_set():
+            print(f"\n{message}", file=sys.stderr, flush=True)
+        interrupted.set()
+
+    before = signal.signal(signal.SIGINT, stop)
     try:
         yield interrupted
     finally:

@@ -1,9 +1,8 @@
 """report.html: one self-contained page that shows how an evaluation went.
 
-Figures come from `utils.results`, the layout from report.html.j2 next to this file; here they are
-only brought together. The page loads nothing from anywhere: images and videos are inside it.
-
-Pictures of grasps, and which of them are shown: successes, failures, of each policy some.
+The figures come from `utils.results`, the layout from report.html.j2 next to this file. The page
+loads nothing from anywhere: pictures of grasps and films are inside it. `picture` draws a grasp,
+`balanced` chooses the pictures to show.
 """
 
 from __future__ import annotations
@@ -24,16 +23,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
 from utils.image_overlay import contact_sheet, draw_grasp
-from utils.result_records import FAILURES, SUCCESS, RoundRecord, contestant
-from utils.results import (
-    Comparison,
-    Row,
-    compare,
-    failures_in_words,
-    interruption,
-    stop_reasons,
-    turn_ms_in_words,
-)
+from utils.result_formats import failures_in_words, turn_ms_in_words
+from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
+from utils.results import Comparison, Row, stop_reasons
 from utils.runs import git_state, write_atomic
 from utils.statistics import Difference
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
@@ -57,13 +49,16 @@ def write_report(
     path: Path,
     rows: Sequence[Row],
     rounds: Sequence[RoundRecord],
+    comparisons: Sequence[Comparison],
     config: Config,
     gallery: Sequence[GalleryItem] = (),
     videos: Sequence[tuple[Path, str]] = (),
     device: str = "",
+    interruption: str | None = None,
 ) -> None:
     """Write the page to `path`; videos are (gif, mp4 or webm file, caption).
 
+    rows, comparisons: the figures of the rounds by `utils.results`. device, interruption: in words.
     Raises UserError on a video file that is missing or of another type.
     """
     templates = Environment(
@@ -78,7 +73,7 @@ def write_report(
     page = templates.get_template("report.html.j2").render(
         groups=_groups(rows),
         policies=_in_order(row.policy for row in rows),
-        comparisons=_comparisons(rounds, config.seed),
+        comparisons=_comparisons(comparisons),
         few_rounds=FEW_ROUNDS,
         labels={SUCCESS: "success", **FAILURES},
         failures_in_words=failures_in_words,
@@ -87,7 +82,7 @@ def write_report(
         turn_ms_in_words=turn_ms_in_words,
         rows=rows,
         totals={"rounds": len(rounds), "grasps": sum(row.attempts for row in rows)},
-        interruption=interruption(len(rounds), config),
+        interruption=interruption,
         gallery=[(_png(item.image), item.caption, item.success) for item in gallery],
         videos=[(*_video(Path(file)), caption) for file, caption in videos],
         command=shlex.join(["python", "evaluate.py", *changed_keys(config)]),
@@ -125,7 +120,7 @@ def _groups(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def _privileged(row: Row) -> bool:
     """Whether its planner, with whatever controller, sees the true scene."""
-    return any(row.policy == contestant(planner, row.controller) for planner in PRIVILEGED)
+    return any(row.policy == policy_name(planner, row.controller) for planner in PRIVILEGED)
 
 
 def _best(rows: Sequence[Row]) -> Row:
@@ -147,10 +142,10 @@ def _outcomes(row: Row) -> list[dict[str, Any]]:
     return segments
 
 
-def _comparisons(rounds: Sequence[RoundRecord], seed: int) -> list[dict[str, Any]]:
+def _comparisons(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """Pairs of policies with difference and verdict, by (scenario, objects) and measure."""
     cells: dict[tuple[str, str], list[Comparison]] = {}
-    for pair in compare(rounds, seed):
+    for pair in comparisons:
         cells.setdefault((pair.scenario, pair.objects), []).append(pair)
     return [
         {
@@ -207,18 +202,20 @@ def _number(value: float | None, digits: int = 0) -> str:
     return "–" if value is None else f"{value:,.{digits}f}"
 
 
+# --- Pictures of grasps -------------------------------------------------------------------------
+
 MOST_FAILURES = 24  # on failures.png
 
 
 def picture(frame: RGBDFrame, grasp: Grasp, policy: str, scenario: str, reason: str) -> GalleryItem:
-    """The frame with the grasp drawn in, and how it went: "success" or why not."""
+    """Draw a grasp on its frame; reason: "success" or a key of FAILURES."""
     on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
     image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
     return GalleryItem(image, f"{policy}, {scenario}: {reason}", success, policy)
 
 
 def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
-    """One picture of failed grasps, of each policy in turn; none if nothing failed."""
+    """Write one picture of failed grasps, of each policy in turn; no file if nothing failed."""
     failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
     if failures:
         sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
@@ -226,7 +223,7 @@ def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
 
 
 def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
-    """`count` pictures, half of them failures where there are enough: those teach the most."""
+    """Choose `count` pictures, half of them failures if there are enough of these."""
     failures = _in_turns([p for p in pictures if not p.success])
     successes = _in_turns([p for p in pictures if p.success])
     take = min(len(failures), max(count // 2, count - len(successes)))
@@ -234,7 +231,7 @@ def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
 
 
 def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
-    """One of each policy, then another of each: the worst policy fails most and would fill all."""
+    """One of each policy, then another of each, so that the worst policy does not fill the page."""
     number_of: Counter[str] = Counter()
     turns = []
     for position, item in enumerate(pictures):

@@ -1,25 +1,30 @@
-"""What an evaluation records: rounds and their attempts, and the journal that holds them.
+"""What an evaluation records: rounds, their attempts, and the journal rounds.jsonl that holds them.
 
-Records come from the cell (`envs.execution` judges, `envs.rounds` writes them down); what they add
-up to is for `utils.results`.
+`envs.execution` judges the attempts, `envs.rounds` makes the records, `utils.results` adds them
+up. A sample is the beginning of a journal with its config, its commit and the versions of the
+packages, so that anyone can play the same rounds again (`python evaluate.py --replay SAMPLE`).
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from utils.config import changed_keys, load_config
 from utils.errors import UserError
 from utils.runs import write_atomic
 from utils.transforms import ImageGrasp
 
 SUCCESS = "success"
-OPEN_LOOP = "open_loop"  # the controller that does not look again
+OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way to the grasp
 NO_PLAN = "no_plan"
-FAILURES = {  # reason: what a reader sees, in the order in which a grasp can fail
+PLANNER_ERROR = "planner_error"
+FAILURES = {  # reason: its name in tables, in the order in which a grasp can fail
     NO_PLAN: "no plan",
+    PLANNER_ERROR: "planner failed",
     "ik": "IK",
     "lost": "lost from sight",
     "stopped": "stopped",
@@ -32,27 +37,31 @@ FAILURES = {  # reason: what a reader sees, in the order in which a grasp can fa
 ENDINGS = {  # why a round ended
     "cleared": "every object removed",
     NO_PLAN: "the planner found no grasp",
+    PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
     "lost": "the objects that were left fell off the table",
     "physics": "the simulation blew up",
 }
 
 
-def contestant(policy: str, controller: str) -> str:
-    """The name under which a policy is scored with a controller, such as heuristic+ibvs; a policy
-    alone stands for its open loop."""
-    return policy if controller == OPEN_LOOP else f"{policy}+{controller}"
+def policy_name(planner: str, controller: str) -> str:
+    """The name under which a planner with a controller is scored, such as heuristic+ibvs; the
+    planner's name alone stands for its open loop."""
+    return planner if controller == OPEN_LOOP else f"{planner}+{controller}"
 
 
 @dataclass(frozen=True)
 class AttemptRecord:
-    """One call of a planner and, unless it found nothing, the grasp that was executed.
+    """One call of a planner and, if it found a grasp, the execution of that grasp.
 
-    reason: "success" or a key of FAILURES; a "no_plan" is a failure but not an executed grasp.
+    reason: "success" or a key of FAILURES; "no_plan" and "planner_error" are failures without an
+        executed grasp.
     plan_seconds: wall-clock time of the planner. sim_seconds: simulated time of the execution.
-    grasp: where it was on the image, for pictures. turn_ms, turn_ms_mean: 95th percentile and mean
-    of the wall-clock time of a closed loop's turns, rendering left out. detail: a sentence on a
-    failure. held: name of the object that was in the hand, if any, however the attempt ended.
+    grasp: the grasp on the image, for pictures.
+    turn_ms, turn_ms_mean: 95th percentile and mean of the wall-clock time of a closed loop's turns,
+        without rendering.
+    detail: a sentence on a failure.
+    held: name of the object that was in the hand, if any, however the attempt ended.
     """
 
     success: bool
@@ -73,18 +82,18 @@ class AttemptRecord:
 
     @property
     def executed(self) -> bool:
-        return self.reason != NO_PLAN
+        return self.reason not in (NO_PLAN, PLANNER_ERROR)
 
 
 @dataclass(frozen=True)
 class RoundRecord:
-    """One scene worked on by one policy until `ended` (a key of ENDINGS).
+    """One policy's work on one scene until `ended` (a key of ENDINGS).
 
+    policy: the planner's name, in a closed loop with the controller's (see `policy_name`).
     seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, seed).
-    A round that ended with "no_plan" has an attempt with that reason at its end.
-    controller: how the arm got to its grasps; a policy of a closed loop is called by both, see
-    `contestant`. randomization: what was drawn for the scene (`utils.domain_randomization`), None
-    where it was the nominal cell's.
+    attempts: a round that ended with "no_plan" or "planner_error" has this reason at its end.
+    controller: how the arm reached the grasps.
+    randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
     """
 
     policy: str
@@ -104,8 +113,14 @@ class RoundRecord:
         if not 0 <= self.objects_cleared <= self.objects_total:
             raise ValueError(f"cleared {self.objects_cleared} of {self.objects_total} objects")
         last = self.attempts[-1].reason if self.attempts else None
-        if (self.ended == NO_PLAN) != (last == NO_PLAN):
-            raise ValueError(f"a round that ended with {self.ended!r} has {last!r} at its end")
+        for reason in (NO_PLAN, PLANNER_ERROR):
+            if (self.ended == reason) != (last == reason):
+                raise ValueError(f"a round that ended with {self.ended!r} has {last!r} at its end")
+
+    @property
+    def planner(self) -> str:
+        """The policy's name without its controller."""
+        return self.policy.removesuffix(policy_name("", self.controller))
 
     @property
     def executed(self) -> int:
@@ -116,23 +131,27 @@ class RoundRecord:
         return sum(attempt.success for attempt in self.attempts)
 
 
-# --- The journal: one round a line, so that an interrupted evaluation can go on ----------------
+# --- The journal: one round a line, so that an interrupted evaluation can be resumed -----------
 
 
 def append_round(path: Path, record: RoundRecord) -> None:
     """Add a finished round to the journal."""
+    with path.open("a", encoding="utf-8") as journal:
+        journal.write(_line(record))
+
+
+def _line(record: RoundRecord) -> str:
     content = asdict(record)
     for attempt in content["attempts"]:
         if attempt["grasp"] is not None:
             attempt["grasp"]["pixel"] = [float(x) for x in attempt["grasp"]["pixel"]]
-    with path.open("a", encoding="utf-8") as journal:
-        journal.write(json.dumps(content, allow_nan=False) + "\n")
+    return json.dumps(content, allow_nan=False) + "\n"
 
 
 def read_rounds(path: Path) -> list[RoundRecord]:
     """The rounds of a journal; an empty list where there is none yet.
 
-    A last line cut short by a crash is taken off the file; any other line that is not a round
+    A last line that a crash cut short is removed from the file; any other line that is no round
     raises UserError.
     """
     if not path.exists():
@@ -141,9 +160,12 @@ def read_rounds(path: Path) -> list[RoundRecord]:
     whole = text[: text.rfind("\n") + 1]
     if whole != text:
         write_atomic(path, whole)
-    lines = whole.split("\n")
+    return _parse(path, whole.split("\n")[:-1])
+
+
+def _parse(path: Path, lines: Sequence[str], first_line: int = 1) -> list[RoundRecord]:
     rounds = []
-    for number, line in enumerate(lines[:-1], start=1):  # what follows the last newline is cut
+    for number, line in enumerate(lines, start=first_line):
         try:
             content = json.loads(line)
             attempts = tuple(
@@ -157,3 +179,72 @@ def read_rounds(path: Path) -> list[RoundRecord]:
                 "a new run without --resume"
             ) from error
     return rounds
+
+
+# --- Samples: the first rounds of a run, to be checked by others --------------------------------
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The first rounds of a run, and what is needed to play them again.
+
+    overrides: dotted keys that make the run's config out of the defaults. commit: of the run.
+    versions: of Python and the packages.
+    """
+
+    commit: str | None
+    versions: dict[str, str | None]
+    overrides: list[str]
+    rounds: list[RoundRecord]
+
+
+def write_sample(run: Path, path: Path, count: int = 10) -> None:
+    """Write the first `count` rounds of each policy, scenario and object set of a run folder to a
+    file of JSON lines, the first of which holds config, commit and versions."""
+    facts = json.loads((run / "environment.json").read_text(encoding="utf-8"))
+    origin = {
+        "commit": facts["commit"],
+        "versions": {"python": facts["python"], **facts["packages"]},
+        "overrides": changed_keys(load_config(run / "config.yaml")),
+    }
+    rows: dict[tuple[str, str, str], list[RoundRecord]] = {}
+    for record in sorted(read_rounds(run / "rounds.jsonl"), key=lambda record: record.seed):
+        rows.setdefault((record.policy, record.scenario, record.objects), []).append(record)
+    lines = [_line(record) for row in rows.values() for record in row[:count]]
+    write_atomic(path, json.dumps(origin) + "\n" + "".join(lines))
+
+
+def read_sample(path: Path) -> Sample:
+    """Read a file of `write_sample`. Raises UserError for a file that is none."""
+    try:
+        first, *lines = path.read_text(encoding="utf-8").splitlines()
+        origin = Sample(**json.loads(first), rounds=[])
+    except OSError as error:
+        raise UserError(f"{path}: cannot read this sample: {error.strerror}") from error
+    except (ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a sample of rounds ({error}); choose a file of docs/results"
+        ) from error
+    return replace(origin, rounds=_parse(path, lines, first_line=2))
+
+
+def without_times(record: RoundRecord) -> RoundRecord:
+    """The record without its wall-clock times, in which alone two equal rounds differ."""
+    attempts = tuple(
+        replace(attempt, plan_seconds=0.0, turn_ms=None, turn_ms_mean=None)
+        for attempt in record.attempts
+    )
+    return replace(record, attempts=attempts)
+
+
+def differing_rounds(
+    before: Sequence[RoundRecord], after: Sequence[RoundRecord]
+) -> list[RoundRecord]:
+    """The rounds of `before` that `after` does not hold, or holds with another outcome; wall-clock
+    times do not count."""
+
+    def key(record: RoundRecord) -> str:
+        return _line(without_times(record))
+
+    held = {key(record) for record in after}
+    return [record for record in before if key(record) not in held]

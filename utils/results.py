@@ -1,193 +1,39 @@
-"""What an evaluation is asked for: who plays which scenes, in which order, and what is left to do.
+"""The figures of an evaluation, counted from its records.
 
-A policy here is a planner's name and a controller's. This module knows neither cells nor planners.
-
-Why attempts were stopped: the cell's sentences on it, those alike counted together.
-
-Reads `utils.result_records`; what stops the arm is for `envs.robot_safety` and the loops to say.
-
-The figures of an evaluation, drawn from its records, and the files and tables that tell them.
-
-This module only counts (`utils.result_records` has what is counted). Success rate and cleared rate
-are VGN's (Breyer et al., CoRL 2020): successes / executed grasps, and objects removed / objects
-placed, both over all rounds.
+Success rate and cleared rate are VGN's (Breyer et al., CoRL 2020): successes / executed grasps, and
+objects removed / objects placed, both over all rounds. Policies and runs are compared on the scenes
+that both have played. `utils.result_records` has the records, `utils.result_formats` shows figures.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from typing import Any
 
-from utils.config import Config, load_config
+import yaml
+
 from utils.errors import UserError
-from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, contestant
-from utils.runs import save_results, write_atomic
+from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, read_rounds
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
 
-# Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
-FREE_TO_CHANGE = tuple(
-    f"evaluate.{key}" for key in ("rounds", "workers", "name", "videos", "gallery", "film_format")
-)
-
-
-@dataclass(frozen=True)
-class Task:
-    """One scene, on which every policy that is still to be scored works in turn."""
-
-    objects: str
-    scenario: str
-    seed: int
-    policies: tuple[tuple[str, str], ...]
-    keep_pictures: bool
-    film_folder: Path | None
-
-
-def contestants(config: Config) -> list[tuple[str, str]]:
-    """Every planner with every controller."""
-    controllers = config.evaluate.controllers or (config.closed_loop.controller,)
-    return [
-        (planner, controller) for planner in config.evaluate.policies for controller in controllers
-    ]
-
-
-def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
-    """What is left to do; every policy gets the same seeds."""
-    plan = config.evaluate
-    known = {(r.policy, r.scenario, r.objects, r.seed) for r in done}
-    for number in range(plan.rounds):
-        seed = config.seed * 100_000 + number
-        for objects in plan.object_sets:
-            for scenario in plan.scenarios:
-                policies = tuple(
-                    pair
-                    for pair in contestants(config)
-                    if (contestant(*pair), scenario, objects, seed) not in known
-                )
-                if policies:
-                    filmed = number < plan.videos and scenario == plan.scenarios[-1]
-                    film = run / "films" if filmed else None
-                    yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
-
-
-def in_order(rounds: Sequence[RoundRecord], config: Config) -> list[RoundRecord]:
-    """The rounds as the plan names them, whichever was finished first."""
-    plan = config.evaluate
-    policies = [contestant(*pair) for pair in contestants(config)]
-
-    def place(record: RoundRecord) -> tuple[int, ...]:
-        known = record.policy in policies  # a resumed report may have lost the weights of one
-        return (
-            plan.object_sets.index(record.objects),
-            plan.scenarios.index(record.scenario),
-            policies.index(record.policy) if known else len(policies),
-            record.seed,
-        )
-
-    return sorted(rounds, key=place)
-
-
-def planned_rounds(config: Config) -> int:
-    """How many rounds the whole evaluation has."""
-    plan = config.evaluate
-    return plan.rounds * len(contestants(config)) * len(plan.scenarios) * len(plan.object_sets)
-
-
-def interruption(rounds_done: int, config: Config) -> str | None:
-    """'interrupted: N of M rounds', or None for a complete evaluation."""
-    planned = planned_rounds(config)
-    return f"interrupted: {rounds_done} of {planned} rounds" if rounds_done < planned else None
-
-
-def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
-    """Raise UserError for a closed_loop.controller that evaluate.controllers would leave unheard."""
-    several, one = config.evaluate.controllers, config.closed_loop.controller
-    asked = any(change.split("=")[0].strip() == "closed_loop.controller" for change in overrides)
-    if several is not None and (asked or one != OPEN_LOOP):
-        raise UserError(
-            f"closed_loop.controller={one} would be ignored: evaluate.controllers is "
-            f"[{', '.join(several)}] and says which controllers are scored; write "
-            f"evaluate.controllers={one} or, to have closed_loop.controller count, "
-            "evaluate.controllers=null"
-        )
-
-
-def check_rounds(config: Config, run: Path | None) -> None:
-    """Raise UserError if a resumed evaluation asks for fewer rounds than it began with."""
-    before = config if run is None else load_config(run / "config.yaml")
-    if config.evaluate.rounds < before.evaluate.rounds:
-        raise UserError(
-            f"--resume {run}: evaluate.rounds is {config.evaluate.rounds}, the run began with "
-            f"{before.evaluate.rounds}; it can only grow"
-        )
-
-
-_NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
-
-
-@dataclass(frozen=True)
-class StopReason:
-    """count: attempts that one policy ended so on a scenario and object set. reason: a key of
-    `utils.result_records.FAILURES`. sentence: the first attempt's; the others differ in their
-    numbers only. seed: of that attempt's scene. held: the object in the hand then, if any."""
-
-    policy: str
-    scenario: str
-    objects: str
-    reason: str
-    count: int
-    sentence: str
-    seed: int
-    held: str | None = None
-
-    @property
-    def place(self) -> str:
-        """Where the first one was: 'scene 7' or 'scene 7, mug_0012 in the hand'."""
-        return f"scene {self.seed}" + (f", {self.held} in the hand" if self.held else "")
-
-
-def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
-    """Every failure on which there is a sentence, in the order of the rounds, the most frequent
-    kinds of a cell first."""
-    kinds: dict[tuple[str, str, str], dict[tuple[str, str], list[tuple[str, int, str | None]]]] = {}
-    for record in rounds:
-        cell = kinds.setdefault((record.policy, record.scenario, record.objects), {})
-        for attempt in record.attempts:
-            if attempt.detail and not attempt.success:
-                kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
-                cell.setdefault(kind, []).append((attempt.detail, record.seed, attempt.held))
-    return [
-        StopReason(*where, reason, len(told), *told[0])
-        for where, cell in kinds.items()
-        for (reason, _), told in sorted(cell.items(), key=lambda item: -len(item[1]))
-    ]
-
-
-def print_stop_reasons(stops: Iterable[StopReason]) -> None:
-    """One line each on stdout; nothing if there are none."""
-    lines = [
-        f"{stop.count:4d} x {stop.policy}, {stop.scenario}, {stop.objects}: {stop.sentence} "
-        f"({stop.place})"
-        for stop in stops
-    ]
-    if lines:
-        print("\n".join(["\nwhat stopped the arm", *lines]))
+CLUTTER = ("packed", "pile")  # scenarios that are also compared together
 
 
 @dataclass(frozen=True)
 class Row:
-    """The figures of one policy on one scenario and object set. None: undefined.
+    """The figures of one policy on one scenario and object set; None where one is undefined.
 
-    attempts: executed grasps. Intervals: Wilson, 95 %, each attempt (object) taken as independent.
-    plan_ms_median: over every call of the planner, those that found nothing included.
+    attempts: executed grasps. The 95 % intervals are Wilson's and take attempts (objects) as
+        independent.
+    plan_ms_median: over all calls of the planner, also those that found nothing.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
-    turn_ms_mean, turn_ms_p95: mean and 95th percentile of a closed loop's turns, the median of all
-    attempts.
+    turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
+        which the median over the attempts.
     """
 
     policy: str
@@ -253,9 +99,58 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
     )
 
 
+# --- Why attempts failed ------------------------------------------------------------------------
+
+_NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
+
+
+@dataclass(frozen=True)
+class StopReason:
+    """Failures of one policy on a scenario and object set for the same reason.
+
+    count: of attempts. reason: a key of `utils.result_records.FAILURES`. sentence: of the first
+    attempt; those of the others differ in their numbers only. seed: of the first attempt's scene.
+    held: the object that was in the hand at the first, if any.
+    """
+
+    policy: str
+    scenario: str
+    objects: str
+    reason: str
+    count: int
+    sentence: str
+    seed: int
+    held: str | None = None
+
+    @property
+    def place(self) -> str:
+        """The first attempt's scene: 'scene 7' or 'scene 7, mug_0012 in the hand'."""
+        return f"scene {self.seed}" + (f", {self.held} in the hand" if self.held else "")
+
+
+def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
+    """The failures that have a sentence, in the order of the rounds; the most frequent first within
+    one policy, scenario and object set."""
+    kinds: dict[tuple[str, str, str], dict[tuple[str, str], list[tuple[str, int, str | None]]]] = {}
+    for record in rounds:
+        cell = kinds.setdefault((record.policy, record.scenario, record.objects), {})
+        for attempt in record.attempts:
+            if attempt.detail and not attempt.success:
+                kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
+                cell.setdefault(kind, []).append((attempt.detail, record.seed, attempt.held))
+    return [
+        StopReason(*where, reason, len(found), *found[0])
+        for where, cell in kinds.items()
+        for (reason, _), found in sorted(cell.items(), key=lambda item: -len(item[1]))
+    ]
+
+
+# --- Comparisons --------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Comparison:
-    """Two policies on the rounds that both have worked on; a difference is first - second."""
+    """Two policies on the rounds that both have played; a difference is first - second."""
 
     first: str
     second: str
@@ -265,12 +160,15 @@ class Comparison:
     cleared: Difference | None
 
 
-CLUTTER = ("packed", "pile")
+def compare(
+    rounds: Iterable[RoundRecord], seed: int, pairs: Collection[tuple[str, str]] | None = None
+) -> list[Comparison]:
+    """Paired differences of policies on each scenario and object set that they share, and at last
+    on all their rounds in clutter together, where these are of several kinds.
 
-
-def compare(rounds: Iterable[RoundRecord], seed: int) -> list[Comparison]:
-    """Every pair of policies, the later one first, on each scenario and object set they share, and
-    at last on all their rounds in clutter together, where these are of several kinds."""
+    seed: of the bootstrap. pairs: the policies to compare, (first, second); None: every pair, the
+    later one first.
+    """
     cells: dict[tuple[str, str], dict[str, dict[tuple, RoundRecord]]] = {}
     clutter: dict[str, dict[tuple, RoundRecord]] = {}
     for record in rounds:
@@ -283,17 +181,31 @@ def compare(rounds: Iterable[RoundRecord], seed: int) -> list[Comparison]:
     if len(kinds) > 1:
         scenarios, sets = (list(dict.fromkeys(names)) for names in zip(*kinds))
         cells[" + ".join(scenarios), " + ".join(sets)] = clutter
-    comparisons = []
-    for (scenario, objects), policies in cells.items():
-        names = list(policies)
-        for i, second in enumerate(names):
-            for first in names[i + 1 :]:
-                shared = [s for s in policies[first] if s in policies[second]]
-                a, b = ([policies[name][s] for s in shared] for name in (first, second))
-                success = _difference(a, b, "successes", "executed", seed)
-                cleared = _difference(a, b, "objects_cleared", "objects_total", seed)
-                comparisons.append(Comparison(first, second, scenario, objects, success, cleared))
-    return comparisons
+    return [
+        _compared(first, second, scenario, objects, policies, seed)
+        for (scenario, objects), policies in cells.items()
+        for first, second in (_every_pair(list(policies)) if pairs is None else pairs)
+        if first in policies and second in policies
+    ]
+
+
+def _every_pair(names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(first, second) for i, second in enumerate(names) for first in names[i + 1 :]]
+
+
+def _compared(
+    first: str,
+    second: str,
+    scenario: str,
+    objects: str,
+    rounds: dict[str, dict[tuple, RoundRecord]],
+    seed: int,
+) -> Comparison:
+    shared = [scene for scene in rounds[first] if scene in rounds[second]]
+    a, b = ([rounds[name][scene] for scene in shared] for name in (first, second))
+    success = _difference(a, b, "successes", "executed", seed)
+    cleared = _difference(a, b, "objects_cleared", "objects_total", seed)
+    return Comparison(first, second, scenario, objects, success, cleared)
 
 
 def _difference(
@@ -303,121 +215,55 @@ def _difference(
     return paired_difference_interval(*counts, seed=seed)
 
 
-# --- Writing --------------------------------------------------------------------------------
+# --- Two runs -----------------------------------------------------------------------------------
+
+SCENE_SECTIONS = ("scene", "objects", "workspace")  # of the config: what a scene is made from
 
 
-def write_results(
-    path: Path, rows: Sequence[Row], config: Config, device: str, complete: bool
-) -> None:
-    """Write results.json of an evaluation, see `utils.runs.save_results`."""
-    content = {
-        "complete": complete,
-        "config": config.model_dump(mode="json"),
-        "device": device,
-        "rows": [asdict(row) for row in rows],
-    }
-    save_results(path, content)
+def compare_runs(first: Path, second: Path) -> list[Comparison]:
+    """Paired differences between two run folders of evaluate.py on their common scenes, first run -
+    second run: of the policies that both have played, else of every policy of the first and every
+    one of the second.
+
+    Raises UserError where a folder holds no evaluation, and where the scenes do not match.
+    """
+    runs = [(folder, *_read_run(folder)) for folder in (first, second)]
+    (_, config, before), (_, other, after) = runs
+    for section in SCENE_SECTIONS:
+        a, b = config.get(section, {}), other.get(section, {})
+        if any(a[key] != b[key] for key in a.keys() & b.keys()):  # versions may differ in keys
+            raise UserError(
+                f"--compare {first} {second}: their scenes do not match, because the section "
+                f"{section} of their configs differs; compare runs of the same scenes"
+            )
+    if not _scenes(before) & _scenes(after):
+        raise UserError(
+            f"--compare {first} {second}: they have no scene in common; compare runs with the same "
+            "seed, evaluate.scenarios and evaluate.object_sets"
+        )
+    names = [list(dict.fromkeys(record.policy for record in rounds)) for *_, rounds in runs]
+    common = [name for name in names[0] if name in names[1]]
+    pairs = [(name, name) for name in common] or [(a, b) for a in names[0] for b in names[1]]
+    labels = ["A", "B"] if first.name == second.name else [first.name, second.name]
+    renamed = [
+        replace(record, policy=f"{record.policy} ({label})")
+        for label, (*_, rounds) in zip(labels, runs)
+        for record in rounds
+    ]
+    labelled = [(f"{a} ({labels[0]})", f"{b} ({labels[1]})") for a, b in pairs]
+    return compare(renamed, config["seed"], labelled)
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """A spreadsheet of the rows: intervals as two columns, failures as one column a reason."""
-    flat = [_flat(row) for row in rows]
-    text = io.StringIO(newline="")
-    if flat:
-        writer = csv.DictWriter(text, flat[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(flat)
-    write_atomic(path, text.getvalue())
+def _read_run(folder: Path) -> tuple[dict[str, Any], list[RoundRecord]]:
+    """The config as plain data, so that those of older versions can be read, and the rounds."""
+    config, journal = folder / "config.yaml", folder / "rounds.jsonl"
+    if not (config.is_file() and journal.is_file()):
+        raise UserError(
+            f"--compare {folder}: not the folder of an evaluation; choose one with config.yaml and "
+            "rounds.jsonl, such as runs/evaluate/20250131-120000"
+        )
+    return yaml.safe_load(config.read_text(encoding="utf-8")), read_rounds(journal)
 
 
-def _flat(row: Row) -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for name, value in asdict(row).items():
-        if name.endswith("_ci95"):
-            flat[f"{name}_low"], flat[f"{name}_high"] = value
-        elif name == "failures":
-            flat |= {f"failures_{reason}": count for reason, count in value.items()}
-        else:
-            flat[name] = value
-    return flat
-
-
-def print_table(rows: Sequence[Row]) -> None:
-    """The rows as aligned text on stdout."""
-    print(format_table(rows))
-
-
-def format_table(rows: Sequence[Row]) -> str:
-    """The rows as aligned plain text."""
-    header = ["policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed"]
-    lines = [list(_cells(row)) for row in rows]
-    if any(row.turn_ms_p95 is not None for row in rows):  # of a closed loop
-        for line, cell in zip([header, *lines], ["turn ms, 95 %", *map(turn_ms_in_words, rows)]):
-            line.insert(-1, cell)
-    return aligned(header, lines, to_the_right=(5, 6))
-
-
-def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """Paired differences in points as aligned text on stdout; nothing if there are none."""
-    if comparisons:
-        header = ("paired difference", "scenario", "objects", "success", "cleared", "rounds")
-        print("\n" + aligned(header, [_difference_cells(pair) for pair in comparisons]))
-
-
-def _difference_cells(pair: Comparison) -> tuple[str, ...]:
-    def points(difference: Difference | None) -> str:
-        if difference is None:
-            return "-"
-        value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
-        return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
-
-    names = (f"{pair.first} - {pair.second}", pair.scenario, pair.objects)
-    rounds = "-" if pair.success is None else str(pair.success.rounds)
-    return (*names, points(pair.success), points(pair.cleared), rounds)
-
-
-def aligned(
-    header: Sequence[str], lines: Sequence[Sequence[str]], to_the_right: Sequence[int] = ()
-) -> str:
-    """Lines of cells under a header, as text in columns of even width."""
-    lines = [header, *lines]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    lines.insert(1, ["-" * width for width in widths])
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if i in to_the_right else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    def share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
-        if rate is None:
-            return "-"
-        low, high = interval
-        return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
-
-    return (
-        row.policy,
-        row.scenario,
-        row.objects,
-        share(row.success_rate, row.success_ci95, row.successes, row.attempts),
-        share(row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total),
-        "-" if row.plan_ms_median is None else f"{row.plan_ms_median:.1f}",
-        "-" if row.picks_per_hour is None else f"{row.picks_per_hour:.0f}",
-        failures_in_words(row),
-    )
-
-
-def failures_in_words(row: Row) -> str:
-    """'3 missed, 1 slipped', most frequent first; 'none' without a failure."""
-    counts = sorted(row.failures.items(), key=lambda item: -item[1])
-    return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"
-
-
-def turn_ms_in_words(row: Row) -> str:
-    """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' of an open loop."""
-    known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
-    return ", ".join(f"{ms:.1f}" for ms in known) or "-"
+def _scenes(rounds: Iterable[RoundRecord]) -> set[tuple[str, str, int]]:
+    return {(record.scenario, record.objects, record.seed) for record in rounds}

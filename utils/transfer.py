@@ -1,7 +1,7 @@
-"""The transfer report: what each policy is worth in worlds that it was not made in.
+"""The transfer report: how well each policy does where it was not trained.
 
-One table of success rates, policies by worlds, and how well one world foretells another's. This
-module counts and draws; it runs nothing.
+One table of success rates, rows of policies by columns such as another simulator, and how well one
+column predicts another. This module counts and draws; `envs.transfer_scenes` names what is played.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from utils.config_schema import TransferPolicy
+from utils.result_formats import aligned
 from utils.result_records import RoundRecord
-from utils.results import aligned
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
 
 TITLES = {
@@ -28,13 +28,12 @@ TITLES = {
     "cornell_as_taken": "Cornell as taken",
 }
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
-_SHAPES = "osD^v"
-PAIRS = (("mujoco", "pybullet"), ("outside", "pybullet"))  # (taken for real, simulation of it)
+PAIRS = (("mujoco", "pybullet"), ("outside", "pybullet"))  # (stands for reality, its simulation)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Successes of so many trials: executed grasps, or photographs."""
+    """Successes in a number of trials, which are executed grasps or photographs."""
 
     successes: int
     trials: int
@@ -50,10 +49,12 @@ class Score:
 
 @dataclass(frozen=True)
 class TransferLine:
-    """One policy: its score by world. A world that is not there was not scored. scenes: what it was
-    scored on. trained: whether the planner's file exists."""
+    """One row with its scores by column; a column without a score was not played.
 
-    who: TransferPolicy
+    row: of the config. scenes: what it was scored on. trained: whether the planner's file exists.
+    """
+
+    row: TransferPolicy
     scenes: str
     scores: Mapping[str, Score]
     trained: bool = True
@@ -61,8 +62,8 @@ class TransferLine:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well the rates of N policies in `simulation` foretell those in `real`, on the same
-    scenes: Pearson's r, and the mean maximum rank violation (`utils.statistics`)."""
+    """How well the rates of policies in the column `simulation` predict those in the column `real`
+    on the same scenes: Pearson's r, and the mean maximum rank violation (`utils.statistics`)."""
 
     scenes: str
     real: str
@@ -79,8 +80,8 @@ def score_of(rounds: Sequence[RoundRecord], planner: str) -> Score:
 
 
 def agreements(lines: Sequence[TransferLine]) -> list[Agreement]:
-    """For each kind of scenes and each pair of worlds, over the policies that were scored in both;
-    one policy alone has no order."""
+    """The agreement of each pair of columns on each kind of scenes, over the policies that were
+    scored in both; a single policy has no order and gives none."""
     found = []
     for scenes in dict.fromkeys(line.scenes for line in lines):
         for real, simulation in PAIRS:
@@ -88,7 +89,7 @@ def agreements(lines: Sequence[TransferLine]) -> list[Agreement]:
                 (line.scores[real].rate, line.scores[simulation].rate)
                 for line in lines
                 if line.scenes == scenes
-                and all(w in line.scores and line.scores[w].trials for w in (real, simulation))
+                and all(_scored(line, column) for column in (real, simulation))
             ]
             if len(rates) < 2:
                 continue
@@ -98,16 +99,20 @@ def agreements(lines: Sequence[TransferLine]) -> list[Agreement]:
     return found
 
 
-def format_transfer(lines: Sequence[TransferLine], worlds: Sequence[str]) -> str:
+def _scored(line: TransferLine, column: str) -> bool:
+    return column in line.scores and line.scores[column].trials > 0
+
+
+def format_transfer(lines: Sequence[TransferLine], columns: Sequence[str]) -> str:
     """The table as aligned text."""
-    header = ("policy", "randomised in training", "scenes", *(TITLES[world] for world in worlds))
+    header = ("policy", "randomised in training", "scenes", *(TITLES[column] for column in columns))
     table = []
     for line in lines:
-        cells = [line.who.policy, line.who.training, line.scenes]
+        cells = [line.row.policy, line.row.training, line.scenes]
         if line.trained:
-            cells += [_cell(line.scores.get(world)) for world in worlds]
+            cells += [_cell(line.scores.get(column)) for column in columns]
         else:
-            cells += ["not trained", *([""] * (len(worlds) - 1))]
+            cells += ["not trained", *([""] * (len(columns) - 1))]
         table.append(cells)
     return aligned(header, table)
 
@@ -119,21 +124,21 @@ def _cell(score: Score | None) -> str:
     return f"{100 * score.rate:3.0f} % [{low:.0f}, {high:.0f}] {score.successes}/{score.trials}"
 
 
-def transfer_notes(lines: Sequence[TransferLine], worlds: Sequence[str]) -> list[str]:
-    """How the worlds agree, and how to get what is missing."""
+def transfer_notes(lines: Sequence[TransferLine], columns: Sequence[str]) -> list[str]:
+    """Sentences on how the columns agree, and on how to get the scores that are missing."""
     notes = []
     for one in agreements(lines):
         r = "undefined" if one.pearson_r is None else f"{one.pearson_r:.3f}"
         notes.append(
-            f"{one.scenes}: {TITLES[one.simulation]} foretells {TITLES[one.real]}: Pearson r {r}, "
+            f"{one.scenes}: {TITLES[one.simulation]} predicts {TITLES[one.real]}: Pearson r {r}, "
             f"mean maximum rank violation {one.mmrv:.3f}, {one.policies} policies"
         )
-    if "cornell" in worlds and not any("cornell" in line.scores for line in lines):
+    if "cornell" in columns and not any("cornell" in line.scores for line in lines):
         notes.append("no photographs were scored: add transfer.cornell=path/to/cornell")
     for line in lines:
         if not line.trained:
-            how = line.who.train_with or f"put its weights at {line.who.planner}"
-            notes.append(f"not trained: {line.who.policy}, {line.who.training}: {how}")
+            how = line.row.train_with or f"put its weights at {line.row.planner}"
+            notes.append(f"not trained: {line.row.policy}, {line.row.training}: {how}")
     return notes
 
 
@@ -142,10 +147,10 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
     return {
         "rows": [
             {
-                "policy": line.who.policy,
-                "training": line.who.training,
+                "policy": line.row.policy,
+                "training": line.row.training,
                 "scenes": line.scenes,
-                "planner": line.who.planner,
+                "planner": line.row.planner,
                 "trained": line.trained,
                 "worlds": {
                     world: {
@@ -173,81 +178,86 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
     }
 
 
-def draw_transfer(lines: Sequence[TransferLine], worlds: Sequence[str]) -> bytes:
-    """A PNG file's bytes: the rates with their intervals, and one world against the other."""
+def draw_transfer(lines: Sequence[TransferLine], columns: Sequence[str]) -> bytes:
+    """The bytes of a PNG file: one small panel for each column with the rows' rates and 95 %
+    intervals, and below them one panel for each pair of columns that agree or do not."""
     shown = [line for line in lines if line.scores]
-    figure = Figure(figsize=(13.5, 1.6 + 0.62 * max(len(shown), 5)), layout="constrained")
-    bars, scatter = figure.subplots(1, 2, width_ratios=(1.6, 1))
-    _draw_bars(bars, shown, worlds)
-    _draw_agreement(scatter, shown)
+    rows = 0.27 * max(len(shown), 4)
+    figure = Figure(figsize=(3.4 + 2.1 * len(columns), rows + 5.0), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(rows + 1.0, 4.0))
+    panels = above.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    for panel, column in zip(panels, columns):
+        _draw_column(panel, shown, column)
+    panels[0].set_yticks(range(len(shown)), [_label(line) for line in shown], fontsize=8)
+    panels[0].set_ylim(len(shown) - 0.5, -0.5)  # the first row on top
+    for panel, pair in zip(below.subplots(1, len(PAIRS)), PAIRS):
+        _draw_agreement(panel, shown, *pair)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     return file.getvalue()
 
 
-def _draw_bars(axes: Axes, lines: Sequence[TransferLine], worlds: Sequence[str]) -> None:
-    height = 0.8 / len(worlds)
-    for number, world in enumerate(worlds):
-        scored = [(i, line.scores[world]) for i, line in enumerate(lines) if world in line.scores]
-        scored = [(i, score) for i, score in scored if score.trials]
-        if not scored:
-            continue
-        rates = [100 * score.rate for _, score in scored]
-        errors = [
-            [100 * (score.rate - score.ci95[0]) for _, score in scored],
-            [100 * (score.ci95[1] - score.rate) for _, score in scored],
-        ]
-        axes.barh(
-            [i + (number - (len(worlds) - 1) / 2) * height for i, _ in scored], rates,
-            0.9 * height, xerr=errors, label=TITLES[world], color=_colour(number),
-            error_kw={"elinewidth": 1.0, "capsize": 2},
-        )  # fmt: skip
-    several = len({line.scenes for line in lines}) > 1
-    names = ["\n".join(_parts(line, several)) for line in lines]
-    axes.set(yticks=range(len(lines)), yticklabels=names, xlim=(0, 105), xlabel="success, %")
-    axes.set_ylim(len(lines) - 0.5, -0.5)  # the first row on top
-    axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=len(worlds), frameon=False)
+def _draw_column(panel: Axes, lines: Sequence[TransferLine], column: str) -> None:
+    """The rates of the rows that were scored in a column, with a rule between kinds of scenes."""
+    colours = _colours(lines)
+    for place, line in enumerate(lines):
+        if place and line.scenes != lines[place - 1].scenes:
+            panel.axhline(place - 0.5, color="0.6", linewidth=0.8)
+        if _scored(line, column):
+            rate, span = _percent(line.scores[column])
+            panel.errorbar(
+                rate, place, xerr=span, fmt="o", color=colours[line.row.policy], markersize=4,
+                elinewidth=1.2, capsize=2,
+            )  # fmt: skip
+    panel.set_title(TITLES[column], fontsize=9)
+    panel.set(xlim=(-3, 103), xticks=(0, 50, 100))
+    panel.set_xlabel("success, %", fontsize=8)
+    panel.tick_params(labelsize=8, left=False)
+    panel.grid(axis="x", alpha=0.4)
+    panel.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _draw_agreement(axes: Axes, lines: Sequence[TransferLine]) -> None:
-    """A colour for each row, a shape for each kind of scenes."""
-    (real, simulation), *_ = PAIRS
-    axes.plot([0, 100], [0, 100], color="0.7", linewidth=1)
-    kinds = list(dict.fromkeys(line.scenes for line in lines))
-    told = False
-    for number, line in enumerate(lines):
-        scores = [line.scores.get(world) for world in (simulation, real)]
-        if not all(score is not None and score.trials for score in scores):
-            continue
-        x, y = (100 * score.rate for score in scores)
-        spans = [[[100 * (s.rate - s.ci95[0])], [100 * (s.ci95[1] - s.rate)]] for s in scores]
-        axes.errorbar(
-            x, y, xerr=spans[0], yerr=spans[1], color=matplotlib.colormaps["tab20"](number % 20),
-            fmt=_SHAPES[kinds.index(line.scenes) % len(_SHAPES)], capsize=2, alpha=0.7,
-            elinewidth=0.8, label=", ".join(_parts(line, len(kinds) > 1)),
-        )  # fmt: skip
-        told = True
+def _draw_agreement(panel: Axes, lines: Sequence[TransferLine], real: str, simulation: str) -> None:
+    """One column against another: a colour for each policy, filled on the first kind of scenes."""
+    colours, kinds = _colours(lines), list(dict.fromkeys(line.scenes for line in lines))
+    panel.plot([0, 100], [0, 100], color="0.7", linewidth=1)
+    for line in lines:
+        if _scored(line, real) and _scored(line, simulation):
+            x, x_span = _percent(line.scores[simulation])
+            y, y_span = _percent(line.scores[real])
+            colour = colours[line.row.policy]
+            panel.errorbar(
+                x, y, xerr=x_span, yerr=y_span, fmt="o" if line.scenes == kinds[0] else "s",
+                color=colour, mfc=colour if line.scenes == kinds[0] else "white", markersize=4,
+                elinewidth=0.7, alpha=0.8,
+            )  # fmt: skip
     titles = [
-        f"{one.scenes}: r = {one.pearson_r:.3f}, MMRV = {one.mmrv:.3f}"
+        f"{one.scenes}: r = {one.pearson_r:.2f}, MMRV = {one.mmrv:.3f}"
         for one in agreements(lines)
         if (one.real, one.simulation) == (real, simulation) and one.pearson_r is not None
     ]
-    axes.set_title("\n".join(titles), fontsize=10)
-    axes.set(
-        xlim=(0, 102), ylim=(0, 102), aspect="equal", xlabel=f"{TITLES[simulation]}, %",
-        ylabel=f"{TITLES[real]}, %",
-    )  # fmt: skip
-    axes.grid(alpha=0.3)
-    if told:
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.12), fontsize=8, frameon=False)
+    panel.set_title("\n".join(titles), fontsize=8)
+    panel.set(xlim=(0, 103), ylim=(0, 103), aspect="equal")
+    panel.set_xlabel(f"{TITLES[simulation]}, %", fontsize=8)
+    panel.set_ylabel(f"{TITLES[real]}, %", fontsize=8)
+    panel.tick_params(labelsize=8)
+    panel.grid(alpha=0.3)
 
 
-def _parts(line: TransferLine, with_scenes: bool) -> list[str]:
-    """What tells a row from the others."""
-    training = [line.who.training] if line.who.training != NOT_TRAINED else []
-    return [line.who.policy, *training, *([line.scenes] if with_scenes else [])]
+def _percent(score: Score) -> tuple[float, list[list[float]]]:
+    """The rate in percent, and how far its interval reaches to both sides."""
+    rate, (low, high) = 100 * score.rate, (100 * bound for bound in score.ci95)
+    return rate, [[rate - low], [high - rate]]
 
 
-def _colour(number: int) -> Any:
-    return matplotlib.colormaps["tab10"](number % 10)
+def _label(line: TransferLine) -> str:
+    """The policy, its training if there is one, and the scenes if they are the row's own."""
+    training = [line.row.training] if line.row.training != NOT_TRAINED else []
+    own = [line.scenes] if line.row.scenes is not None else []
+    return ", ".join([line.row.policy, *training, *own])
+
+
+def _colours(lines: Sequence[TransferLine]) -> dict[str, Any]:
+    """A colour for each policy."""
+    names = dict.fromkeys(line.row.policy for line in lines)
+    return {name: matplotlib.colormaps["tab10"](k % 10) for k, name in enumerate(names)}

@@ -16,7 +16,7 @@ from envs.env_actions import ActionDecoder
 from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
-from envs.policy_approach import PolicyApproach, nowhere_yet
+from envs.policy_approach import PolicyApproach, placeholder
 from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from envs.vector_env import make_env
@@ -103,7 +103,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
         approach, outcomes = PolicyApproach(cell, policy, policy.config), []
         for seed in range(3):
             cell.load(make_scene("isolated", objects, seed, config))
-            (grasp,) = nowhere_yet(cell.frame())
+            (grasp,) = placeholder(cell.frame())
             place = cell.object_position(0)
             outcomes.append(execute_grasp(cell, grasp, approach))
             assert np.linalg.norm(approach.closed_at.position - place) < 0.06
@@ -116,7 +116,7 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
     with PybulletCell(config) as cell:
         approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config)
         cell.load(make_scene("isolated", objects, 0, config))
-        outcome = execute_grasp(cell, nowhere_yet(cell.frame())[0], approach)
+        outcome = execute_grasp(cell, placeholder(cell.frame())[0], approach)
         assert (outcome.reason, approach.closed_at) == ("stopped", None)
         assert "gripped nothing" in outcome.detail
         assert np.abs(cell.robot.q - cell.home).max() < 0.02, "home again"
@@ -142,7 +142,7 @@ def driven(cell, actions, seed=0):
     approach = PolicyApproach(cell, lambda observation: next(left), trained)
     told = recorded(approach.env._actions)
     cell.load(make_scene("isolated", objects, seed, cell.config))
-    execute_grasp(cell, nowhere_yet(None)[0], approach)
+    execute_grasp(cell, placeholder(None)[0], approach)
     return np.array(told), cell.robot.q
 
 

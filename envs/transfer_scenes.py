@@ -1,0 +1,133 @@
+"""What the transfer report scores: its rows on their scenes in each simulated column, and the
+planners on photographs.
+
+`utils.transfer` makes the report of the scores, evaluate.py plays the evaluations.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from envs.policy_approach import check_learned, is_learned
+from models.photographs import judge_as_taken, judge_photographs
+from models.rectangle_examples import draw_rectangles
+from utils.config import Config, TransferPolicy, with_settings
+from utils.errors import UserError
+from utils.evaluation import policies_of
+from utils.real_data import RealSample
+from utils.result_records import OPEN_LOOP
+from utils.transfer import Score
+
+# The columns of the report that are not simulated.
+PHOTOGRAPHS = {"cornell": judge_photographs, "cornell_as_taken": judge_as_taken}
+
+
+class Scenes(NamedTuple):
+    """The scenarios and object sets on which a row of the report is scored."""
+
+    scenarios: tuple[str, ...]
+    objects: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{', '.join(self.scenarios)} of {', '.join(self.objects)}"
+
+    @property
+    def folder(self) -> str:
+        """A name for a folder; it holds the whole path of a folder of objects."""
+        return str(self).replace(", ", "-").replace(" ", "_").replace(os.sep, "_")
+
+
+@dataclass(frozen=True)
+class TransferEvaluation:
+    """The rows of the report that are scored on the same scenes in one column, and the config of
+    their evaluation."""
+
+    column: str
+    scenes: Scenes
+    rows: tuple[TransferPolicy, ...]
+    config: Config
+
+
+def evaluations_of(config: Config) -> list[TransferEvaluation]:
+    """The evaluations of the transfer report; rows that are not trained are left out."""
+    trained = [row for row in config.transfer.policies if is_trained(row)]
+    found = []
+    for scenes in dict.fromkeys(scenes_of(row, config) for row in trained):
+        rows = tuple(row for row in trained if scenes_of(row, config) == scenes)
+        plan = {"policies": list(dict.fromkeys(row.planner for row in rows))}
+        plan |= {"scenarios": list(scenes.scenarios), "object_sets": list(scenes.objects)}
+        here = with_settings(config, "evaluate", plan)
+        for column in config.transfer.columns:
+            if column not in PHOTOGRAPHS:
+                found.append(TransferEvaluation(column, scenes, rows, config_of(here, column)))
+    return found
+
+
+def config_of(config: Config, column: str) -> Config:
+    """The config of an evaluation in a column of the report: `pybullet`, `mujoco`, or `outside`,
+    which is PyBullet changed by the section `randomization`."""
+    config = with_settings(config, "evaluate", {"randomise": column == "outside"})
+    simulator = "mujoco" if column == "mujoco" else "pybullet"
+    return config.model_copy(update={"simulator": simulator})
+
+
+def scenes_of(row: TransferPolicy, config: Config) -> Scenes:
+    """A row's own scenes, or those of the section evaluate."""
+    if row.scenes is None:
+        return Scenes(config.evaluate.scenarios, config.evaluate.object_sets)
+    scenario, objects = row.scenes
+    return Scenes((scenario,), (objects,))
+
+
+def is_trained(row: TransferPolicy) -> bool:
+    """Whether a row can be scored: its planner needs no file, or the file exists."""
+    file = Path(row.planner.partition(":")[2] if is_learned(row.planner) else row.planner)
+    return file.suffix not in (".pt", ".zip") or file.exists()
+
+
+def check_open_loop(config: Config) -> None:
+    """Raise UserError where the report would have to compare closed loops."""
+    if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
+        raise UserError(
+            "transfer.policies: the report compares open loops; leave evaluate.controllers null "
+            "and closed_loop.controller open_loop"
+        )
+
+
+def check_rows(evaluation: TransferEvaluation) -> None:
+    """Raise UserError for a row that cannot be scored on its scenes."""
+    for row in evaluation.rows:
+        if is_learned(row.planner):
+            try:
+                scenarios = evaluation.scenes.scenarios
+                check_learned(row.planner, scenarios, [OPEN_LOOP], evaluation.config)
+            except UserError as error:
+                raise UserError(
+                    f"transfer.policies: the row {row.policy}, {row.training} is scored on "
+                    f"{evaluation.scenes}; give it scenes that it can play, such as [isolated, "
+                    f"box] ({error})"
+                ) from None
+
+
+def score_photographs(
+    row: TransferPolicy, samples: Sequence[RealSample], config: Config, pictures: Path
+) -> dict[str, Score]:
+    """The score of a row's planner in each column of photographs; the best rectangles are drawn in
+    the folder `pictures`. Empty for a row that has scenes of its own, because it is compared on
+    these alone, and for one that is not trained or plans no grasps."""
+    scores: dict[str, Score] = {}
+    if row.scenes is not None or not is_trained(row) or is_learned(row.planner):
+        return scores
+    for column in (column for column in config.transfer.columns if column in PHOTOGRAPHS):
+        judged = PHOTOGRAPHS[column](row.planner, samples, config.seed)
+        if judged is None:
+            continue
+        shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
+        scores[column] = Score(sum(one.correct for _, one in shown), len(samples))
+        if shown:
+            draw_rectangles(pictures / f"{Path(row.planner).stem}-{column}.png", *zip(*shown))
+    return scores

@@ -1,0 +1,96 @@
+"""Policies of Stable-Baselines3, which are trained on `gymnasium.make("RobotGrasping-v0", ...)`.
+
+The package is optional. Loading a policy unpickles parts of its file, as Stable-Baselines3 always
+does, so that only files from a trusted source should be loaded. This module knows no simulator.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from utils.errors import UserError
+
+
+class Sb3Policy:
+    """A deterministic policy: a callable from an observation, a dict of arrays, to an action (A,).
+
+    observation_space, action_space: those of its training; images may be stored as (C, H, W).
+    """
+
+    def __init__(self, path: Path, model: Any):
+        self.path, self.model = path, model
+        self.observation_space, self.action_space = model.observation_space, model.action_space
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        seen = {key: np.asarray(observation[key]) for key in self.observation_space.spaces}
+        action, _ = self.model.predict(seen, deterministic=True)
+        return action
+
+    def check_spaces(self, observations: spaces.Dict, actions: spaces.Box) -> None:
+        """Raise UserError unless the policy can act in an environment with these spaces."""
+        theirs = self.observation_space
+        if not isinstance(theirs, spaces.Dict):
+            raise UserError(
+                f"{self.path}: the policy observes {theirs}, expected a Dict of "
+                f"{_described(observations)}; train it with MultiInputPolicy on the environment "
+                "without a wrapper that changes its observations"
+            )
+        fits = all(
+            key in observations.spaces and _same_box(box, observations[key])
+            for key, box in theirs.spaces.items()
+        )
+        if not fits:
+            raise UserError(
+                f"{self.path}: the policy observes {_described(theirs)}, but the section env gives "
+                f"{_described(observations)}; set env.observations, env.resolution and env.camera "
+                "as in its training"
+            )
+        if self.action_space.shape != actions.shape:
+            raise UserError(
+                f"{self.path}: the policy has actions of shape {self.action_space.shape}, but "
+                f"env.control expects {actions.shape}; set env.control as in its training"
+            )
+
+
+def load_sb3(path: Path) -> Sb3Policy:
+    """Load the file that `model.save` of PPO, A2C, SAC, TD3, DDPG or DQN has written, on the CPU.
+
+    Raises UserError where Stable-Baselines3 is missing and where the file cannot be loaded.
+    """
+    try:
+        import stable_baselines3
+    except ImportError as error:
+        raise UserError(
+            f"sb3:{path}: Stable-Baselines3 is not installed; pip install stable-baselines3"
+        ) from error
+    # The file does not name its algorithm, but the module of its policy does.
+    algorithms = {"sac": "SAC", "td3": "TD3", "dqn": "DQN", "common": "PPO"}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
+        algorithm = getattr(stable_baselines3, algorithms[module.split(".")[1]])
+        return Sb3Policy(path, algorithm.load(path, device="cpu"))
+    except OSError as error:
+        raise UserError(f"sb3:{path}: cannot read this file: {error.strerror}") from error
+    except Exception as error:  # unpickling raises whatever the file's objects raise
+        raise UserError(
+            f"sb3:{path}: not a policy of Stable-Baselines3 ({type(error).__name__}: {error}); "
+            "give a file that model.save has written"
+        ) from error
+
+
+def _same_box(theirs: spaces.Box, ours: spaces.Box) -> bool:
+    """Whether two boxes have the same shape and type; Stable-Baselines3 turns (H, W, C) images to
+    (C, H, W)."""
+    shapes = {ours.shape, (ours.shape[-1], *ours.shape[:-1])}
+    return theirs.shape in shapes and theirs.dtype == ours.dtype
+
+
+def _described(space: spaces.Dict) -> str:
+    return ", ".join(f"{key} {box.shape} {box.dtype}" for key, box in space.spaces.items())

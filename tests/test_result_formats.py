@@ -1,0 +1,110 @@
+"""Files and tables that show the figures of an evaluation."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, stopped
+from utils.result_formats import (
+    format_comparisons,
+    format_stop_reasons,
+    format_table,
+    write_comparisons_csv,
+    write_comparisons_latex,
+    write_csv,
+    write_results,
+)
+from utils.results import compare, stop_reasons, summarise
+from utils.runs import git_state
+
+
+def test_results_json_is_strict_and_complete(tmp_path):
+    path = tmp_path / "results.json"
+    rows, pairs = summarise(ROUNDS, seed=0), compare(ROUNDS, seed=0)
+    write_results(path, rows, pairs, CONFIG, "CPU", complete=True)
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    assert (content["schema"], content["complete"]) == (1, True)
+    assert content["commit"] == git_state().commit
+    assert content["versions"]["numpy"] == np.__version__
+    assert content["device"] == "CPU" and content["config"]["evaluate"]["rounds"] == 2
+    fields = """policy scenario objects seed rounds attempts successes objects_total
+        objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
+        sim_seconds_per_pick picks_per_hour"""
+    loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
+    assert set(content["rows"][0]) == {*fields.split(), "failures"} | loops
+    assert content["rows"][1]["picks_per_hour"] is None
+    (pair,) = content["comparisons"]
+    assert (pair["first"], pair["second"]) == ("random", "heuristic")
+    assert pair["cleared"] == {"value": -0.3, "low": -0.4, "high": -0.2, "rounds": 2}
+    bad = replace(rows[0], plan_ms_median=math.nan)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):
+        write_results(path, [bad], [], CONFIG, "CPU", complete=True)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_csv(tmp_path):
+    write_csv(tmp_path / "rows.csv", summarise(ROUNDS, seed=0))
+    with (tmp_path / "rows.csv").open(encoding="utf-8", newline="") as file:
+        first, second = csv.DictReader(file)
+    assert first["policy"] == "heuristic" and float(first["success_ci95_low"]) < 0.19
+    assert first["failures_missed"] == "1" and second["picks_per_hour"] == ""
+    write_csv(tmp_path / "none.csv", [])
+    assert (tmp_path / "none.csv").read_text() == ""
+
+
+def test_table():
+    lines = format_table(summarise(ROUNDS, seed=0)).splitlines()
+    assert lines[0].split()[:3] == ["policy", "scenario", "objects"]
+    assert "50 % [19, 81] 3/6" in lines[2] and "30 % [11, 60] 3/10" in lines[2]
+    assert "40.0" in lines[2] and "360" in lines[2]
+    assert lines[2].endswith("1 no plan, 1 missed, 1 slipped, 1 dropped")
+    assert lines[3].endswith("1 no plan, 1 IK, 1 collision on approach")
+    assert format_table([]).startswith("policy")
+
+
+def test_a_closed_loop_s_turns_have_a_column():
+    table = format_table(summarise([*ROUNDS, *STOPS], 0)).splitlines()
+    assert "turn ms, 95 %" in table[0]
+    assert "8.0, 14.0" in table[-1] and "8.0" not in table[2]
+    assert "turn ms" not in format_table(summarise(ROUNDS, 0))
+
+
+def test_reasons_of_failures_are_lines_with_their_scene():
+    text = format_stop_reasons(stop_reasons([*ROUNDS, *STOPS]))
+    assert f"   2 x heuristic+ibvs, pile, box: {OLD.format(104)} (scene 7)" in text
+    carried = replace(stopped("stopped", "stopped: the workspace ends here"), held="mug_0012")
+    text = format_stop_reasons(stop_reasons([a_round("heuristic", 4, 1, 0, [carried])]))
+    assert "(scene 4, mug_0012 in the hand)" in text
+    assert format_stop_reasons([]) == ""
+
+
+def test_comparisons_as_text_csv_and_latex(tmp_path):
+    pairs = compare(ROUNDS, seed=0)
+    text = format_comparisons(pairs).splitlines()
+    assert text[2].startswith("random - heuristic  pile      box")
+    assert text[2].endswith("-30.0 [-40.0, -20.0]  2")
+    assert format_comparisons([]) == ""
+    write_comparisons_csv(tmp_path / "pairs.csv", pairs)
+    with (tmp_path / "pairs.csv").open(encoding="utf-8", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["first"] == "random" and float(row["cleared_low"]) == pytest.approx(-0.4)
+    assert (row["success_value"], row["success_rounds"]) == ("-0.5", "2")
+    undefined = compare([ROUNDS[1], ROUNDS[2]], seed=0)  # no scene in common
+    write_comparisons_csv(tmp_path / "none.csv", undefined)
+    assert (tmp_path / "none.csv").read_text().splitlines()[
+        1
+    ] == "random,heuristic,pile,box" + "," * 8
+    renamed = [replace(pairs[0], objects="random_urdfs")]
+    write_comparisons_latex(tmp_path / "pairs.tex", renamed)
+    lines = (tmp_path / "pairs.tex").read_text().splitlines()
+    assert lines[4].startswith(r"random $-$ heuristic & pile & random\_urdfs & -50.0 [")
+    assert lines[4].endswith(r"& -30.0 [-40.0, -20.0] & 2 \\") and lines[-1] == r"\end{tabular}"

@@ -1,0 +1,143 @@
+"""Figures of an evaluation against hand computation."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, attempt
+from utils.config import dump_config, load_config
+from utils.errors import UserError
+from utils.result_records import RoundRecord, append_round, policy_name
+from utils.results import compare, compare_runs, stop_reasons, summarise
+
+
+def test_summary_by_hand():
+    heuristic, random = summarise(ROUNDS, seed=7)
+    assert (heuristic.policy, heuristic.scenario) == ("heuristic", "pile")
+    assert (heuristic.seed, heuristic.rounds) == (7, 2)
+    assert (heuristic.attempts, heuristic.successes) == (6, 3)  # the no_plan is no attempt
+    assert (heuristic.objects_total, heuristic.objects_cleared) == (10, 3)
+    assert heuristic.success_rate == pytest.approx(0.5)
+    # z^2 = 3.841459: 0.5 -+ z sqrt(0.25 / 6 + z^2 / 144) / (1 + z^2 / 6) = 0.5 -+ 0.312384
+    assert heuristic.success_ci95 == pytest.approx((0.187616, 0.812384), abs=1e-5)
+    assert heuristic.cleared_rate == pytest.approx(0.3)
+    # (0.3 + z^2/20 -+ z sqrt(0.021 + z^2/400)) / (1 + z^2/10)
+    assert heuristic.cleared_ci95 == pytest.approx((0.107789, 0.603222), abs=1e-5)
+    assert heuristic.plan_ms_median == pytest.approx(40)  # of 10 20 30 40 50 60 100
+    assert heuristic.sim_seconds_per_pick == pytest.approx(30 / 3)
+    assert heuristic.picks_per_hour == pytest.approx(360)
+    assert heuristic.failures == {
+        "no_plan": 1, "planner_error": 0, "ik": 0, "lost": 0, "stopped": 0, "collision": 0,
+        "missed": 1, "slipped": 1, "dropped": 1, "physics": 0,
+    }  # fmt: skip
+    assert (random.attempts, random.successes, random.success_rate) == (2, 0, 0.0)
+    assert random.sim_seconds_per_pick is None and random.picks_per_hour is None
+    assert random.failures["no_plan"] == 1 and random.failures["ik"] == 1
+
+
+def test_rounds_without_an_attempt_still_count_as_not_cleared():
+    (row,) = summarise([ROUNDS[1], replace(ROUNDS[3], policy="heuristic")], seed=0)
+    assert row.cleared_rate == pytest.approx(1 / 10)
+
+
+def test_nothing_but_no_plan_is_undefined_not_zero():
+    (row,) = summarise([ROUNDS[3]], seed=0)
+    assert row.attempts == 0 and row.success_rate is None and row.success_ci95 == (0.0, 1.0)
+    assert summarise([], seed=0) == []
+
+
+def test_comparison_pairs_rounds_by_seed():
+    (pair,) = compare([ROUNDS[1], ROUNDS[0], *ROUNDS[2:]], seed=0)  # order must not matter
+    assert (pair.first, pair.second) == ("random", "heuristic")
+    assert pair.success.value == pytest.approx(0 / 2 - 3 / 6)
+    assert pair.cleared.value == pytest.approx(0 / 10 - 3 / 10)
+    # Resamples of cleared: -2/5 twice the first round, -1/5 twice the second, -3/10 both.
+    assert (pair.cleared.low, pair.cleared.high) == pytest.approx((-0.4, -0.2))
+    (partial,) = compare(ROUNDS[:3], seed=0)  # random has not come to seed 1
+    assert partial.cleared.rounds == 1
+    (none,) = compare([ROUNDS[1], ROUNDS[2]], seed=0)
+    assert none.success is None and none.cleared is None
+
+
+def test_comparison_adds_all_of_clutter():
+    packed = [replace(r, scenario="packed") for r in (ROUNDS[0], ROUNDS[2])]  # seed 0 of each
+    isolated = [replace(r, scenario="isolated") for r in ROUNDS]
+    *single, together = compare([*ROUNDS, *packed, *isolated], seed=0)
+    assert [pair.scenario for pair in single] == ["pile", "packed", "isolated"]
+    assert (together.scenario, together.objects) == ("pile + packed", "box")
+    assert together.cleared.rounds == 3  # both seeds of pile and one of packed
+    first, second = ROUNDS[0].objects_cleared, ROUNDS[1].objects_cleared
+    assert together.cleared.value == pytest.approx(0 / 15 - (2 * first + second) / 15)
+
+
+def test_a_closed_loop_is_a_policy_of_its_own():
+    assert policy_name("heuristic", "open_loop") == "heuristic"
+    assert policy_name("heuristic", "ibvs") == "heuristic+ibvs"
+    turns = [10.0, 30.0, 20.0]
+    attempts = tuple(replace(attempt("success"), turn_ms=ms) for ms in turns)
+    record = RoundRecord(
+        "heuristic+ibvs", "moved", "box", 0, 3, 3, attempts, "cleared", controller="ibvs"
+    )
+    (row,) = summarise([record], seed=0)
+    assert (row.policy, row.controller, row.turn_ms_p95) == ("heuristic+ibvs", "ibvs", 20.0)
+    assert summarise(ROUNDS, seed=0)[0].turn_ms_p95 is None
+
+
+def test_failures_of_one_kind_are_counted_together():
+    assert stop_reasons(ROUNDS) == []
+    stops = stop_reasons([*ROUNDS, *STOPS])
+    assert [(s.count, s.reason, s.sentence, s.seed) for s in stops] == [
+        (2, "stopped", OLD.format(104), 7),
+        (1, "collision", "stopped: contact with 12.0 N", 8),
+    ]
+
+
+# --- Two runs -----------------------------------------------------------------------------------
+
+
+def a_run(folder, rounds, config=CONFIG):
+    folder.mkdir()
+    (folder / "config.yaml").write_text(dump_config(config))
+    for record in rounds:
+        append_round(folder / "rounds.jsonl", record)
+    return folder
+
+
+def test_two_runs_are_compared_on_their_common_scenes(tmp_path):
+    """The second run clears 1 of 5 and 1 of 5 with 2 of 4 grasps, the first 2 of 5 and 1 of 5 with
+    3 of 6; a third scene of the second run alone does not count."""
+    after = [
+        a_round("heuristic", 0, 5, 1, [attempt("success"), attempt("missed"), attempt("missed")]),
+        a_round("heuristic", 1, 5, 1, [attempt("success"), attempt("no_plan")], "no_plan"),
+        a_round("heuristic", 2, 5, 0, [attempt("missed"), attempt("missed")]),
+    ]
+    runs = a_run(tmp_path / "before", ROUNDS), a_run(tmp_path / "after", after)
+    (pair,) = compare_runs(*runs)
+    assert (pair.first, pair.second) == ("heuristic (before)", "heuristic (after)")
+    assert (pair.scenario, pair.objects, pair.success.rounds) == ("pile", "box", 2)
+    assert pair.success.value == pytest.approx(3 / 6 - 2 / 4)
+    # Resamples: twice scene 0 (2/5 - 1/3), twice scene 1 (1/1 - 1/1), both (3/6 - 2/4).
+    assert (pair.success.low, pair.success.high) == pytest.approx((0.0, 2 / 5 - 1 / 3))
+    assert pair.cleared.value == pytest.approx(3 / 10 - 2 / 10)
+    assert (pair.cleared.low, pair.cleared.high) == pytest.approx((0.0, 1 / 5))
+    (back,) = compare_runs(*reversed(runs))
+    assert back.cleared.value == pytest.approx(-pair.cleared.value)
+
+
+def test_runs_of_different_policies_are_compared_in_every_pair(tmp_path):
+    other = [replace(record, policy="graspnet") for record in ROUNDS[:2]]
+    runs = a_run(tmp_path / "a", ROUNDS), a_run(tmp_path / "b", other)
+    names = [(pair.first, pair.second) for pair in compare_runs(*runs)]
+    assert names == [("heuristic (a)", "graspnet (b)"), ("random (a)", "graspnet (b)")]
+
+
+def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):
+    before = a_run(tmp_path / "before", ROUNDS)
+    crowded = load_config(None, ["scene.count=15"])
+    with pytest.raises(UserError, match="section scene of their configs differs"):
+        compare_runs(before, a_run(tmp_path / "crowded", ROUNDS, crowded))
+    later = [replace(record, seed=record.seed + 100_000) for record in ROUNDS]
+    with pytest.raises(UserError, match="no scene in common"):
+        compare_runs(before, a_run(tmp_path / "later", later))
+    with pytest.raises(UserError, match="not the folder of an evaluation"):
+        compare_runs(before, tmp_path)

@@ -1,0 +1,132 @@
+"""The rows of the transfer report, their scenes, and the command from end to end."""
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import evaluate
+from envs.transfer_scenes import Scenes, evaluations_of, score_photographs
+from utils.config import Config, TransferPolicy, load_config
+from utils.errors import UserError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+REPORT = REPOSITORY / "configs" / "sim_to_real.yaml"
+
+
+def test_the_shipped_report_is_a_config():
+    transfer = load_config(REPORT).transfer
+    small = [who for who in transfer.policies if who.policy == "GraspNet, 800 images"]
+    parts = ["none", "physics", "vision", "both", "both for longer", "both + adaptation"]
+    assert [who.training for who in small] == parts
+    for who in small:  # the commands are of one budget
+        assert config_of(who).data.frames == 800
+    learned = [who for who in transfer.policies if who.policy == "PPO"]
+    assert [who.training for who in learned] == ["none", "physics", "vision", "both"]
+    assert {
+        (config_of(who).rl.total_steps, config_of(who).rl.target_success) for who in learned
+    } == {(102400, 0.98)}
+    assert {who.scenes for who in learned} == {("isolated", "box")}
+    for who in learned:
+        varied = config_of(who).randomization.parts if "Randomized" in who.train_with else ()
+        assert ("physics" in varied) == (who.training in ("physics", "both"))
+        assert ("vision" in varied) == (who.training in ("vision", "both"))
+
+
+def test_the_commands_of_the_report_do_as_its_rows_say():
+    rows = [who for who in load_config(REPORT).transfer.policies if who.policy[:8] == "GraspNet"]
+    for who in rows:
+        config, both = config_of(who), who.training.startswith("both")
+        assert config.train.backbone == "tutorial_skip"
+        assert config.data.randomise_physics == (who.training == "physics" or both)
+        assert config.data.randomise == (who.training.startswith("vision") or both)
+        assert (config.train.depth_noise_share > 0) == config.data.randomise
+        assert (config.adaptation.target is not None) == ("adaptation" in who.training)
+
+
+def config_of(who: TransferPolicy) -> Config:
+    """That of the command which trains a row's policy; it leaves what the row's planner reads."""
+    python, script, *words = shlex.split(who.train_with)
+    assert (python, script) in {("python", "train_graspnet.py"), ("python", "train_rl.py")}
+    assert words[-2:] == ["--weights", who.planner.removeprefix("ppo:")]
+    file = REPOSITORY / words[1] if words[0] == "--config" else None
+    return load_config(file, [word for word in words[:-2] if "=" in word])
+
+
+def test_rows_on_the_same_scenes_are_one_evaluation():
+    """Whether the scenes are the row's own or not; folders of objects go by their whole path."""
+    rows = [
+        ["a", "-", "heuristic", None, None],
+        ["b", "-", "random", ["pile", "box"], None],
+        ["c", "-", "random", ["isolated", "box"], None],
+        ["d", "-", "random", None, "never trained: a.pt"],
+    ]
+    config = load_config(
+        None,
+        [f"transfer.policies={json.dumps(rows)}", "evaluate.scenarios=pile",
+         "evaluate.object_sets=box", "transfer.columns=[outside,mujoco,cornell]"],
+    )  # fmt: skip
+    played = evaluations_of(config)
+    told = [(one.column, str(one.scenes), [who.policy for who in one.rows]) for one in played]
+    assert told == [
+        ("outside", "pile of box", ["a", "b", "d"]), ("mujoco", "pile of box", ["a", "b", "d"]),
+        ("outside", "isolated of box", ["c"]), ("mujoco", "isolated of box", ["c"]),
+    ]  # fmt: skip
+    one, two = (Scenes(("isolated",), (name,)) for name in ("a/meshes", "b/meshes"))
+    assert one.folder == "isolated_of_a_meshes" != two.folder
+
+
+def test_a_row_that_cannot_play_its_scenes_is_named():
+    with pytest.raises(UserError, match="the row PPO, none is scored on pile of box; give it"):
+        evaluate.main(
+            ["transfer.policies=[[PPO, none, ppo, null, null]]", "evaluate.scenarios=pile",
+             "evaluate.object_sets=box", "transfer.columns=pybullet"]
+        )  # fmt: skip
+
+
+def test_rows_that_cannot_see_photographs_have_no_score_there(tmp_path):
+    config = load_config()
+    for planner, scenes in (("oracle", None), ("ppo", None), ("none.pt", None),
+                            ("heuristic", ("pile", "box"))):  # fmt: skip
+        row = TransferPolicy("a", "-", planner, scenes, None)
+        assert score_photographs(row, [], config, tmp_path) == {}
+
+
+def test_outside_is_outside():
+    """No range of physics meets that of training in more than a point."""
+    training, outside = (load_config(path).randomization for path in (None, REPORT))
+    for name in type(training.physics).model_fields:
+        inner, outer = getattr(training.physics, name), getattr(outside.physics, name)
+        assert outer.low >= inner.high or outer.high <= inner.low, name
+        assert outer.operation == inner.operation, name
+
+
+@pytest.mark.slow
+def test_the_command_from_end_to_end(tmp_path):
+    command = [
+        sys.executable, REPOSITORY / "evaluate.py", "--config", REPORT, "evaluate.rounds=1",
+        "evaluate.workers=1", "evaluate.scenarios=isolated", "evaluate.object_sets=primitives",
+        "transfer.columns=pybullet,outside,cornell", "sim.renderer=tiny",
+        "--results", "copy.json",
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "PyBullet outside the ranges" in done.stdout and "not trained" in done.stdout
+    assert "transfer.cornell" in done.stdout
+    rows = json.loads((tmp_path / "copy.json").read_text())["rows"]
+    heuristic = next(row for row in rows if row["policy"] == "heuristic")
+    assert set(heuristic["worlds"]) == {"pybullet", "outside"}
+    (run,) = (tmp_path / "runs" / "evaluate").iterdir()
+    assert (run / "transfer.png").exists()
+    for scenes in ("isolated_of_primitives", "isolated_of_box"):
+        assert (run / "outside" / scenes / "rounds.jsonl").exists()
+    boxes = [row for row in rows if row["scenes"] == "isolated of box"]
+    assert [row["policy"] for row in boxes] == [
+        "random",
+        "heuristic",
+        "PPO (shipped)",
+        *["PPO"] * 4,
+    ]

@@ -1,0 +1,188 @@
+"""Figures of an evaluation for people and other programs: results.json, CSV, LaTeX, aligned text.
+
+This module formats what `utils.results` has counted.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from utils.config import Config
+from utils.result_records import FAILURES
+from utils.results import Comparison, Row, StopReason
+from utils.runs import save_results, write_atomic
+from utils.statistics import Difference
+
+
+def write_results(
+    path: Path,
+    rows: Sequence[Row],
+    comparisons: Sequence[Comparison],
+    config: Config,
+    device: str,
+    complete: bool,
+) -> None:
+    """Write results.json of an evaluation, see `utils.runs.save_results`."""
+    content = {
+        "complete": complete,
+        "config": config.model_dump(mode="json"),
+        "device": device,
+        "rows": [asdict(row) for row in rows],
+        "comparisons": [asdict(pair) for pair in comparisons],
+    }
+    save_results(path, content)
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write a spreadsheet of the rows: intervals as two columns, each failure as one column."""
+    _write_csv(path, [_flat(row) for row in rows])
+
+
+def _write_csv(path: Path, flat: Sequence[dict[str, object]]) -> None:
+    text = io.StringIO(newline="")
+    if flat:
+        writer = csv.DictWriter(text, flat[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+    write_atomic(path, text.getvalue())
+
+
+def _flat(row: Row) -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for name, value in asdict(row).items():
+        if name.endswith("_ci95"):
+            flat[f"{name}_low"], flat[f"{name}_high"] = value
+        elif name == "failures":
+            flat |= {f"failures_{reason}": count for reason, count in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def format_table(rows: Sequence[Row]) -> str:
+    """The rows as aligned plain text."""
+    header = ["policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed"]
+    lines = [list(_cells(row)) for row in rows]
+    if any(row.turn_ms_p95 is not None for row in rows):  # of a closed loop
+        for line, cell in zip([header, *lines], ["turn ms, 95 %", *map(turn_ms_in_words, rows)]):
+            line.insert(-1, cell)
+    return aligned(header, lines, to_the_right=(5, 6))
+
+
+def format_stop_reasons(stops: Iterable[StopReason]) -> str:
+    """One line for each under a title; an empty text if there are none."""
+    lines = [
+        f"{stop.count:4d} x {stop.policy}, {stop.scenario}, {stop.objects}: {stop.sentence} "
+        f"({stop.place})"
+        for stop in stops
+    ]
+    return "\n".join(["why attempts failed", *lines]) if lines else ""
+
+
+def aligned(
+    header: Sequence[str], lines: Sequence[Sequence[str]], to_the_right: Sequence[int] = ()
+) -> str:
+    """Lines of cells under a header, as text in columns of even width."""
+    lines = [header, *lines]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if i in to_the_right else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    def share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
+        if rate is None:
+            return "-"
+        low, high = interval
+        return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
+
+    return (
+        row.policy,
+        row.scenario,
+        row.objects,
+        share(row.success_rate, row.success_ci95, row.successes, row.attempts),
+        share(row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total),
+        "-" if row.plan_ms_median is None else f"{row.plan_ms_median:.1f}",
+        "-" if row.picks_per_hour is None else f"{row.picks_per_hour:.0f}",
+        failures_in_words(row),
+    )
+
+
+def failures_in_words(row: Row) -> str:
+    """'3 missed, 1 slipped', most frequent first; 'none' without a failure."""
+    counts = sorted(row.failures.items(), key=lambda item: -item[1])
+    return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"
+
+
+def turn_ms_in_words(row: Row) -> str:
+    """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' for an open loop."""
+    known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
+    return ", ".join(f"{ms:.1f}" for ms in known) or "-"
+
+
+# --- Comparisons --------------------------------------------------------------------------------
+
+
+def format_comparisons(comparisons: Sequence[Comparison]) -> str:
+    """Paired differences in percentage points as aligned text; an empty text if there are none."""
+    if not comparisons:
+        return ""
+    header = ("paired difference", "scenario", "objects", "success", "cleared", "rounds")
+    return aligned(header, [_difference_cells(pair) for pair in comparisons])
+
+
+def _difference_cells(pair: Comparison) -> tuple[str, ...]:
+    names = (f"{pair.first} - {pair.second}", pair.scenario, pair.objects)
+    rounds = "-" if pair.success is None else str(pair.success.rounds)
+    return (*names, _points(pair.success), _points(pair.cleared), rounds)
+
+
+def _points(difference: Difference | None) -> str:
+    """'+12.5 [+3.1, +21.9]' in percentage points."""
+    if difference is None:
+        return "-"
+    value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
+    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None:
+    """Write a spreadsheet of paired differences as shares of 1, with their 95 % intervals."""
+    flat = []
+    for pair in comparisons:
+        line: dict[str, object] = {
+            name: getattr(pair, name) for name in ("first", "second", "scenario", "objects")
+        }
+        for measure in ("success", "cleared"):
+            difference = getattr(pair, measure)
+            for name in ("value", "low", "high", "rounds"):
+                line[f"{measure}_{name}"] = getattr(difference, name, None)
+        flat.append(line)
+    _write_csv(path, flat)
+
+
+def write_comparisons_latex(path: Path, comparisons: Sequence[Comparison]) -> None:
+    """Write a LaTeX tabular (package booktabs) of paired differences in percentage points."""
+    header = ["Difference", "Scenario", "Objects", "Success", "Cleared", "Rounds"]
+    lines = [
+        " & ".join(_latex(cell) for cell in _difference_cells(pair)) + r" \\"
+        for pair in comparisons
+    ]
+    text = [r"\begin{tabular}{lllrrr}", r"\toprule", " & ".join(header) + r" \\", r"\midrule"]
+    text += [*lines, r"\bottomrule", r"\end{tabular}"]
+    write_atomic(path, "\n".join(text) + "\n")
+
+
+def _latex(cell: str) -> str:
+    for special in "&%#_$":
+        cell = cell.replace(special, "\\" + special)
+    return cell.replace(" - ", " $-$ ")
