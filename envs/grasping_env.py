@@ -136,6 +136,11 @@ class RobotGraspingEnv(gymnasium.Env):
         **settings: Any,
     ):
         self._closed = True  # until everything below has been built
+        if settings.keys() & {"render", "gui"}:
+            raise UserError(
+                "RobotGraspingEnv: render and gui are one argument, render_mode: 'human' opens a "
+                "window, 'rgb_array' makes render() return images"
+            )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(
                 f"render_mode {render_mode!r} is unknown; allowed are None, 'human', 'rgb_array'"

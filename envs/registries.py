@@ -20,10 +20,12 @@ from envs.simulators import SIMULATORS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config
 from utils.errors import unknown_choice
+from utils.real_data import FORMATS
 
 REGISTRIES: dict[str, Collection[str]] = {
     "simulator": SIMULATORS,
     "closed_loop.controller": CONTROLLERS,
+    "data.kind": ("simulated", *FORMATS),
     "train.backbone": BACKBONES,
     "evaluate.controllers": CONTROLLERS,
     "evaluate.scenarios": SCENARIOS,

@@ -162,6 +162,9 @@ class GraspPolicyNetwork(nn.Module):
     def forward(self, image: torch.Tensor | None, state: torch.Tensor) -> ActionDistribution:
         """What to do. image: (B, C, H, W) colours in 0..1 and depth in metres, or None where there
         are no image channels; state: (B, S), both as observed: normalising is done in here."""
+        channels = self.model_args["image_channels"]
+        if image is not None and image.shape[1] != channels:
+            raise ValueError(f"image: got {image.shape[1]} channels, the network has {channels}")
         return self._distribution(self.features(image, state))
 
     def value(

@@ -70,6 +70,11 @@ class GraspPPO:
     """
 
     def __init__(self, network, layout: ObservationLayout, settings: RLConfig, team=ALONE, seed=0):
+        if not isinstance(network, nn.Module):
+            raise TypeError(
+                f"GraspPPO: got {network!r} for a network; make it from the environment's spaces by "
+                "models.grasp_policy.policy_for, and call GraspPPO(network, layout, settings)"
+            )
         if settings.batch_size % team.ranks or settings.envs % team.ranks:
             raise UserError(
                 f"rl.envs is {settings.envs} and rl.batch_size {settings.batch_size}, but "

@@ -133,7 +133,7 @@ def test_bars_are_learned(tmp_path, monkeypatch):
 
 def test_root_has_to_be_named_and_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match="needs root"):
+    with pytest.raises(UserError, match="data.kind=cornell needs the folder"):
         train_graspnet.main(["data.kind=cornell"])
     with pytest.raises(UserError, match="no folder .*nowhere"):
         train_graspnet.main(["data.kind=cornell", f"data.root={tmp_path / 'nowhere'}"])

@@ -40,6 +40,7 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("evaluate.controllers=ibsv", "evaluate.controllers: got 'ibsv', .* did you mean ibvs?"),
         ("env.scenario=moved", "env.scenario: got 'moved', expected one of isolated, packed, pile"),
         ("simulator=pybulet", "simulator: got 'pybulet', .* did you mean pybullet?"),
+        ("data.kind=cornel", "data.kind: got 'cornel', .* did you mean cornell?"),
         ("train.backbone=vgg", "train.backbone: got 'vgg', expected one of .*grconvnet"),
         ("env.reward=dens", "env.reward: got 'dens', .* did you mean dense?"),
         ("evaluate.object_sets=random_urdf", "an existing folder or .* did you mean random_urdfs?"),

@@ -224,7 +224,7 @@ class TransferConfig(Section):
 
 
 class DataConfig(Section):
-    kind: Literal["simulated", "cornell", "jacquard"]
+    kind: Name
     root: Annotated[Path, Field(strict=False)] | None
     split: Literal["object", "image"]
     folds: Annotated[int, Field(ge=2)]
@@ -240,12 +240,7 @@ class DataConfig(Section):
     workers: Count | None
 
     @model_validator(mode="after")
-    def _real_data_have_a_root(self) -> DataConfig:
-        if self.kind != "simulated" and self.root is None:
-            raise ValueError(
-                f"kind {self.kind} needs root, the folder that holds the data set: add "
-                f"data.root=path/to/{self.kind}"
-            )
+    def _fold_exists(self) -> DataConfig:
         if self.fold is not None and self.fold >= self.folds:
             raise ValueError(f"fold {self.fold} is not below folds ({self.folds})")
         return self

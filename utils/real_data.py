@@ -173,13 +173,18 @@ FORMATS: dict[str, Callable[[str | Path], RealDataset]] = {
 }
 
 
-def open_real_data(kind: str, root: str | Path) -> RealDataset:
+def open_real_data(kind: str, root: str | Path | None) -> RealDataset:
     """Open the data set of format `kind` in the folder `root`.
 
-    Raises UserError for an unknown format, a missing folder, or missing files.
+    Raises UserError for an unknown format, no folder, a missing one, or missing files.
     """
     if kind not in FORMATS:
         raise unknown_choice("data.kind", kind, FORMATS)
+    if root is None:
+        raise UserError(
+            f"data.root: data.kind={kind} needs the folder that holds the data set: add "
+            f"data.root=path/to/{kind}"
+        )
     return FORMATS[kind](root)
 
 
