@@ -1,4 +1,8 @@
-"""The simulators that a cell can be built in, chosen by the config's key `world`."""
+"""The simulators, by the names that the config's key `simulator` takes, and `make_cell`.
+
+A new simulator brings a `Cell`, a `Robot` and a `Camera` (`envs.cell`, `envs.robot`, `envs.camera`)
+and an entry here.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +11,19 @@ from envs.mujoco_cell import MujocoCell
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
-from utils.errors import UserError
+from utils.errors import UserError, unknown_choice
 
-SIMULATORS = {"pybullet": PybulletCell, "mujoco": MujocoCell}
+SIMULATORS: dict[str, type[Cell]] = {"pybullet": PybulletCell, "mujoco": MujocoCell}
 
 
 def make_cell(config: Config) -> Cell:
-    """A cell in the configured world; with evaluate.randomise, one that differs from scene to scene
-    by what the section `randomization` says, the same way for the same scene. Noise and bias of
-    actions are a policy's that acts in turns; a planner's trajectories are no actions."""
+    """A cell in the configured simulator.
+
+    With evaluate.randomise the cell differs from scene to scene by what the section `randomization`
+    says, in the same way for the same scene. Noise and bias of actions apply to learned policies
+    that act step by step; a planner's trajectories are no actions. Raises UserError for an unknown
+    simulator, and where the cell cannot be had in it.
+    """
     check_simulator(config)
     cell = SIMULATORS[config.simulator](config)
     if config.evaluate.randomise:
@@ -26,7 +34,9 @@ def make_cell(config: Config) -> Cell:
 
 
 def check_simulator(config: Config) -> None:
-    """Raise UserError for what is to be evaluated and cannot be had in the configured world."""
+    """Raise UserError for an unknown simulator, and for one that cannot be randomised."""
+    if config.simulator not in SIMULATORS:
+        raise unknown_choice("simulator", config.simulator, SIMULATORS)
     if config.simulator != "pybullet" and config.evaluate.randomise:
         raise UserError(
             "evaluate.randomise=true changes PyBullet's physics; use simulator=pybullet"

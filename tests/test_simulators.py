@@ -1,0 +1,108 @@
+"""What holds in every simulator of the registry: the interface, and one gripper definition."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+from envs.camera import Camera
+from envs.cell_scenes import Placement, Scene
+from envs.execution import execute_grasp
+from envs.objects import load_object_set
+from envs.pybullet_cell import PybulletCell
+from envs.robot import Robot
+from envs.simulators import SIMULATORS, make_cell
+from models.planners import make_planner
+from utils.config import load_config
+from utils.errors import UserError
+from utils.geometry import Workspace
+from utils.transforms import Grasp
+
+WIDE = 0.10  # m
+SIDE = 0.09  # m, of a cube that the Panda's own hand cannot take
+
+
+def _cell(simulator: str, *overrides: str):
+    if simulator == "mujoco":
+        pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
+    return make_cell(
+        load_config(None, [f"simulator={simulator}", "sim.renderer=tiny", *overrides])
+    )
+
+
+@pytest.fixture(scope="module", params=SIMULATORS)
+def wide(request):
+    """A cell whose hand opens 0.10 m, and the frame of a cube of 0.09 m in it."""
+    with _cell(request.param, f"gripper.max_opening={WIDE}") as cell:
+        config = cell.config
+        cubes = load_object_set("box", scale=SIDE / 0.06, cache_dir=config.cache_folder)
+        at = Placement(cubes[0], np.array([0.5, 0.0, SIDE / 2]), np.eye(4)[3])
+        cell.load(Scene("isolated", 0, (at,)))
+        yield cell
+
+
+def test_a_hand_of_ten_centimetres_opens_that_far(wide):
+    wide.robot.place(wide.home, opening=0.0)
+    wide.robot.open_gripper()
+    wide.step(round(1.5 / wide.dt))
+    assert wide.robot.opening == pytest.approx(WIDE, abs=2e-4)
+    wide.robot.command_gripper(0.2)  # wider than it can
+    wide.step(round(0.5 / wide.dt))
+    assert wide.robot.opening == pytest.approx(WIDE, abs=2e-4)
+
+
+@pytest.mark.parametrize("policy", ["heuristic", "oracle"])
+def test_planners_use_the_whole_opening(wide, policy):
+    wide.load(wide.scene)
+    plan = make_planner(policy, wide.gripper, Workspace(), 0)
+    best = plan(wide.frame(with_truth=True))[0]
+    assert SIDE < best.width <= WIDE
+
+
+def test_a_hand_of_ten_centimetres_grasps_a_cube_of_nine(wide):
+    wide.load(wide.scene)
+    outcome = execute_grasp(wide, Grasp(np.array([0.5, 0.0, 0.06]), 0.0, WIDE, 1.0))
+    assert outcome.reason == "success"
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_the_pandas_own_hand_opens_eight_centimetres(simulator, box_set):
+    with _cell(simulator) as cell:
+        at = Placement(box_set[0], np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
+        cell.load(Scene("isolated", 0, (at,)))
+        cell.robot.command_gripper(0.2)
+        cell.step(round(0.5 / cell.dt))
+        assert cell.robot.opening == pytest.approx(0.08, abs=2e-4)
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_a_simulator_brings_nothing_under_another_name(simulator, box_set):
+    """Robot and camera are implementations of the abstract ones, and what the abstract classes
+    declare keeps its parameters, so that calls mean the same in every simulator."""
+    with _cell(simulator) as cell:
+        at = Placement(box_set[0], np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
+        cell.build(Scene("isolated", 0, (at,)))
+        assert isinstance(cell.robot, Robot) and isinstance(cell.camera, Camera)
+        for thing, base in ((cell.robot, Robot), (cell.camera, Camera)):
+            for name, method in inspect.getmembers(base, inspect.isfunction):
+                if name != "__init__":
+                    own = inspect.signature(getattr(type(thing), name))
+                    assert own.parameters.keys() == inspect.signature(method).parameters.keys()
+
+
+def test_an_unknown_simulator_is_refused():
+    config = load_config(None, ["simulator=mujocco"])
+    with pytest.raises(UserError, match="expected one of mujoco, pybullet; did you mean mujoco?"):
+        make_cell(config)
+
+
+def test_a_cell_of_pybullet_is_not_made_for_mujoco():
+    with pytest.raises(UserError, match=r"only evaluate\.py"):
+        PybulletCell(load_config(None, ["simulator=mujoco"]))
+
+
+def test_randomisation_is_refused_in_mujoco():
+    with pytest.raises(UserError, match="simulator=pybullet"):
+        make_cell(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
