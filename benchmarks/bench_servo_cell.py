@@ -25,7 +25,8 @@ from envs.pybullet_panda import ARM
 from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
 from utils.config import load_config
 from utils.servo_features import MOUNTINGS
-from utils.servo_loop import ServoHistory, ServoView, VisualServo
+from utils.servo_history import ServoHistory
+from utils.servo_loop import ServoView, VisualServo
 from utils.transforms import inverse_pose, pose_matrix, top_down_pose
 from utils.visual_servo import (
     AdaptiveGain,

@@ -24,7 +24,8 @@ from utils.config import SafetyConfig, ServoConfig
 from utils.errors import ServoError, unknown_choice
 from utils.servo_control import joint_limit_avoidance
 from utils.servo_features import MOUNTINGS, ServoCamera
-from utils.servo_loop import ServoCommand, ServoHistory, ServoView, VisualServo
+from utils.servo_history import ServoHistory
+from utils.servo_loop import ServoCommand, ServoView, VisualServo
 from utils.transforms import transform_points
 
 _MOUNTS = dict(zip(MOUNTINGS, ("wrist", "overhead")))

@@ -68,7 +68,6 @@ from utils.visual_servo import (
     SingularMatrixError,
     TwistLimits,
     joint_limit_avoidance,
-    scale_joint_velocities,
 )
 
 K = CAMERA["intrinsics"]

@@ -1,7 +1,7 @@
-"""From an error to a safe velocity: inverses, gains, limits, and the arm behind the camera.
+"""From an error to a velocity: inverses, gains, speed limits, and the arm behind the camera.
 
 Twists are (v, w) in m/s and rad/s. J_W is a geometric Jacobian (6, n) of E's origin with both
-halves in the axes of W, as PyBullet gives it. Formulas: Chaumette and Hutchinson, "Visual servo
+halves in the axes of W. Formulas: Chaumette and Hutchinson, "Visual servo
 control, part II", IEEE Robotics and Automation Magazine 14(1), 2007; the adaptive gain and smooth
 start are those of ViSP (Marchand, Spindler and Chaumette, 2005).
 
@@ -24,11 +24,11 @@ MAX_CONDITION = 1e8  # beyond it an exact inverse only amplifies rounding
 def pseudo_inverse(
     A: np.ndarray, damping: float = 0.0, truncation: float = 0.0
 ) -> tuple[np.ndarray, float]:
-    """Pseudo-inverse (n, m) of A (m, n), and A's condition number (of A itself, not tamed).
+    """Pseudo-inverse (n, m) of A (m, n), and the condition number of A itself.
 
     damping: s / (s^2 + damping^2) for 1 / s, in the unit of the singular values s.
     truncation: singular values below this share of the largest count as zero.
-    Raises SingularMatrixError where A is singular and neither is given.
+    Raises SingularMatrixError where A is singular and neither of the two is given.
     """
     try:
         U, s, Vt = np.linalg.svd(A, full_matrices=False)
@@ -49,7 +49,7 @@ def pseudo_inverse(
         inverse = 1.0 / s
     else:
         raise SingularMatrixError(
-            f"matrix: singular (condition number {condition:.3g}); move the start, or ask for "
+            f"matrix: singular (condition number {condition:.3g}); choose another start, or set "
             "damping or truncation"
         )
     return (Vt.T * inverse) @ U.T, condition
@@ -57,7 +57,7 @@ def pseudo_inverse(
 
 @dataclass(frozen=True)
 class AdaptiveGain:
-    """A gain that is high near the goal and low far from it, 1/s (ViSP's values).
+    """A gain that is high near the goal and low far from it, 1/s, with ViSP's values.
 
     g(x) = (g0 - ginf) exp(-slope x / (g0 - ginf)) + ginf, where x is the largest component of the
     twist that would null the error in one second.
@@ -88,21 +88,11 @@ class TwistLimits:
             raise UserError(f"TwistLimits: expected positive speeds, got {self}")
 
     def scale(self, twist: np.ndarray) -> np.ndarray:
-        """The whole twist made smaller until both speeds hold, so its direction is kept."""
+        """The twist (6,) times one factor that brings both speeds within their limits."""
         linear = float(twist[:3] @ twist[:3]) ** 0.5
         angular = float(twist[3:] @ twist[3:]) ** 0.5
         excess = max(linear / self.linear, angular / self.angular)
         return twist / excess if excess > 1.0 else twist
-
-
-def scale_joint_velocities(velocities: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """All joints' velocities (n,) made smaller by one factor until each is within limits (n,),
-    rad/s, so that the camera's direction of travel is kept."""
-    limits = np.asarray(limits, dtype=float)
-    if not (limits > 0.0).all():
-        raise UserError(f"joint velocity limits: expected positive numbers, got {limits.tolist()}")
-    excess = float(np.max(np.abs(velocities) / limits))
-    return velocities / excess if excess > 1.0 else velocities
 
 
 def camera_jacobian(
@@ -112,11 +102,11 @@ def camera_jacobian(
     T_EC: np.ndarray | None = None,
     T_WC: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(6, n) J with v_C = J qdot, the camera's twist relative to what it looks at, in C.
+    """(6, n) J with v_C = J qdot, the camera's twist relative to the object it looks at, in C.
 
-    eye_in_hand (needs T_EC): the camera rides on E and looks at a fixed object.
-    eye_to_hand (needs T_WC): the camera is fixed and looks at an object that rides on E. The
-    object's motion counts as the camera's opposite one, hence the minus.
+    eye_in_hand (needs T_EC): the camera is mounted on E and looks at a fixed object.
+    eye_to_hand (needs T_WC): the camera is fixed and looks at an object that E carries. A motion of
+    the object is the opposite motion of the camera relative to it, hence the minus.
     """
     T_WE, J_W = np.asarray(T_WE, dtype=float), np.asarray(J_W, dtype=float)
     if J_W.ndim != 2 or J_W.shape[0] != 6 or not np.isfinite(J_W).all():
@@ -140,13 +130,14 @@ def joint_velocities(
 ) -> tuple[np.ndarray, float]:
     """Joint velocities (n,) with J qdot = twist, rad/s, and J's condition number.
 
-    secondary: (n,) velocities wished for beside the task; only the part that leaves the task
-    alone is added: qdot = J^+ twist + (I - J^+ J) secondary.
+    secondary: (n,) desired velocities of a second task, projected into the null space of the first:
+    qdot = J^+ twist + (I - J^+ J) secondary.
     """
     inverse, condition = pseudo_inverse(J, damping, truncation)
     velocities = inverse @ twist
     if secondary is not None:
-        # The projector needs the exact inverse: a damped one would let the wish leak into the task.
+        # The projector needs the exact inverse: with a damped one the second task would disturb
+        # the first.
         exact = (
             inverse if damping == 0.0 else pseudo_inverse(J, truncation=max(truncation, 1e-6))[0]
         )
@@ -157,11 +148,11 @@ def joint_velocities(
 def joint_limit_avoidance(
     q: np.ndarray, lower: np.ndarray, upper: np.ndarray, gain: float = 1.0, margin: float = 0.1
 ) -> np.ndarray:
-    """(n,) joint velocities away from limits that are near, rad/s; to be used as `secondary`.
+    """(n,) joint velocities away from near limits, rad/s, for use as `secondary`.
 
-    Descends a cost that is zero inside and grows with the square of the way into the outermost
-    `margin` (a share of each joint's range) on both sides (Chaumette and Marchand, 2001).
-    q, lower, upper: (n,) rad. gain: 1/s.
+    The negative gradient of a cost that is zero inside a joint's range and grows with the square of
+    the distance into the outermost `margin` on either side (Chaumette and Marchand, 2001).
+    q, lower, upper: (n,) rad. gain: 1/s. margin: share of each joint's range.
     """
     q, lower, upper = (np.asarray(a, dtype=float) for a in (q, lower, upper))
     if q.shape != lower.shape or q.shape != upper.shape or not (lower < upper).all():

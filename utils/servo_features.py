@@ -1,4 +1,4 @@
-"""What a camera tells a servo: checked points and depths, and how they move with the camera.
+"""Image features of a servo: points and depths, checked, and how they move with the camera.
 
 Pixels are (u, v); normalised coordinates are x = (u - u0) / fx, y = (v - v0) / fy, without a unit.
 Depths are metres along the optical axis. v_C is the twist (v, w) of the camera in its own frame.
@@ -27,9 +27,9 @@ from utils.errors import (
 )
 from utils.transforms import skew
 
-MIN_POINTS = 3  # six unknowns, two equations each; four or more have no singular cylinder
-COLLINEAR = 1e-3  # a set of points narrower than this share of its length is a line
-RIGID = 1e-6  # how far a rotation may be from orthonormal
+MIN_POINTS = 3  # six unknowns and two equations a point; from four on no singular cylinder
+COLLINEAR = 1e-3  # points in a strip narrower than this share of its length count as a line
+RIGID = 1e-6  # tolerance on the orthonormality of a rotation
 
 MOUNTINGS = ("eye_in_hand", "eye_to_hand")
 CAMERA_KEYS = ("intrinsics", "width", "height", "mounting", "T_EC", "T_WC")
@@ -39,9 +39,9 @@ CAMERA_KEYS = ("intrinsics", "width", "height", "mounting", "T_EC", "T_WC")
 class ServoCamera:
     """A pinhole camera and where it is mounted.
 
-    K: (3, 3) matrix in pixels, no skew. size: (width, height) pixels, or None for an image without
-    borders. mounting: eye_in_hand with T_EC (4, 4), or eye_to_hand with T_WC (4, 4); needed only
-    to turn twists into joint velocities.
+    K: (3, 3) matrix in pixels, without skew. size: (width, height) pixels, or None for an image
+    without borders. mounting: eye_in_hand with T_EC (4, 4), or eye_to_hand with T_WC (4, 4); only
+    joint velocities need it.
     """
 
     K: np.ndarray
@@ -57,8 +57,8 @@ class ServoCamera:
 
     @classmethod
     def from_config(cls, config: Mapping) -> ServoCamera:
-        """From {"intrinsics": K, "width", "height", "mounting", "T_EC", "T_WC"}, only the first
-        of which is required. Raises CameraMatrixError, PoseError, or UserError on an unknown key.
+        """From {"intrinsics": K, "width", "height", "mounting", "T_EC", "T_WC"}, of which only
+        the first is required. Raises CameraMatrixError, PoseError, or UserError for unknown keys.
         """
         if not isinstance(config, Mapping) or "intrinsics" not in config:
             raise CameraMatrixError(
@@ -83,9 +83,9 @@ class ServoCamera:
         return cls(K, None if size[0] is None else size, mounting, **poses)
 
     def normalise(self, pixels) -> np.ndarray:
-        """Normalised coordinates (n, 2) of pixels (n, 2), which are checked.
+        """Normalised coordinates (n, 2) of pixels (n, 2).
 
-        Raises FeatureCountError, PointError or CollinearPointsError.
+        Checks them: raises FeatureCountError, PointError or CollinearPointsError.
         """
         pixels = np.asarray(pixels, dtype=float)
         if pixels.ndim != 2 or pixels.shape[1] != 2:
@@ -126,7 +126,7 @@ class ServoCamera:
 
 
 def check_camera_matrix(K) -> np.ndarray:
-    """K as a float array, or CameraMatrixError with what is wrong."""
+    """K as a float array; raises CameraMatrixError."""
     try:
         K = np.asarray(K, dtype=float)
     except (TypeError, ValueError):
@@ -145,7 +145,7 @@ def check_camera_matrix(K) -> np.ndarray:
 
 
 def check_pose(name: str, T) -> np.ndarray:
-    """T as a (4, 4) float array, or PoseError if it is missing or no rigid transform."""
+    """T as a (4, 4) float array; raises PoseError where it is missing or not a rigid transform."""
     if T is None:
         raise PoseError(f"{name}: a pose is needed here, got None")
     T = np.asarray(T, dtype=float)
@@ -166,7 +166,7 @@ def check_pose(name: str, T) -> np.ndarray:
 
 
 def check_depths(depths, count: int) -> np.ndarray:
-    """(count,) depths in metres from one for all points or one for each.
+    """(count,) depths in metres, from one depth for all points or one for each.
 
     Raises FeatureCountError, or DepthError where one is zero, not finite or behind the camera.
     """
@@ -186,7 +186,7 @@ def check_depths(depths, count: int) -> np.ndarray:
 def depths_from_image(pixels, depth_map: np.ndarray) -> np.ndarray:
     """Depths (n,) at the nearest pixels of a depth image (H, W), metres, 0 where unknown.
 
-    Raises PointError outside the image (no index wraps round), DepthError where depth is unknown.
+    Raises PointError outside the image (no index wraps around), DepthError for an unknown depth.
     """
     pixels = np.atleast_2d(np.asarray(pixels, dtype=float))
     depth_map = np.asarray(depth_map)
@@ -252,10 +252,10 @@ def points_from_depths(xy: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 def pose_from_points(points_C: np.ndarray, points_O: np.ndarray) -> np.ndarray:
-    """(4, 4) T_CO that best carries an object's known points (n, 3) to where they are seen (n, 3).
+    """(4, 4) T_CO that best maps points of the object, points_O (n, 3), to points_C (n, 3).
 
     Least squares in closed form (Kabsch 1976; Umeyama 1991). Raises FeatureCountError or
-    CollinearPointsError where the rotation is not determined.
+    CollinearPointsError where the points do not determine the rotation.
     """
     points_C, points_O = np.asarray(points_C, dtype=float), np.asarray(points_O, dtype=float)
     if points_C.shape != points_O.shape or points_C.ndim != 2 or len(points_C) < MIN_POINTS:
@@ -277,28 +277,28 @@ def pose_from_points(points_C: np.ndarray, points_O: np.ndarray) -> np.ndarray:
 
 
 class DepthFromMotion:
-    """Depths of points from how they move in the image while the camera moves in a known way.
+    """Depths of points from their motion in the image while the camera moves with a known twist.
 
     The flow of a point is linear in its inverse depth, so each step gives one estimate by least
-    squares (Corke, section 15.2.3). Between steps the estimate is carried along by the motion,
-    and the new one is weighed by how much parallax the step had: a turning camera teaches nothing.
+    squares (Corke, section 15.2.3). A Kalman filter on the inverse depth weighs it by the step's
+    parallax: a camera that only turns gives no information.
     """
 
     def __init__(self, initial: float, noise: float = 1e-3):
-        """initial: first guess for all points, metres. noise: of a normalised coordinate between
-        two images; parallax below it hardly counts."""
+        """initial: first guess for all points, metres. noise: standard deviation of a normalised
+        coordinate between two images; parallax below it hardly counts."""
         self.initial = float(check_depths(initial, 1)[0])
         self.noise = noise
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything but the first guess."""
+        """Go back to the first guess."""
         self._xy: np.ndarray | None = None
         self._inverse: np.ndarray | None = None
         self._variance: np.ndarray | None = None
 
     def update(self, xy: np.ndarray, v_C: np.ndarray, dt: float) -> np.ndarray:
-        """Depths (n,) at normalised coordinates xy (n, 2), reached by moving with v_C for dt s."""
+        """Depths (n,) at normalised coordinates xy (n, 2) after a motion with v_C for dt s."""
         if self._xy is None or self._xy.shape != xy.shape:
             self._inverse = np.full(len(xy), 1 / self.initial)
             self._variance = self._inverse**2  # the guess may well be wrong by as much as itself

@@ -1,25 +1,18 @@
-"""What a servo did, step by step, and pictures of it.
+"""The loop that every visual servo shares: from a view to a twist, until the camera sees its goal.
 
-Knows no control law; only what each step recorded.
-
-The loop that every visual servo shares: from a view to a twist, and on until the goal is seen.
-
-Knows neither how a law corrects an error nor a simulator; see `utils.visual_servo` for the laws and
-the frames.
+A control law is a subclass of `VisualServo` that says which displacement of the camera would null
+the error (`utils.servo_laws`). Everything else stands here: gain, smooth start, limits, the loop
+around any camera and any robot, and an ideal camera to try a law on. Knows no simulator.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from math import exp, sqrt
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from utils.errors import DepthError, FeatureCountError, PointError, ServoError, UserError
 from utils.servo_control import AdaptiveGain, TwistLimits, camera_jacobian, joint_velocities
@@ -30,162 +23,14 @@ from utils.servo_features import (
     points_from_depths,
     pose_from_points,
 )
-from utils.transforms import pose_exp, rotation_log
+from utils.servo_history import ServoHistory
+from utils.transforms import pose_exp
 
-FRAME_COLOURS = ("tab:red", "tab:green", "tab:blue")  # x, y, z
-
-
-@dataclass(frozen=True)
-class ServoHistory:
-    """One row for each of the k images that the servo looked at, the first and last included.
-
-    poses: (k, 4, 4) T_CO of the object in the camera; NaN where it was not known.
-    goal_pose: (4, 4) T_CO wanted; NaN where it was not given.
-    points: (k, n, 2) pixels, or (k, 0, 2) where only poses were used. goal_points: (n, 2).
-    errors: (k, m), in the law's own units. velocities: (k, 6) v_C commanded, m/s and rad/s.
-    condition_numbers: (k,). gains: (k,) 1/s. dt: seconds between images.
-    converged: whether the error's norm came under the tolerance. reason: why it ended.
-    """
-
-    poses: np.ndarray
-    goal_pose: np.ndarray
-    points: np.ndarray
-    goal_points: np.ndarray
-    errors: np.ndarray
-    velocities: np.ndarray
-    condition_numbers: np.ndarray
-    gains: np.ndarray
-    dt: float
-    converged: bool
-    reason: str
-
-    @property
-    def iterations(self) -> int:
-        """Images looked at, the one that was found good enough included."""
-        return len(self.errors)
-
-    @property
-    def times(self) -> np.ndarray:
-        """(k,) seconds since the first image."""
-        return np.arange(self.iterations) * self.dt
-
-    @property
-    def error_norms(self) -> np.ndarray:
-        """(k,) Euclidean norms of the errors."""
-        return np.linalg.norm(self.errors, axis=1)
-
-    @property
-    def camera_poses(self) -> np.ndarray:
-        """(k, 4, 4) T_OC of the camera in the object's frame."""
-        return np.linalg.inv(self.poses)
-
-    @property
-    def distances(self) -> np.ndarray:
-        """(k,) metres between camera and object origin."""
-        return np.linalg.norm(self.poses[:, :3, 3], axis=1)
-
-    @property
-    def path_length(self) -> float:
-        """Metres that the camera travelled."""
-        positions = self.camera_poses[:, :3, 3]
-        return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
-    def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """(k,) metres and (k,) radians between the camera's pose and the wanted one."""
-        T = self.goal_pose @ self.camera_poses  # T_GC: the camera seen from its goal
-        turns = [np.linalg.norm(rotation_log(R)) for R in T[:, :3, :3]]
-        return np.linalg.norm(T[:, :3, 3], axis=1), np.array(turns)
-
-    def plot(self, path: Path | str | None = None, title: str = "") -> Figure:
-        """Errors, velocities, condition number, image trajectories and the camera's 3-D path.
-
-        Also writes a picture where `path` names one.
-        """
-        figure = Figure(figsize=(13, 7.5), layout="constrained")
-        figure.suptitle(f"{title}: {self.reason}" if title else self.reason)
-        panels = [figure.add_subplot(2, 3, i) for i in (1, 2, 3, 4)]
-        self._plot_errors(panels[0])
-        self._plot_velocities(panels[1], slice(0, 3), "linear velocity (m/s)", "v")
-        self._plot_velocities(panels[3], slice(3, 6), "angular velocity (rad/s)", "ω")
-        self._plot_condition(panels[2])
-        self._plot_image(figure.add_subplot(2, 3, 5))
-        self._plot_path(figure.add_subplot(2, 3, 6, projection="3d"))
-        if path is not None:
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=90)
-        return figure
-
-    def _plot_errors(self, axes: Axes) -> None:
-        axes.plot(self.times, self.errors, linewidth=0.8)
-        axes.set(xlabel="time (s)", ylabel="error, each component")
-        log = axes.twinx()
-        log.semilogy(self.times, self.error_norms, "k--", linewidth=1.5)
-        log.set_ylabel("norm of the error (dashed)")
-        axes.grid(True, alpha=0.3)
-
-    def _plot_velocities(self, axes: Axes, part: slice, label: str, letter: str) -> None:
-        for values, axis, colour in zip(self.velocities.T[part], "xyz", FRAME_COLOURS):
-            axes.plot(self.times, values, color=colour, label=f"{letter}{axis}")
-        axes.set(xlabel="time (s)", ylabel=label)
-        axes.grid(True, alpha=0.3)
-        axes.legend(loc="best", fontsize="small")
-
-    def _plot_condition(self, axes: Axes) -> None:
-        axes.semilogy(self.times, self.condition_numbers, color="tab:purple")
-        axes.set(xlabel="time (s)", ylabel="condition number")
-        axes.grid(True, alpha=0.3)
-
-    def _plot_image(self, axes: Axes) -> None:
-        axes.set(xlabel="u (px)", ylabel="v (px)", title="points in the image")
-        if not self.points.size:
-            axes.text(0.5, 0.5, "no points were used", ha="center", transform=axes.transAxes)
-            return
-        for i in range(self.points.shape[1]):
-            axes.plot(*self.points[:, i].T, linewidth=1)
-        for corners, style, label in (
-            (self.points[0], "ko--", "start"),
-            (self.points[-1], "ks-", "end"),
-            (self.goal_points, "r*", "goal"),
-        ):
-            outline = np.vstack([corners, corners[:1]])
-            axes.plot(*outline.T, style, linewidth=0.6, markersize=5, fillstyle="none", label=label)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.invert_yaxis()  # v grows downwards
-        axes.grid(True, alpha=0.3)
-        axes.legend(loc="best", fontsize="small")
-
-    def _plot_path(self, axes) -> None:
-        axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="camera, object at 0")
-        T = self.camera_poses
-        if not np.isfinite(T).all():
-            axes.set_title("camera path unknown: no poses")
-            return
-        positions = T[:, :3, 3]
-        axes.plot(*positions.T, color="black", linewidth=1)
-        length = 0.12 * float(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max())
-        for i in np.unique(np.linspace(0, len(T) - 1, 8).astype(int)):
-            for axis, colour in enumerate(FRAME_COLOURS):
-                tip = positions[i] + length * T[i, :3, axis]
-                axes.plot(*np.column_stack([positions[i], tip]), color=colour, linewidth=1)
-        axes.scatter(0, 0, 0, color="tab:orange", marker="s", label="object")
-        if np.isfinite(self.goal_pose).all():
-            goal = np.linalg.inv(self.goal_pose)[:3, 3]
-            axes.scatter(*goal, color="tab:red", marker="*", s=60, label="goal")
-        axes.invert_zaxis()  # the camera looks along +z, so a camera above the object has z < 0
-        half = 0.25 * float(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max())
-        for axis, values in (("x", positions[:, 0]), ("y", positions[:, 1])):
-            # A straight path would make the box so thin that its labels overlap.
-            getattr(axes, f"set_{axis}lim")(min(values.min(), -half), max(values.max(), half))
-        axes.locator_params(nbins=4)
-        axes.set_aspect("equal")
-        axes.legend(loc="upper left", fontsize="small")
-
-
-STALLED = 1e-12  # a correction this small (m, rad) will never move a camera
+STALLED = 1e-12  # m and rad: a smaller correction does not move a camera
 
 
 class ServoView(NamedTuple):
-    """What a camera saw, or should see. What a law does not use may be None.
+    """What a camera sees, or should see at its goal. What a law does not use may be None.
 
     points: (n, 2) pixels. depths: (n,) or one for all, metres along the optical axis.
     T_CO: (4, 4) pose of the object in the camera.
@@ -197,10 +42,11 @@ class ServoView(NamedTuple):
 
 
 class ServoCommand(NamedTuple):
-    """velocity: (6,) v_C. error: (m,) in the law's units. gain: 1/s.
+    """What a law answers to one view.
 
-    correction: (6,) minus the way still to go, metres and radians in C; velocity is -gain times
-    it, before smooth start and limits.
+    velocity: (6,) desired v_C. error: (m,) in the law's units. condition_number: of the
+    interaction matrix. gain: 1/s. correction: (6,) metres and radians in C, minus the displacement
+    that is left to the goal; velocity is -gain times it, before smooth start and limits.
     """
 
     velocity: np.ndarray
@@ -211,9 +57,9 @@ class ServoCommand(NamedTuple):
 
 
 class VisualServo(ABC):
-    """What the three laws share: gain, smooth start, limits, the loop, and the arm behind it.
+    """What the laws share: gain, smooth start, limits, the loop, and the arm behind the camera.
 
-    A law only says, in `_correct`, which displacement would null the error at once.
+    A law implements `_correct`, the displacement that would null the error at once.
     """
 
     def __init__(
@@ -230,7 +76,7 @@ class VisualServo(ABC):
         """camera_config: {"intrinsics": K, ...}, see `ServoCamera.from_config`.
         lambda_: gain, 1/s, or an AdaptiveGain. dt: seconds between two steps.
         smooth_start: mu, 1/s; the velocity grows from zero as 1 - exp(-mu t); None starts at once.
-        limits: largest speeds; None for none. damping, truncation: see `pseudo_inverse`.
+        limits: largest speeds; None sets no limit. damping, truncation: see `pseudo_inverse`.
         Raises CameraMatrixError or UserError.
         """
         self.camera = ServoCamera.from_config(camera_config)
@@ -258,7 +104,7 @@ class VisualServo(ABC):
         return self.camera.K
 
     def reset(self) -> None:
-        """Begin anew: the next step is the first one of a smooth start."""
+        """Forget the run so far: the next step is the first one of a smooth start."""
         self._time = 0.0
         self._first_correction: np.ndarray | None = None
         self._velocity = np.zeros(6)
@@ -292,9 +138,9 @@ class VisualServo(ABC):
     ) -> ServoHistory:
         """See and move until the error's norm is under `tolerance`.
 
-        see() returns the present ServoView; move(v_C) has the camera move with v_C until the next call.
-        However it ends, the last command is zero. Bad input in the first view raises; later on, a
-        lost feature set ends the run with the reason in the history.
+        see() returns the present ServoView; move(v_C) makes the camera move with v_C until the next
+        call. The last command is zero, however the run ends. Bad input in the first view raises a
+        ServoError; in a later view it ends the run, and the history holds the reason.
         """
         self.reset()
         views: list[ServoView] = []
@@ -335,17 +181,17 @@ class VisualServo(ABC):
         max_iterations: int = 3000,
         tolerance: float = 1e-5,
     ) -> ServoHistory:
-        """Servo an ideal camera that moves exactly as told.
+        """Servo an ideal camera, which moves exactly with the commanded velocity.
 
         points_O: (n, 3) points of the object. T_CO, T_GO: (4, 4) the object in the camera at the
-        start and at the goal. depth_factor: the depths told are the true ones times this; None
-        tells none. pixel_noise: standard deviation of each coordinate in pixels, from `rng`; the
-        pose told is then the one fitted to the noisy points at their true depths.
+        start and at the goal. depth_factor: the views hold the true depths times this factor, or
+        no depths for None. pixel_noise: standard deviation of each coordinate in pixels, drawn
+        from `rng`; the views' pose is then fitted to the noisy points at their true depths.
         """
         camera = _SimulatedCamera(self, points_O, T_CO, depth_factor, pixel_noise, rng)
         ideal = _SimulatedCamera(self, points_O, T_GO, 1.0, 0.0, None)
         history = self.run(camera.see, camera.move, ideal.see(), max_iterations, tolerance)
-        history.poses[:] = camera.poses[: history.iterations]  # the true ones, not those told
+        history.poses[:] = camera.poses[: history.iterations]  # the true poses, not the fitted ones
         return history
 
     def compute_joint_velocities(
@@ -359,9 +205,9 @@ class VisualServo(ABC):
         """Joint velocities (n,) that give the camera the twist v_C relative to what it looks at.
 
         end_effector_pose: (4, 4) T_WE. jacobian: (6, n) of E's origin in the axes of W, linear
-        first. secondary: (n,) wished joint velocities, done as far as they leave v_C alone. The
-        camera's mounting comes from camera_config. Raises SingularMatrixError in a singular
-        posture unless damped.
+        first. secondary: (n,) desired joint velocities of a second task, of which the part that
+        does not change v_C is added. damping: of the Jacobian's inverse. The camera's mounting
+        comes from camera_config. Raises SingularMatrixError in a singular posture without damping.
         """
         T_WE = check_pose("end_effector_pose", end_effector_pose)
         camera = self.camera
@@ -379,8 +225,19 @@ class VisualServo(ABC):
     def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         """Error (m,), L^+ error (6,), condition number of L."""
 
+    def _matched_points(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray]:
+        """Normalised coordinates (n, 2) of the points in the view and in the goal, checked."""
+        if view.points is None or goal.points is None:
+            raise FeatureCountError("points: needed in the view and in the goal, got None")
+        xy, xy_goal = self.camera.normalise(view.points), self._goal_xy(goal.points)
+        if len(xy) != len(xy_goal):
+            raise FeatureCountError(
+                f"points: the view has {len(xy)} and the goal has {len(xy_goal)}; give as many"
+            )
+        return xy, xy_goal
+
     def _goal_xy(self, points) -> np.ndarray:
-        """Normalised coordinates of the goal's points: checked once, not in every step."""
+        """Normalised coordinates of the goal's points; a goal is checked only once."""
         points = np.asarray(points, dtype=float)
         # Compared by value, as the caller may write into the array.
         content = points.tobytes(), points.shape
@@ -396,7 +253,7 @@ class VisualServo(ABC):
         converged: bool,
         reason: str,
     ) -> ServoHistory:
-        """What a run that saw `views` and answered with `steps`, one each, leaves behind."""
+        """The history of a run that answered each of `views` with one of `steps`."""
         unknown = np.full((4, 4), np.nan)
         no_points = np.empty((0, 2))
         return ServoHistory(
@@ -415,7 +272,7 @@ class VisualServo(ABC):
 
 
 class _SimulatedCamera:
-    """An ideal camera in front of points: sees them where they are and moves as it is told."""
+    """An ideal camera in front of points; it moves exactly with the commanded velocity."""
 
     def __init__(self, servo: VisualServo, points_O, T_CO, depth_factor, pixel_noise, rng):
         if pixel_noise and rng is None:
@@ -440,8 +297,8 @@ class _SimulatedCamera:
             pixels = pixels + self.rng.normal(0.0, self.pixel_noise, pixels.shape)
             xy = self.camera.normalise_unchecked(pixels)
             T_CO = pose_from_points(points_from_depths(xy, depths), self.points_O)
-        told = None if self.depth_factor is None else depths * self.depth_factor
-        return ServoView(pixels, told, T_CO)
+        seen_depths = None if self.depth_factor is None else depths * self.depth_factor
+        return ServoView(pixels, seen_depths, T_CO)
 
     def move(self, velocity: np.ndarray) -> None:
         self.T_CO = pose_exp(-self.dt * velocity) @ self.T_CO

@@ -1,8 +1,8 @@
-"""Servo runs with known outcomes: for the tests, the benchmark and `python -m utils.visual_servo`.
+"""Servo runs with known results: for the tests, the benchmark and `python -m utils.visual_servo`.
 
-The target is a square of 20 cm with four points; gain 0.5 1/s, 0.04 s a step, exact depths unless
-said. The references were computed beforehand with an exact SE(3) exponential and checked against
-machinevision-toolbox-python 2.4.1, so they are not figures of this code.
+The target is a square of 20 cm with a point in each corner. Gain 0.5 1/s, 0.04 s a step and exact
+depths, unless a row's name says otherwise. The references do not come from this code: they were
+computed with an exact SE(3) exponential and checked against machinevision-toolbox-python 2.4.1.
 """
 
 from __future__ import annotations
@@ -14,25 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from utils.errors import ServoError
 from utils.servo_control import AdaptiveGain
-from utils.servo_loop import ServoHistory
+from utils.servo_history import ServoHistory, compare
+from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.transforms import rotation_exp
-from utils.visual_servo import (
-    HybridVisualServo,
-    ImageBasedVisualServo,
-    PositionBasedVisualServo,
-    ServoError,
-)
 
 SQUARE = 0.1 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])  # metres in O
 FOCAL = 840.0  # pixels
 CAMERA = {"intrinsics": np.array([[FOCAL, 0.0, 320.0], [0.0, FOCAL, 240.0], [0.0, 0.0, 1.0]])}
 TOLERANCE = 1e-5  # norm of the image error in normalised coordinates
-STEADY_AFTER = 200  # iterations; what was at the start has decayed to 0.98^200 = 2 %
+STEADY_AFTER = 200  # iterations, after which the initial error has decayed to 0.98^200 = 2 %
+GAINS = (0.5, 1.0, 2.0, AdaptiveGain())  # 1/s, of the comparison
 
 
 class Row(NamedTuple):
-    """One figure beside what it should be; tolerance: relative, how far it may be off."""
+    """A measured figure and its reference; tolerance: allowed relative deviation."""
 
     name: str
     value: float
@@ -54,7 +51,7 @@ def object_pose(translation, rotation_degrees) -> np.ndarray:
 
 START = object_pose([0.15, -0.1, 1.0], [10, -10, 50])
 GOAL = object_pose([0, 0, 0.75], [0, 0, 0])
-NEAR_GOAL = object_pose([0, 0, 0.5], [0, 0, 0])  # no farther than any random start
+NEAR_GOAL = object_pose([0, 0, 0.5], [0, 0, 0])  # as near as the nearest random start
 FACING = object_pose([0, 0, 1.0], [0, 0, 0])
 
 
@@ -64,7 +61,8 @@ def turned(degrees: float) -> np.ndarray:
 
 
 def random_start(rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) T_CO: 0.5 to 1 m away, up to 10 cm aside, tilted up to 30 and turned up to 180 deg."""
+    """(4, 4) T_CO: 0.5 to 1 m away, up to 10 cm aside, tilted by up to 30 and turned by up to 180
+    degrees."""
     about = rng.uniform(0, 2 * np.pi)
     tilt = rng.uniform(0, 30) * np.array([np.cos(about), np.sin(about), 0])
     T = object_pose([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 1.0)], tilt)
@@ -73,21 +71,21 @@ def random_start(rng: np.random.Generator) -> np.ndarray:
 
 
 def image_errors(history: ServoHistory) -> np.ndarray:
-    """(k,) norms of the image error in normalised coordinates, whatever the law controlled."""
+    """(k,) norms of the image error in normalised coordinates, for any law."""
     difference = (history.points - history.goal_points) / FOCAL
     return np.linalg.norm(difference.reshape(len(difference), -1), axis=1)
 
 
 def iterations_to_tolerance(history: ServoHistory) -> int:
-    """Images until the image error is under TOLERANCE, that image included; 0 if it never is."""
+    """Number of images until the image error is under TOLERANCE, that image included; 0: never."""
     under = image_errors(history) < TOLERANCE
     return int(np.argmax(under)) + 1 if under.any() else 0
 
 
 def steady_noise(pixels: float, seeds: Sequence[int] = range(8)) -> tuple[float, float]:
-    """RMS pose error in mm and degrees of an image-based servo held at GOAL under noise.
+    """RMS pose error in mm and degrees of an image-based servo that stays at GOAL under noise.
 
-    One run of this length is good to about 5 %, because the noise lives on for 50 iterations.
+    One run of this length is accurate to about 5 %: its errors are correlated over 50 iterations.
     """
     squares = []
     for seed in seeds:
@@ -102,50 +100,57 @@ def steady_noise(pixels: float, seeds: Sequence[int] = range(8)) -> tuple[float,
 
 
 def rows() -> Iterator[Row]:
-    """Every figure of the reference table."""
+    """The rows of the reference table."""
 
     def from_start(servo, **options) -> ServoHistory:
         return servo.simulate(SQUARE, START, GOAL, **options)
 
     history = from_start(ImageBasedVisualServo(CAMERA), max_iterations=150, tolerance=0)
     norms = history.error_norms
-    yield Row("A error ratio after 150 iterations", norms[-1] / norms[0], 0.0490, 0.005)
+    yield Row("error ratio after 150 iterations", norms[-1] / norms[0], 0.0490, 0.005)
     for interaction, reference in (("current", 534), ("desired", 554), ("mean", 546)):
         history = from_start(ImageBasedVisualServo(CAMERA, interaction=interaction))
-        yield Row(f"A' iterations, {interaction} L", history.iterations, reference, 0.01)
+        yield Row(f"iterations, {interaction} L", history.iterations, reference, 0.01)
         if interaction == "current":
-            yield Row("A' final position (mm)", history.pose_errors()[0][-1] * 1e3, 0.011, 0.05)
+            yield Row("final position (mm), current L", history.pose_errors()[0][-1] * 1e3, 0.011, 0.05)
         if interaction == "desired":
             turn = np.degrees(history.pose_errors()[1][-1])
-            yield Row("A' final rotation (deg), desired L", turn, 0.0009, 0.06)
+            yield Row("final rotation (deg), desired L", turn, 0.0009, 0.06)
     adaptive = ImageBasedVisualServo(CAMERA, AdaptiveGain())
-    yield Row("A'' iterations, adaptive gain", from_start(adaptive).iterations, 132, 0.01)
+    yield Row("iterations, adaptive gain", from_start(adaptive).iterations, 132, 0.01)
     smooth = ImageBasedVisualServo(CAMERA, AdaptiveGain(), smooth_start=4.0)
-    yield Row("A'' iterations, smooth start too", from_start(smooth).iterations, 139, 0.01)
+    yield Row("iterations, adaptive gain, smooth start", from_start(smooth).iterations, 139, 0.01)
     for factor, reference in ((0.2, 2755), (0.5, 1117), (2, 544), (5, 547)):
         history = from_start(ImageBasedVisualServo(CAMERA), depth_factor=factor)
-        yield Row(f"B iterations, depth x {factor}", history.iterations, reference, 0.01)
+        yield Row(f"iterations, depths x {factor}", history.iterations, reference, 0.01)
     for pixels, millimetres, degrees in ((0.5, 1.7, 0.13), (1.0, 3.5, 0.26)):
         found = steady_noise(pixels)
-        yield Row(f"C steady RMS (mm), {pixels} px", found[0], millimetres, 0.1)
-        yield Row(f"C steady RMS (deg), {pixels} px", found[1], degrees, 0.1)
+        yield Row(f"steady RMS (mm), noise {pixels} px", found[0], millimetres, 0.1)
+        yield Row(f"steady RMS (deg), noise {pixels} px", found[1], degrees, 0.1)
     for degrees, reference in ((90, 0.42), (120, 1.03), (150, 2.98), (170, 11.6)):
         history = ImageBasedVisualServo(CAMERA).simulate(SQUARE, turned(degrees), FACING)
         retreat = history.poses[:, 2, 3].max() - 1.0
-        yield Row(f"D retreat (m), current L, {degrees} deg", retreat, reference, 0.013)
+        yield Row(f"retreat (m), current L, {degrees} deg", retreat, reference, 0.013)
     desired = ImageBasedVisualServo(CAMERA, interaction="desired")
     nearest = desired.simulate(SQUARE, turned(90), FACING).poses[:, 2, 3].min()
-    yield Row("D' nearest (m), desired L, 90 deg", nearest, 0.67, 0.0075)
+    yield Row("nearest (m), desired L, 90 deg", nearest, 0.67, 0.0075)
     for name, servo in (
         ("position-based", PositionBasedVisualServo(CAMERA)),
         ("2 1/2-D", HybridVisualServo(CAMERA, scheme="2.5d")),
     ):
         history = servo.simulate(SQUARE, turned(180), FACING)
-        yield Row(f"D' iterations, {name}, 180 deg", iterations_to_tolerance(history), 566, 0.01)
+        yield Row(f"iterations, {name}, 180 deg", iterations_to_tolerance(history), 566, 0.01)
+
+
+def gain_runs() -> dict[str, ServoHistory]:
+    """The image-based law from START to GOAL with each of GAINS, by the gain's name."""
+    names = (f"gain {g} 1/s" if isinstance(g, float) else "adaptive gain" for g in GAINS)
+    runs = (ImageBasedVisualServo(CAMERA, gain).simulate(SQUARE, START, GOAL) for gain in GAINS)
+    return dict(zip(names, runs))
 
 
 def outcome(servo, T_CO: np.ndarray, T_GO: np.ndarray) -> str:
-    """'converged after ...' or why not, also where the very first view is refused."""
+    """'converged after ...' or the reason why not, a refused first view included."""
     try:
         return servo.simulate(SQUARE, T_CO, T_GO).reason
     except ServoError as error:
@@ -154,28 +159,32 @@ def outcome(servo, T_CO: np.ndarray, T_GO: np.ndarray) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = ArgumentParser(description="Repeat known visual servoing results and draw them.")
-    parser.add_argument("--folder", type=Path, default=Path("runs/visual_servo"), help="of plots")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/visual_servo"), help="folder of the plots"
+    )
     folder = parser.parse_args(argv).folder
     print(f"{'what':40} {'value':>10} {'reference':>10}  holds")
     for row in rows():
         holds = "yes" if row.holds else "NO"
         print(f"{row.name:40} {row.value:10.4g} {row.reference:10.4g}  {holds}", flush=True)
-    print("\nG: turned by 180 degrees")
+    print("\nturned by 180 degrees about the optical axis")
     for name, servo in (
         ("image-based", ImageBasedVisualServo(CAMERA)),
         ("position-based", PositionBasedVisualServo(CAMERA)),
-        ("hybrid, blend", HybridVisualServo(CAMERA)),
-        ("hybrid, 2 1/2-D", HybridVisualServo(CAMERA, scheme="2.5d")),
+        ("blend", HybridVisualServo(CAMERA)),
+        ("2 1/2-D", HybridVisualServo(CAMERA, scheme="2.5d")),
     ):
         print(f"{name:16} {outcome(servo, turned(180), FACING)[:80]}")
     print()
     for name, servo, start, goal in (
         ("image_based", ImageBasedVisualServo(CAMERA), START, GOAL),
         ("position_based", PositionBasedVisualServo(CAMERA), START, GOAL),
-        ("hybrid_blend", HybridVisualServo(CAMERA), START, GOAL),
-        ("hybrid_2.5d", HybridVisualServo(CAMERA, scheme="2.5d"), START, GOAL),
+        ("blend", HybridVisualServo(CAMERA), START, GOAL),
+        ("2.5d", HybridVisualServo(CAMERA, scheme="2.5d"), START, GOAL),
         ("retreat_120_degrees", ImageBasedVisualServo(CAMERA), turned(120), FACING),
     ):
         path = folder / f"{name}.png"
         servo.simulate(SQUARE, start, goal).plot(path, title=name.replace("_", " "))
         print(f"wrote {path}")
+    compare(gain_runs(), folder / "gains.png")
+    print(f"wrote {folder / 'gains.png'}")
