@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from tests.helpers.servo_cases import directions, twists, unit
 from utils.transforms import (
     Grasp,
     ImageGrasp,
@@ -16,10 +18,16 @@ from utils.transforms import (
     image_to_grasp,
     inverse_pose,
     look_at,
+    pose_exp,
+    pose_log,
     pose_matrix,
     position_quaternion,
     project,
+    rotation_exp,
+    rotation_log,
+    skew,
     top_down_pose,
+    velocity_transform,
     wrap_to_pi_range,
 )
 
@@ -128,3 +136,63 @@ def test_frame_points_and_blinding():
     assert np.isnan(frame.points()[0, 1]).all()
     blind = frame.without_truth()
     assert blind.truth is None and blind.segmentation is None
+
+
+# Rigid motion
+
+
+def twist_matrix(twist):
+    A = np.zeros((4, 4))
+    A[:3, :3], A[:3, 3] = skew(twist[3:]), twist[:3]
+    return A
+
+
+@given(twists, st.sampled_from([0, 1e-9, 1e-6, 0.9e-4, 1.1e-4, 1, 2]))
+def test_exponential_is_the_matrix_exponential(twist, scale):
+    twist = twist * scale
+    np.testing.assert_allclose(pose_exp(twist), expm(twist_matrix(twist)), atol=1e-13)
+
+
+@given(directions, st.floats(0, np.pi - 1e-6), st.tuples(unit, unit, unit))
+def test_pose_log_undoes_the_exponential(axis, angle, linear):
+    twist = np.array([*linear, *(axis * angle)])
+    np.testing.assert_allclose(pose_log(pose_exp(twist)), twist, atol=1e-9)
+
+
+@given(directions, st.floats(-15, 0).map(lambda power: np.pi - 10**power))
+def test_rotation_log_near_pi(axis, angle):
+    R = rotation_exp(axis * angle)
+    np.testing.assert_allclose(rotation_exp(rotation_log(R)), R, atol=1e-14)
+    if angle < np.pi - 1e-9:
+        np.testing.assert_allclose(rotation_log(R), axis * angle, atol=1e-12)
+
+
+@given(directions)
+def test_rotation_log_at_pi_about_any_axis(axis):
+    # R = 2 u u^T - I is the rotation by pi about u; +u and -u are the same rotation.
+    found = rotation_log(2 * np.outer(axis, axis) - np.eye(3))
+    assert np.linalg.norm(found) == pytest.approx(np.pi, abs=1e-12)
+    np.testing.assert_allclose(np.outer(found, found) / np.pi**2, np.outer(axis, axis), atol=1e-12)
+
+
+@given(twists)
+def test_rotation_log_is_scipys(twist):
+    R = Rotation.from_rotvec(1.2 * twist[3:])
+    np.testing.assert_allclose(rotation_log(R.as_matrix()), R.as_rotvec(), atol=1e-12)
+
+
+@given(twists, twists)
+def test_velocity_transform_is_the_adjoint(pose, twist):
+    # T_AB [v_B] T_BA = [v_A] for the same motion, by definition of a change of frame.
+    T = pose_exp(pose)
+    seen = T @ twist_matrix(twist) @ inverse_pose(T)
+    np.testing.assert_allclose(twist_matrix(velocity_transform(T) @ twist), seen, atol=1e-12)
+
+
+def test_velocity_transform_has_the_lever_arm_by_hand():
+    # E turns with 2 rad/s about its z; a camera 0.1 m along E's x moves with w x r = 0.2 m/s in y.
+    T_CE = np.eye(4)
+    T_CE[0, 3] = -0.1
+    np.testing.assert_allclose(
+        velocity_transform(T_CE) @ [0, 0, 0, 0, 0, 2], [0, 0.2, 0, 0, 0, 2], atol=1e-15
+    )

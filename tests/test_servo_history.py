@@ -1,0 +1,54 @@
+"""The record of a run and its pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.helpers.servo_cases import CORNERS, LAW_NAMES, LAWS
+from utils.servo_history import compare
+from utils.servo_laws import PositionBasedVisualServo
+from utils.servo_loop import ServoView
+from utils.servo_reference import CAMERA, GOAL, SQUARE, START
+from utils.transforms import pose_exp
+
+
+@pytest.mark.parametrize("servo", LAWS, ids=LAW_NAMES)
+def test_history_holds_every_step_and_draws_itself(servo, tmp_path):
+    history = servo.simulate(SQUARE, START, GOAL, max_iterations=30)
+    k = history.iterations
+    assert k == 30 and history.times[-1] == pytest.approx(29 * 0.04)
+    assert history.poses.shape == (k, 4, 4) and history.velocities.shape == (k, 6)
+    assert (history.condition_numbers >= 1).all()
+    # Each pose is the one before, moved by the velocity recorded with it.
+    np.testing.assert_allclose(
+        history.poses[7], pose_exp(-0.04 * history.velocities[6]) @ history.poses[6], atol=1e-12
+    )
+    figure = history.plot(tmp_path / "sub" / "servo.png", title="test")
+    assert (tmp_path / "sub" / "servo.png").stat().st_size > 20_000
+    assert {"u (px)", "condition number"} <= {
+        label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel())
+    }
+
+
+def test_history_without_poses_or_points_still_draws(tmp_path):
+    by_image = LAWS[0].run(
+        lambda: ServoView(CORNERS + 5, 1.0), lambda v: None, ServoView(CORNERS, 1.0), 3
+    )
+    by_pose = LAWS[1].run(lambda: ServoView(T_CO=START), lambda v: None, ServoView(T_CO=GOAL), 3)
+    for history in by_image, by_pose:
+        history.plot(tmp_path / "servo.png")
+
+
+def test_runs_are_compared_in_one_picture(tmp_path):
+    runs = {
+        f"gain {gain}": PositionBasedVisualServo(CAMERA, gain).simulate(SQUARE, START, GOAL)
+        for gain in (1.0, 2.0)
+    }
+    figure = compare(runs, tmp_path / "gains.png")
+    assert (tmp_path / "gains.png").stat().st_size > 20_000
+    # The angle shrinks by 1 - gain dt a step.
+    last = [line.get_ydata()[50] for line in figure.axes[1].get_lines()]
+    assert last[1] / last[0] == pytest.approx((0.92 / 0.96) ** 50)
+    names = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    assert [name.split(":")[0] for name in names] == ["gain 1.0", "gain 2.0"]
