@@ -5,6 +5,7 @@
     make results PARTS=cornell CORNELL=path/to/cornell
     python -m benchmarks.results --list           # the parts, their commands and how long they take
     python -m benchmarks.results --write          # only write the tables from docs/results/*.json
+    python -m benchmarks.results --commit HASH    # what was measured at another commit, from runs/
 
 A part is a list of commands that anyone can run alone. The parts that stop early (Ctrl-C) go on
 with the next call: finished commands lie in runs/results/<commit>/, unfinished ones are resumed.
@@ -143,15 +144,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_parts(parts, options.scale)
         return 0
     if not options.write:
-        commit = code_commit()
+        commit = options.commit or code_commit()
         for part in parts:
-            if part.needs_cornell and options.cornell is None:
+            if options.commit is not None and not is_finished(part, commit, options.scale):
+                print(f"{part.name}: skipped, because {RUNS / commit} does not hold all of it")
+            elif part.needs_cornell and options.cornell is None and options.commit is None:
                 print(f"{part.name}: skipped, because no --cornell names a folder of photographs")
-                continue
-            measure(part, commit, options.scale, options.cornell)
-            print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}", flush=True)
-    else:
-        print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}")
+            else:
+                measure(part, commit, options.scale, options.cornell)
+                write_tables(FIGURES)
+    print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}", flush=True)
     return 0
 
 
@@ -162,6 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cornell", type=Path, help="folder of Cornell's photographs")
     parser.add_argument("--list", action="store_true", help="print the parts and measure nothing")
     parser.add_argument("--write", action="store_true", help="only write the tables again")
+    parser.add_argument("--commit", metavar="HASH", help="write what runs/ holds of that commit")
     return parser
 
 
@@ -208,7 +211,7 @@ def measure(part: Part, commit: str, scale: float, cornell: Path | None) -> None
     """Run a part's commands that are not finished yet, and write docs/results/<part>.json."""
     measured: dict[str, Any] = {}
     for command in part.commands:
-        file = RUNS / commit / f"{run_name(part, command, command.scaled(scale), commit)}.json"
+        file = finished_file(part, command, commit, scale)
         if not file.exists():
             write_json_atomic(file, run_command(part, command, scale, commit, cornell))
         measured[command.name] = json.loads(file.read_text())
@@ -216,6 +219,14 @@ def measure(part: Part, commit: str, scale: float, cornell: Path | None) -> None
             keep_rounds(part, command, Path(measured[command.name].pop("run")))
     content = {"part": part.name, "commit": commit, "seed": SEED, "date": str(date.today())}
     write_json_atomic(FIGURES / f"{part.name}.json", content | {"commands": measured})
+
+
+def is_finished(part: Part, commit: str, scale: float) -> bool:
+    return all(finished_file(part, one, commit, scale).exists() for one in part.commands)
+
+
+def finished_file(part: Part, command: Command, commit: str, scale: float) -> Path:
+    return RUNS / commit / f"{run_name(part, command, command.scaled(scale), commit)}.json"
 
 
 def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables of figures made up here, so that every cell is known; parts and commands of make results."""
+"""Tables of figures made up here, so that every cell is known; the parts of make results."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import results
 from benchmarks.result_tables import PAGES, TABLES, rate, with_tables
-from benchmarks.results import PARTS, chosen_parts, keep_rounds, main
+from benchmarks.results import PARTS, chosen_parts, main
 from utils.config import load_config
 from utils.errors import UserError
 
@@ -93,17 +93,24 @@ def test_commands_are_valid_and_take_fresh_seeds(capsys):
     assert "seed=2027" in capsys.readouterr().out
 
 
-def test_the_first_rounds_of_each_row_are_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(results, "FIGURES", tmp_path)
-    lines = [
-        json.dumps({"objects": "box", "scenario": "pile", "policy": policy, "seed": 202700000 + i})
-        for i in (12, 1, 10, 9)
-        for policy in ("oracle", "heuristic")
-    ]
-    (tmp_path / "rounds.jsonl").write_text("\n".join(lines) + "\n")
-    part = PARTS[0]
-    keep_rounds(part, part.commands[0], tmp_path)
-    kept = (tmp_path / "scoreboard-scoreboard.jsonl").read_text().splitlines()
-    assert [(json.loads(x)["policy"], json.loads(x)["seed"] % 100) for x in kept] == [
-        ("heuristic", 1), ("heuristic", 9), ("oracle", 1), ("oracle", 9),
-    ]  # fmt: skip
+def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = []
+
+    def run_command(part, command, scale, commit, cornell):
+        lines.append(command.line(command.scaled(scale)))
+        if command.name == "primitives" and len(lines) == 3:
+            raise KeyboardInterrupt
+        return {"command": lines[-1], "rows": [row(command.name, 3, 4)]}
+
+    monkeypatch.setattr(results, "run_command", run_command)
+    (part,) = chosen_parts("ppo")
+    with pytest.raises(KeyboardInterrupt):
+        results.measure(part, "c0ffee", 0.1, None)
+    assert not (results.FIGURES / "ppo.json").exists()
+    results.measure(part, "c0ffee", 0.1, None)
+    assert len(lines) == 4 and lines[2] == lines[3]
+    content = json.loads((results.FIGURES / "ppo.json").read_text())
+    assert (content["commit"], content["seed"]) == ("c0ffee", 2027)
+    assert list(content["commands"]) == ["box", "random_urdfs", "primitives"]
+    assert results.is_finished(part, "c0ffee", 0.1) and not results.is_finished(part, "dead", 0.1)
