@@ -1,0 +1,108 @@
+"""Policies of Stable-Baselines3: loaded, checked against the environment, and at work in a cell."""
+
+import builtins
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envs.cell_scenes import make_scene
+from envs.objects import load_object_set
+from envs.policy_approach import check_learned, is_learned, learned_approach, placeholder
+from envs.pybullet_cell import PybulletCell
+from envs.rounds import run_round
+from models.sb3_policy import load_sb3
+from utils.config import load_config
+from utils.errors import UserError
+
+stable_baselines3 = pytest.importorskip("stable_baselines3")
+SETTINGS = {"observations": ["state"], "control": "ee_planar", "max_steps": 4}
+CONFIG = load_config(
+    None,
+    ["env.observations=state", "env.control=ee_planar", "env.max_steps=4", "sim.renderer=tiny"],
+)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The files of a PPO and a SAC policy, each trained for a few steps."""
+    folder = tmp_path_factory.mktemp("sb3")
+    env = gymnasium.make("RobotGrasping-v0", **SETTINGS)
+    few = {"PPO": {"n_steps": 8, "batch_size": 8, "n_epochs": 1}, "SAC": {"learning_starts": 4}}
+    for name, settings in few.items():
+        algorithm = getattr(stable_baselines3, name)
+        model = algorithm("MultiInputPolicy", env, seed=0, device="cpu", **settings)
+        model.learn(8).save(folder / f"{name}.zip")
+    env.close()
+    return folder
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC"])
+def test_the_algorithm_is_found_and_its_actions_are_the_model_s(files, name):
+    policy = load_sb3(files / f"{name}.zip")
+    assert type(policy.model).__name__ == name
+    observation = {"state": np.linspace(-0.1, 0.1, 15, dtype=np.float32), "other": np.zeros(3)}
+    model = getattr(stable_baselines3, name).load(files / f"{name}.zip", device="cpu")
+    expected, _ = model.predict({"state": observation["state"]}, deterministic=True)
+    np.testing.assert_array_equal(policy(observation), expected)
+
+
+def test_a_trained_policy_is_scored(files):
+    name = f"sb3:{files / 'PPO.zip'}"
+    assert is_learned(name) and not is_learned("sb3")
+    check_learned(name, ["isolated"], ["open_loop"], CONFIG)
+    objects = load_object_set("box", cache_dir=CONFIG.cache_folder)
+    with PybulletCell(CONFIG) as cell:
+        record = run_round(
+            cell, make_scene("isolated", objects, 0, CONFIG), placeholder, policy=name,
+            objects="box", max_failures=1, approach_by=learned_approach(name, cell),
+        )  # fmt: skip
+    (attempt,) = record.attempts
+    assert (record.policy, attempt.reason) == (name, "stopped"), "eight steps teach no grasp"
+    assert "gripped nothing" in attempt.detail
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "env.observations=depth",
+            r"observes state \(15,\) float32, but the section env gives depth",
+        ),
+        ("env.control=joint", r"has actions of shape \(5,\), but env.control expects \(8,\)"),
+    ],
+)
+def test_a_policy_of_other_spaces_is_refused(files, override, message):
+    config = load_config(None, ["sim.renderer=tiny", "env.control=ee_planar", override])
+    with pytest.raises(UserError, match=message):
+        check_learned(f"sb3:{files / 'SAC.zip'}", ["isolated"], ["open_loop"], config)
+
+
+def test_images_may_have_their_channels_first(files):
+    policy = load_sb3(files / "PPO.zip")
+    policy.observation_space = spaces.Dict({"rgb": spaces.Box(0, 255, (3, 64, 48), np.uint8)})
+    ours = {"rgb": spaces.Box(0, 255, (64, 48, 3), np.uint8), "state": spaces.Box(0, 1, (15,))}
+    policy.check_spaces(spaces.Dict(ours), policy.action_space)
+    policy.observation_space = spaces.Box(0, 1, (15,))
+    with pytest.raises(UserError, match="expected a Dict of rgb .64, 48, 3. uint8, state"):
+        policy.check_spaces(spaces.Dict(ours), policy.action_space)
+
+
+def test_a_file_that_is_none_is_refused(tmp_path):
+    with pytest.raises(UserError, match="cannot read this file: No such file"):
+        load_sb3(tmp_path / "missing.zip")
+    (tmp_path / "other.zip").write_text("no zip")
+    with pytest.raises(UserError, match="not a policy of Stable-Baselines3"):
+        load_sb3(tmp_path / "other.zip")
+
+
+def test_without_the_package_one_sentence_says_so(tmp_path, monkeypatch):
+    def without(name, *rest, imported=builtins.__import__):
+        if name == "stable_baselines3":
+            raise ModuleNotFoundError(name)
+        return imported(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(UserError, match="is not installed; pip install stable-baselines3"):
+        load_sb3(tmp_path / "policy.zip")
