@@ -145,8 +145,8 @@ def planner_errors(name: str) -> Iterator[None]:
         yield
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{last.filename}, line {last.lineno}"
-        raise PlannerError(f"{name} raised {type(error).__name__}: {error} ({place})") from error
+        message, place = " ".join(str(error).split()), f"{last.filename}, line {last.lineno}"
+        raise PlannerError(f"{name} raised {type(error).__name__}: {message} ({place})") from error
 
 
 def checked_grasps(grasps: object) -> Sequence[Grasp]:

@@ -6,13 +6,13 @@ import pytest
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
-from envs.cell_scenes import LAYOUTS, Placement, Scene, SceneError, make_scene
+from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.execution import choose_posture, execute_grasp
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
 from envs.robot_kinematics import forward_kinematics, inverse_kinematics
-from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
+from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.config import with_settings
 from utils.transforms import Grasp, top_down_pose
 
@@ -26,16 +26,6 @@ def cell(config):
 @pytest.fixture(scope="module")
 def primitives(config):
     return load_object_set("primitives", cache_dir=config.cache_folder)
-
-
-def cube_scene(box_set, position=(0.5, 0.0, 0.03), yaw=0.0) -> Scene:
-    """One 6 cm cube lying flat at a known place."""
-    quaternion = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
-    return Scene("isolated", 0, (Placement(box_set[0], np.array(position), quaternion),))
-
-
-def cube_grasp(angle=0.0, offset=(0.0, 0.0, 0.0), width=0.08) -> Grasp:
-    return Grasp(np.array([0.5, 0.0, 0.03]) + offset, angle, width, 1.0)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -211,19 +201,6 @@ def test_non_finite_physics_is_noticed(cell, box_set):
     )
     with pytest.raises(PhysicsError):
         cell.check_physics()
-    record = run_round(
-        cell, cube_scene(box_set), _break_physics(cell), policy="x", objects="b", max_failures=2
-    )
-    assert record.ended == "physics"
-    assert [attempt.reason for attempt in record.attempts] == ["physics"]
-
-
-def _break_physics(cell):
-    def plan(frame):
-        pybullet.resetJointState(cell.robot.body, 0, np.nan, physicsClientId=cell.client)
-        return [cube_grasp()]
-
-    return plan
 
 
 def test_lost_objects_are_retired(cell, box_set):
@@ -232,102 +209,3 @@ def test_lost_objects_are_retired(cell, box_set):
         cell.bodies[0], [0.5, 0.0, -0.5], [0, 0, 0, 1], physicsClientId=cell.client
     )
     assert cell.retire_lost_objects() == [0] and not cell.remaining
-
-
-def test_rounds_are_deterministic_whatever_came_before(cell, config, primitives):
-    scene = make_scene("pile", primitives, 5, config)
-    from models.planners import make_planner
-    from utils.geometry import GripperGeometry, Workspace
-
-    def play():
-        plan = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
-        record = run_round(cell, scene, plan, policy="h", objects="p", max_failures=2)
-        poses = [cell.object_pose(i) for i in range(len(cell.bodies))]
-        return [(a.reason, a.sim_seconds) for a in record.attempts], np.array(poses)
-
-    reasons, poses = play()
-    cell.load(make_scene("packed", primitives, 6, config))
-    cell.step(100)
-    again, poses_again = play()
-    assert reasons == again
-    np.testing.assert_array_equal(poses, poses_again)
-
-
-def _planner_that_returns(grasps):
-    return lambda frame: list(grasps)
-
-
-def test_stop_rule(cell, box_set):
-    scene = cube_scene(box_set)
-    settings = {"policy": "x", "objects": "box", "max_failures": 2}
-    cleared = run_round(cell, scene, _planner_that_returns([cube_grasp()]), **settings)
-    assert (cleared.ended, cleared.objects_cleared, cleared.successes) == ("cleared", 1, 1)
-    nothing = run_round(cell, scene, _planner_that_returns([]), **settings)
-    assert (nothing.ended, nothing.executed, nothing.objects_cleared) == ("no_plan", 0, 0)
-    miss = cube_grasp(offset=(0.13, 0, 0))
-    failed = run_round(cell, scene, _planner_that_returns([miss]), **settings)
-    assert (failed.ended, failed.executed, failed.successes) == ("failures", 2, 0)
-
-
-def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
-    first, again, beside, turned = (
-        Grasp(np.array([x, 0.0, 0.05]), angle, 0.08, 1.0)
-        for x, angle in ((0.5, 0.0), (0.51, 0.1), (0.53, 0.0), (0.5, 1.0))
-    )
-    assert first_untried([first, beside], []) is first
-    assert first_untried([again, beside, turned], [first]) is beside
-    assert first_untried([again, turned], [first]) is turned
-    assert first_untried([again, first], [first]) is again  # nothing else is left
-
-
-def test_no_grasp_goes_as_deep_as_the_palm_was_stopped_there() -> None:
-    here, near, far, above = (
-        Grasp(np.array([x, 0.0, z]), 0.0, 0.08, 1.0)
-        for x, z in ((0.5, 0.01), (0.515, 0.01), (0.525, 0.01), (0.5, 0.06))
-    )
-    raised = no_deeper(near, [above, here], [None, 0.04])
-    np.testing.assert_allclose(raised.position, [0.515, 0.0, 0.04 + ROOM_OVER_TOUCH])
-    assert no_deeper(far, [here], [0.04]) is far
-    assert no_deeper(above, [here], [0.04]) is above
-    assert no_deeper(near, [here], [None]) is near
-    assert no_deeper(near, [], []) is near
-
-
-def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
-    """A cube 60 mm high, grasped 12 mm over the table: the palm, 39 mm over E, meets its top
-    when E is 21 mm up. The same grasp again, raised over that, succeeds."""
-    deep = cube_grasp(offset=(0, 0, -0.018))
-    heights = []
-    record = run_round(
-        cell, cube_scene(box_set), _planner_that_returns([deep]), policy="x", objects="box",
-        max_failures=2, on_attempt=lambda frame, grasp, outcome: heights.append(
-            (grasp.position[2], outcome.palm_stopped_at)
-        ),
-    )  # fmt: skip
-    assert [attempt.reason for attempt in record.attempts] == ["collision", "success"]
-    (first, stopped), (second, not_stopped) = heights
-    assert first == pytest.approx(0.012) and stopped == pytest.approx(0.021, abs=0.002)
-    assert second == stopped + ROOM_OVER_TOUCH and not_stopped is None
-
-
-def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -> None:
-    """What failed is remembered, all of it, and forgotten after a success: the planner names the
-    same two grasps out of reach before the cube's each time."""
-    places = [(0.5, -0.08, 0.03), (0.5, 0.08, 0.03)]
-    scene = Scene(
-        "packed", 0, tuple(Placement(box_set[0], np.array(p), np.eye(4)[3]) for p in places)
-    )
-    bad = [Grasp(np.array([1.5, y, 0.03]), 0.0, 0.08, 1.0) for y in (0.0, 0.1)]
-    good = [Grasp(np.array(p), 0.0, 0.08, 0.5) for p in places]
-    tried = []
-
-    def plan(frame):
-        return [*bad, good[2 - len(cell.remaining)]]  # the cubes one after the other
-
-    record = run_round(
-        cell, scene, plan, policy="x", objects="box", max_failures=3,
-        on_attempt=lambda frame, grasp, outcome: tried.append(grasp),
-    )  # fmt: skip
-    assert [id(grasp) for grasp in tried] == [id(g) for g in (*bad, good[0], *bad, good[1])]
-    assert [attempt.success for attempt in record.attempts] == [False, False, True] * 2
-    assert (record.ended, record.objects_cleared) == ("cleared", 2)

@@ -21,7 +21,7 @@ from envs.rounds import run_round
 from models.planners import make_planner, needs_truth
 from utils.config import run_script as end_like_a_script
 from utils.geometry import GripperGeometry, Workspace
-from utils.result_records import read_rounds
+from utils.result_records import read_rounds, write_sample
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box"]
@@ -101,6 +101,70 @@ def test_policies_see_the_same_scenes(finished):
     assert seeds["heuristic"] == seeds["random"] == {0, 1}
 
 
+def test_a_run_is_compared_with_another(finished, tmp_path, monkeypatch, capsys):
+    """Both played by the same code: no difference but that of the policies."""
+    folder, _ = finished
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in ("config.yaml", "rounds.jsonl"):
+        shutil.copy(only_run(folder) / file, other)
+    monkeypatch.chdir(tmp_path)
+    files = ["--csv", "pairs.csv", "--latex", "pairs.tex", "--results", "pairs.json"]
+    assert evaluate.main(["--compare", str(only_run(folder)), str(other), *files]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4 and all("+0.0 [+0.0, +0.0]  2" in line for line in lines[2:])
+    pairs = json.loads((tmp_path / "pairs.json").read_text())["comparisons"]
+    assert [pair["first"][:9] for pair in pairs] == ["heuristic", "random (2"]
+    assert pairs[0]["cleared"] == {"value": 0.0, "low": 0.0, "high": 0.0, "rounds": 2}
+    assert len((tmp_path / "pairs.csv").read_text().splitlines()) == 3
+    assert "toprule" in (tmp_path / "pairs.tex").read_text()
+    assert not (tmp_path / "runs").exists(), "nothing is played"
+
+
+def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, capsys):
+    """A round that is the same, and one whose published outcome was changed."""
+    folder, _ = finished
+    write_sample(only_run(folder), tmp_path / "sample.jsonl", count=1)
+    origin, heuristic, random = (tmp_path / "sample.jsonl").read_text().splitlines()
+    changed = json.loads(heuristic)
+    changed["attempts"][0]["sim_seconds"] += 0.1
+    (tmp_path / "sample.jsonl").write_text("\n".join([origin, json.dumps(changed), random]))
+    monkeypatch.chdir(tmp_path)
+    assert evaluate.main(["--replay", "sample.jsonl", "evaluate.workers=1"]) == 1
+    told = capsys.readouterr().out
+    assert "different: heuristic, isolated, scene 0" in told
+    assert "1 of 2 rounds are the same" in told
+
+
+MODULE = """
+from utils.transforms import Grasp
+
+def plan(frame):
+    return []
+
+class Careless:
+    def __init__(self, gripper, workspace, seed):
+        self.opening, self.centre = gripper.max_opening, workspace.centre
+
+    def __call__(self, frame):
+        raise KeyError("no grasp")
+"""
+
+
+def test_planners_of_another_module_are_scored(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_planners.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    policies = "evaluate.policies=my_planners:plan,my_planners:Careless"
+    settings = ["evaluate.scenarios=isolated", "evaluate.rounds=1", "evaluate.workers=1"]
+    assert evaluate.main([*SMALL[2:], policies, *settings]) == 0, "the run goes on"
+    assert "my_planners:Careless raised KeyError: 'no grasp'" in capsys.readouterr().out
+    rows = json.loads((only_run(tmp_path) / "results.json").read_text())["rows"]
+    assert [row["policy"] for row in rows] == ["my_planners:plan", "my_planners:Careless"]
+    assert [row["failures"]["no_plan"] for row in rows] == [1, 0]
+    assert [row["failures"]["planner_error"] for row in rows] == [0, 1]
+    assert [row["attempts"] for row in rows] == [0, 0]
+
+
 def test_resume_runs_only_what_is_missing(finished):
     folder, _ = finished
     run = only_run(folder)
@@ -150,6 +214,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
     ("arguments", "message"),
     [
         (["evaluate.policies=heuristik"], "heuristic"),
+        (["evaluate.policies=no_such_module:plan"], "there is no module 'no_such_module'"),
+        (["evaluate.policies=sb3:none.zip", "evaluate.scenarios=isolated"], "none.zip"),
+        (["--compare", "here", "there"], "--compare here: not the folder of an evaluation"),
+        (["--replay", "none.jsonl"], "none.jsonl: cannot read this sample"),
+        (["--csv", "no/such/folder/x.csv"], "no/such/folder"),
         (["evaluate.policies=ppo", "evaluate.scenarios=pile"], "allowed with it are"),
         (["evaluate.policies=ppo:none.pt", "evaluate.scenarios=isolated"], "none.pt"),
         (
@@ -169,7 +238,7 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["cache_dir=/dev/null/x"], "cache_dir"),
         (
             ["evaluate.controllers=[open_loop,ibvs]", "closed_loop.controller=pbvs"],
-            "closed_loop.controller=pbvs would be ignored: evaluate.controllers is [open_loop, ibvs]",
+            "closed_loop.controller=pbvs would be ignored: evaluate.controllers is [open_loop,",
         ),
         (["evaluate.controllers=ibvs", "closed_loop.controller=open_loop"], "would be ignored"),
     ],

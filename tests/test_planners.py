@@ -5,6 +5,7 @@ import pytest
 
 from models.planners import PLANNERS, make_planner, needs_truth, reset_planner
 from tests.helpers.box_frames import boxes_frame
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame, angle_difference
 
@@ -54,6 +55,19 @@ def test_a_planner_of_ones_own_is_made_by_its_import_path() -> None:
     assert made(frame)[0].width == GripperGeometry().max_opening
     reset_planner(made, 7)
     assert made(frame)[0].quality == 7
+
+
+def make_one(gripper, workspace, seed):
+    """A function that makes a planner."""
+    return WithMemory(gripper, workspace, seed) if seed else 3
+
+
+def test_a_function_with_the_three_parameters_makes_the_planner() -> None:
+    assert planner("tests.test_planners:make_one", seed=5).seed == 5
+    with pytest.raises(UserError, match="make_one' made a int, expected a planner"):
+        planner("tests.test_planners:make_one", seed=0)
+    with pytest.raises(UserError, match="'pathlib:PurePath' raised TypeError: .*; it is called"):
+        planner("pathlib:PurePath")
 
 
 def test_oracle_without_truth_says_what_is_missing() -> None:

@@ -1,0 +1,179 @@
+"""A round: when it ends, which grasps are tried, and planners that fail."""
+
+import numpy as np
+import pybullet
+import pytest
+
+from envs.cell_scenes import Placement, Scene, make_scene
+from envs.objects import load_object_set
+from envs.pybullet_cell import PybulletCell
+from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
+from models.planners import make_planner
+from tests.helpers.cubes import cube_grasp, cube_scene
+from utils.geometry import GripperGeometry, Workspace
+from utils.transforms import Grasp
+
+
+@pytest.fixture(scope="module")
+def cell(config):
+    with PybulletCell(config) as cell:
+        yield cell
+
+
+def planner_of(grasps):
+    """A planner that returns these whatever it sees."""
+    return lambda frame: list(grasps)
+
+
+def test_rounds_are_deterministic_whatever_came_before(cell, config):
+    primitives = load_object_set("primitives", cache_dir=config.cache_folder)
+    scene = make_scene("pile", primitives, 5, config)
+
+    def play():
+        plan = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
+        record = run_round(cell, scene, plan, policy="h", objects="p", max_failures=2)
+        poses = [cell.object_pose(i) for i in range(len(cell.bodies))]
+        return [(a.reason, a.sim_seconds) for a in record.attempts], np.array(poses)
+
+    reasons, poses = play()
+    cell.load(make_scene("packed", primitives, 6, config))
+    cell.step(100)
+    again, poses_again = play()
+    assert reasons == again
+    np.testing.assert_array_equal(poses, poses_again)
+
+
+def test_stop_rule(cell, box_set):
+    scene = cube_scene(box_set)
+    settings = {"policy": "x", "objects": "box", "max_failures": 2}
+    cleared = run_round(cell, scene, planner_of([cube_grasp()]), **settings)
+    assert (cleared.ended, cleared.objects_cleared, cleared.successes) == ("cleared", 1, 1)
+    nothing = run_round(cell, scene, planner_of([]), **settings)
+    assert (nothing.ended, nothing.executed, nothing.objects_cleared) == ("no_plan", 0, 0)
+    miss = cube_grasp(offset=(0.13, 0, 0))
+    failed = run_round(cell, scene, planner_of([miss]), **settings)
+    assert (failed.ended, failed.executed, failed.successes) == ("failures", 2, 0)
+
+
+def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
+    first, again, beside, turned = (
+        Grasp(np.array([x, 0.0, 0.05]), angle, 0.08, 1.0)
+        for x, angle in ((0.5, 0.0), (0.51, 0.1), (0.53, 0.0), (0.5, 1.0))
+    )
+    assert first_untried([first, beside], []) is first
+    assert first_untried([again, beside, turned], [first]) is beside
+    assert first_untried([again, turned], [first]) is turned
+    assert first_untried([again, first], [first]) is again  # nothing else is left
+
+
+def test_no_grasp_goes_as_deep_as_the_palm_was_stopped_there() -> None:
+    here, near, far, above = (
+        Grasp(np.array([x, 0.0, z]), 0.0, 0.08, 1.0)
+        for x, z in ((0.5, 0.01), (0.515, 0.01), (0.525, 0.01), (0.5, 0.06))
+    )
+    raised = no_deeper(near, [above, here], [None, 0.04])
+    np.testing.assert_allclose(raised.position, [0.515, 0.0, 0.04 + ROOM_OVER_TOUCH])
+    assert no_deeper(far, [here], [0.04]) is far
+    assert no_deeper(above, [here], [0.04]) is above
+    assert no_deeper(near, [here], [None]) is near
+    assert no_deeper(near, [], []) is near
+
+
+def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
+    """A cube 60 mm high, grasped 12 mm over the table: the palm, 39 mm over E, meets its top
+    when E is 21 mm up. The same grasp again, raised over that, succeeds."""
+    deep = cube_grasp(offset=(0, 0, -0.018))
+    heights = []
+    record = run_round(
+        cell, cube_scene(box_set), planner_of([deep]), policy="x", objects="box",
+        max_failures=2, on_attempt=lambda frame, grasp, outcome: heights.append(
+            (grasp.position[2], outcome.palm_stopped_at)
+        ),
+    )  # fmt: skip
+    assert [attempt.reason for attempt in record.attempts] == ["collision", "success"]
+    (first, stopped), (second, not_stopped) = heights
+    assert first == pytest.approx(0.012) and stopped == pytest.approx(0.021, abs=0.002)
+    assert second == stopped + ROOM_OVER_TOUCH and not_stopped is None
+
+
+def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -> None:
+    """What failed is remembered, all of it, and forgotten after a success: the planner names the
+    same two grasps out of reach before the cube's each time."""
+    places = [(0.5, -0.08, 0.03), (0.5, 0.08, 0.03)]
+    scene = Scene(
+        "packed", 0, tuple(Placement(box_set[0], np.array(p), np.eye(4)[3]) for p in places)
+    )
+    bad = [Grasp(np.array([1.5, y, 0.03]), 0.0, 0.08, 1.0) for y in (0.0, 0.1)]
+    good = [Grasp(np.array(p), 0.0, 0.08, 0.5) for p in places]
+    tried = []
+
+    def plan(frame):
+        return [*bad, good[2 - len(cell.remaining)]]  # the cubes one after the other
+
+    record = run_round(
+        cell, scene, plan, policy="x", objects="box", max_failures=3,
+        on_attempt=lambda frame, grasp, outcome: tried.append(grasp),
+    )  # fmt: skip
+    assert [id(grasp) for grasp in tried] == [id(g) for g in (*bad, good[0], *bad, good[1])]
+    assert [attempt.success for attempt in record.attempts] == [False, False, True] * 2
+    assert (record.ended, record.objects_cleared) == ("cleared", 2)
+
+
+def test_physics_that_blows_up_ends_the_round(cell, box_set):
+    def plan(frame):
+        pybullet.resetJointState(cell.robot.body, 0, np.nan, physicsClientId=cell.client)
+        return [cube_grasp()]
+
+    record = run_round(cell, cube_scene(box_set), plan, policy="x", objects="b", max_failures=2)
+    assert record.ended == "physics"
+    assert [attempt.reason for attempt in record.attempts] == ["physics"]
+
+
+class Planner:
+    """A planner that keeps the seeds of its resets and fails where it is told to."""
+
+    def __init__(self, failing_seed=None):
+        self.failing_seed, self.seeds = failing_seed, []
+
+    def reset(self, seed):
+        self.seeds.append(seed)
+
+    def __call__(self, frame):
+        assert frame.truth is None
+        if self.seeds[-1] == self.failing_seed:
+            raise RuntimeError("no idea")
+        return [cube_grasp()]
+
+
+def test_a_planner_that_raises_ends_its_round_alone(cell, box_set):
+    planner, settings = Planner(failing_seed=1), {"objects": "box", "max_failures": 2}
+    scenes = [Scene("isolated", seed, cube_scene(box_set).placements) for seed in range(3)]
+    rounds = [run_round(cell, scene, planner, policy="mine:plan", **settings) for scene in scenes]
+    assert [record.ended for record in rounds] == ["cleared", "planner_error", "cleared"]
+    assert planner.seeds == [0, 1, 2], "reset for every round"
+    (attempt,) = rounds[1].attempts
+    assert attempt.reason == "planner_error" and rounds[1].executed == 0
+    assert "mine:plan raised RuntimeError: no idea" in attempt.detail
+    assert "test_rounds.py, line" in attempt.detail
+
+
+@pytest.mark.parametrize("result", [None, 3, [(0.5, 0.0, 0.1)], np.zeros((2, 3))])
+def test_a_planner_that_returns_something_else_is_named(cell, box_set, result):
+    record = run_round(
+        cell, cube_scene(box_set), lambda frame: result, policy="mine", objects="box",
+        max_failures=2,
+    )  # fmt: skip
+    assert record.ended == "planner_error"
+    assert "mine raised TypeError: a planner returns a list of Grasp" in record.attempts[0].detail
+
+
+def test_a_privileged_planner_sees_the_truth(cell, box_set):
+    class Privileged:
+        needs_truth = True
+
+        def __call__(self, frame):
+            return [] if frame.truth is None else [cube_grasp()]
+
+    scene, settings = cube_scene(box_set), {"policy": "x", "objects": "box", "max_failures": 1}
+    assert run_round(cell, scene, Privileged(), **settings).ended == "cleared"
+    assert run_round(cell, scene, lambda frame: Privileged()(frame), **settings).ended == "no_plan"
