@@ -1,26 +1,31 @@
 """Ranked grasps for your own RGB-D image.
 
     python predict.py --rgb rgb.png --depth depth.png --intrinsics 615 615 320 240
+    python predict.py ... --intrinsics intrinsics.json      # {"fx": 615, "fy": 615, "cx": 320, ...}
     python predict.py ... --camera-pose T_WC.txt --table-height 0.02    # grasps in your world, too
     python predict.py --export graspnet.onnx                            # the network for ONNX
 
---depth is a PNG, TIFF or NPY of the colour image's size: whole numbers are millimetres, floats
-metres; --depth-scale says otherwise. --intrinsics are fx fy cx cy in pixels, with integers at
-pixel centres. --camera-pose is T_WC, 4x4, .npy, .txt, .json or .yaml: it takes a point in the
-camera's optical frame (x right, y down, z forward) to the world, whose z is up.
+--depth is a PNG, TIFF or NPY file of the colour image's size. Whole numbers are millimetres, floats
+metres; --depth-scale sets another unit. --intrinsics are fx fy cx cy in pixels, with integers at
+pixel centres, or a JSON file with these keys (and width and height, which are checked), as
+`python -m envs.studio --rgbd FOLDER` writes it. --camera-pose is T_WC, 4x4, .npy, .txt, .json or
+.yaml: it takes a point in the camera's optical frame (x right, y down, z forward) to the world,
+whose z is up.
 
-Without --table-height the table is the dominant plane of the depth image; without --camera-pose
-the gripper descends along that plane's normal. Prints JSON and writes it to OUT/grasps.json,
-with a picture in OUT/grasps.png. Of each grasp: `pixel` (u, v) and `image_angle` (from right
-towards down) on the image; `width` between the fingertips; and in `camera` and `world` the pose of
-the middle between the closed finger pads, 7 mm above the tips: z along the approach, y along the
-closing line. Metres and radians; quaternions are x, y, z, w. Nothing to grasp is an empty list; a
-bad input ends with one sentence and status 2.
+Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
+the gripper descends along that plane's normal. The program prints JSON, and writes it to
+OUT/grasps.json with a picture in OUT/grasps.png; OUT is runs/predict/<name of the image>, with a
+number where another image of that name was first. Each grasp has `pixel` (u, v) and `image_angle`
+(from right towards down) on the image, `width` between the finger pads, and in `camera` and `world`
+the pose of the middle between the pads, 7.2 mm above the lowest point of the fingertips: z along
+the approach, y along the closing line. Units are metres and radians; quaternions are x, y, z, w. If
+there is nothing to grasp the list is empty. Bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -36,12 +41,12 @@ from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
 from utils.config import run_script
 from utils.errors import UserError
 from utils.image_overlay import is_prediction_panel, prediction_panel
-from utils.images import intrinsics_matrix, read_depth, read_pose, read_rgb
+from utils.images import read_depth, read_intrinsics, read_pose, read_rgb
 from utils.runs import write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
 
-FORMAT = "robot-grasping grasps"  # tells our grasps.json from others
+FORMAT = "robot-grasping grasps"  # marks a grasps.json of this program
 VERSION = 1
 
 
@@ -55,13 +60,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"wrote {options.export}", file=sys.stderr)
         return 0
 
-    out = options.out or Path("runs/predict") / options.rgb.stem
-    check_output(out, None if options.out else options.rgb)
-    seen = read_image(options)
-    training_scale(seen, saved.metres_per_pixel)  # tells wrong units before a table is looked for
-    table = locate_table(seen, options)
+    out = options.out or free_folder(Path("runs/predict") / options.rgb.stem, options.rgb)
+    check_output(out)
+    image = read_image(options)
+    training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
+    table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
-    frame = replace(seen, T_WC=table.T_WC)
+    frame = replace(image, T_WC=table.T_WC)
     found = predict(saved.model, saved.metres_per_pixel, frame, table.height, options.count)
 
     text = json.dumps(as_plain(found, frame, table, options), indent=2, allow_nan=False)
@@ -80,14 +85,16 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image, PNG or JPEG")
     parser.add_argument("--depth", type=Path, metavar="FILE", help="depth, PNG, TIFF or NPY")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres for 1 in the file")
-    parser.add_argument("--intrinsics", type=float, nargs="+", metavar="F", help="fx fy cx cy")
+    parser.add_argument(
+        "--intrinsics", nargs="+", metavar="F", help="fx fy cx cy, or a JSON file with these keys"
+    )
     parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
     parser.add_argument("--table-height", type=float, metavar="Z", help="m in the world")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", default=SHIPPED)
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
     )
-    parser.add_argument("--count", type=int, metavar="N", help="most grasps told; 20")
+    parser.add_argument("--count", type=int, metavar="N", help="largest number of grasps; 20")
     parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")
     options = parser.parse_args(argv)
     image = [options.rgb, options.depth, options.intrinsics]
@@ -108,18 +115,27 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def check_output(folder: Path, rgb: Path | None) -> None:
-    """Raise UserError where the results would overwrite what this program did not write, or, where
-    the user did not choose the folder, the results of another image than `rgb` of the same name."""
+def free_folder(folder: Path, rgb: Path) -> Path:
+    """`folder`, or `folder`-2, -3, ...: the first that holds no grasps of another image."""
+    for number in itertools.count(1):
+        numbered = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+        before = own_json(numbered / "grasps.json")
+        if before is None or Path(before["rgb"]).resolve() == rgb.resolve():
+            return numbered
+    raise AssertionError("itertools.count ended")
+
+
+def check_output(folder: Path) -> None:
+    """Raise UserError where the results would overwrite files of another program."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"--out {folder}: exists and is no folder")
-    told, drawn = folder / "grasps.json", folder / "grasps.png"
-    before = our_json(told) if told.exists() else None
-    for path, ours in ((told, before is not None), (drawn, is_prediction_panel(drawn))):
-        if path.exists() and not ours:
+    text, drawing = folder / "grasps.json", folder / "grasps.png"
+    for path, own in (
+        (text, own_json(text) is not None),
+        (drawing, is_prediction_panel(drawing)),
+    ):
+        if path.exists() and not own:
             raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
-    if rgb is not None and before is not None and Path(before["rgb"]).resolve() != rgb.resolve():
-        raise UserError(f"{told}: holds the grasps of {before['rgb']}; give --out FOLDER for {rgb}")
 
 
 def write(path: Path, content: str | bytes) -> None:
@@ -129,39 +145,39 @@ def write(path: Path, content: str | bytes) -> None:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def our_json(path: Path) -> dict[str, Any] | None:
+def own_json(path: Path) -> dict[str, Any] | None:
     """The content of a grasps.json of this program; None if the file is something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    ours = isinstance(content, dict) and content.get("format") == FORMAT
-    return content if ours and isinstance(content.get("rgb"), str) else None
+    own = isinstance(content, dict) and content.get("format") == FORMAT
+    return content if own and isinstance(content.get("rgb"), str) else None
 
 
 def read_image(options: argparse.Namespace) -> RGBDFrame:
-    """The image, with the camera as the world for the time being."""
+    """The image as a frame whose world is the camera's frame, until the table is known."""
     rgb, depth = read_rgb(options.rgb), read_depth(options.depth, options.depth_scale)
     check_rgbd(rgb, depth)
-    K = intrinsics_matrix(options.intrinsics, rgb.shape[1], rgb.shape[0])
+    K = read_intrinsics(options.intrinsics, rgb.shape[1], rgb.shape[0])
     return RGBDFrame(rgb, depth, K, np.eye(4))
 
 
-def locate_table(seen: RGBDFrame, options: argparse.Namespace) -> Table:
+def locate_table(image: RGBDFrame, options: argparse.Namespace) -> Table:
     """The table, and the camera above it.
 
-    Without a pose the world is the table's own, see `utils.table_plane.Plane.camera_pose`.
+    Without --camera-pose the table defines the world, see `utils.table_plane.Plane.camera_pose`.
     """
     T_WC = None if options.camera_pose is None else read_pose(options.camera_pose)
     if options.table_height is None:
-        return find_table(seen.points(), T_WC)
-    return table_at_height(options.table_height, seen.points(), T_WC)
+        return find_table(image.points(), T_WC)
+    return table_at_height(options.table_height, image.points(), T_WC)
 
 
 def as_plain(
     found: Prediction, frame: RGBDFrame, table: Table, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """What grasps.json holds."""
+    """The content of grasps.json."""
     T_CW, posed = inverse_pose(frame.T_WC), options.camera_pose is not None
     return {
         "format": FORMAT,

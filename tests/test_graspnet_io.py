@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
+import onnxruntime
 import pytest
 import torch
+from torch import nn
 
 from models.graspnet import GraspNet
 from models.graspnet_backbones import BACKBONES
 from models.graspnet_io import (
     KIND,
+    OUTPUTS,
+    SavedGraspNet,
+    export_onnx,
     for_inference,
     load_graspnet,
     load_initial,
@@ -169,3 +177,32 @@ def test_the_faster_copy_gives_the_same_maps(backbone):
     after = model.state_dict()  # the given network can still be trained and saved
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+# --- ONNX -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backbone", ["ggcnn", "tutorial_skip"])
+def test_onnx_returns_what_pytorch_returns(tmp_path, backbone):
+    torch.manual_seed(0)
+    model = GraspNet(max_width=0.08, backbone=backbone, centre_head=True).eval()
+    for layer in model.modules():  # statistics that are not those of a fresh layer
+        if isinstance(layer, nn.BatchNorm2d):
+            layer.running_mean.uniform_(-0.2, 0.2)
+            layer.running_var.uniform_(0.2, 1.0)
+    path = tmp_path / "net.onnx"
+    export_onnx(SavedGraspNet(model, PIXEL, {}, {}), path)
+    session = onnxruntime.InferenceSession(str(path))
+    described = session.get_modelmeta().custom_metadata_map
+    stride = model.backbone.stride
+    assert json.loads(described["stride"]) == stride
+    assert "centre_head" not in described, "the graph leaves it out"
+    assert json.loads(described["metres_per_pixel"]) == PIXEL
+    assert [output.name for output in session.get_outputs()] == list(OUTPUTS)
+    for batch, rows, columns in ((1, 5, 3), (3, 2, 7)):
+        x = 3 * torch.randn(batch, 4, rows * stride, columns * stride)
+        with torch.no_grad():
+            expected = model(x)
+        for ours, theirs in zip(session.run(None, {"image": x.numpy()}), expected):
+            assert theirs.std() > 1e-6
+            np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-4)

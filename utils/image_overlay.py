@@ -1,8 +1,6 @@
-"""Grasps drawn on images. Knows the pinhole camera, no simulator and no planner.
+"""Pictures of grasps: drawn on images, in contact sheets, and beside the maps of a prediction.
 
-One picture of a prediction: the image with its grasps, and the maps of quality, angle, width.
-
-Knows the pinhole camera, no network and no files.
+This module knows the pinhole camera, but no simulator, no planner and no network.
 """
 
 from __future__ import annotations
@@ -39,8 +37,9 @@ def draw_grasp(
     """A copy of the (H, W, 3) uint8 RGB image with the grasp on it.
 
     Two finger plates stand at +-width/2 along the closing line, which is drawn thinly between
-    them; lengths in pixels are metres * fx / depth. Without `color`, green is a success and red a
-    failure, white neither. Raises ValueError on another image type or a depth that is not > 0.
+    them; lengths in pixels are metres * fx / depth. Without `color`, a success is green, a failure
+    red and an unknown outcome white. Raises ValueError for another image type and for a depth that
+    is not > 0.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"draw_grasp: need (H, W, 3) uint8, got {image.shape} {image.dtype}")
@@ -93,11 +92,13 @@ def _line(image: np.ndarray, start, end, color, thickness: int) -> None:
     cv2.line(image, *ends, color, thickness, cv2.LINE_AA, _SHIFT)
 
 
-NUMBERED = 10  # grasps that carry their rank; more would hide each other
+# --- The picture of a prediction ------------------------------------------------------------
+
+NUMBERED = 10  # grasps with a rank beside them; more would hide each other
 PICTURE_SIDE = 1000  # pixels, the longer side of the image in the panel
-NOTHING, CERTAIN = 0.1, 0.5  # quality at which angle and width fade out, and are in full colour
+NOTHING, CERTAIN = 0.1, 0.5  # quality at which angle and width are invisible, and in full colour
 INK, PAPER = "#1d2430", "white"
-MARK = "Software", "robot-grasping predict.py"  # PNG text that tells our pictures from others
+MARK = "Software", "robot-grasping predict.py"  # PNG text that marks pictures of this project
 
 
 def prediction_panel(
@@ -109,7 +110,7 @@ def prediction_panel(
     width: np.ndarray,
     max_width: float,
 ) -> bytes:
-    """A PNG file's bytes.
+    """The image with its grasps beside the maps of quality, angle and width, as bytes of a PNG.
 
     rgb: (H, W, 3) uint8. K: (3, 3). grasps: best first, in pixels of rgb; the first ten are
     numbered in that order, the best is green. quality, angle, width: (H, W); image angles in

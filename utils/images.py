@@ -1,17 +1,9 @@
-"""Images resampled to another pixel size, and pixels, angles and maps taken back exactly.
+"""RGB-D images: read from a user's files, resampled, and seen from straight above.
 
-A `PixelScaling` is one factor for each image axis. Integer coordinates lie at pixel centres, so
-pixel u becomes (u + 0.5) * factor - 0.5. This module knows neither networks nor grasps.
-
-A user's own RGB-D image from files: colour, depth, intrinsics, camera pose.
-
-Whatever is missing or cannot be meant is a `UserError` that names the file or the option. This
-module knows no network and no simulator.
-
-What a camera straight above the table would see of an RGB-D image that was taken from the side.
-
-A network that has learned from above knows no other view. Every known pixel goes to where its point
-lies; what the image does not show is bare table, as in a height map. This module knows no network.
+`read_rgb`, `read_depth`, `read_intrinsics` and `read_pose` read the files of predict.py; whatever
+is missing or makes no sense is a `UserError` that names the file or the option. `PixelScaling`
+resamples an image, and takes pixels, angles and maps back exactly. `overhead_view` renders what a
+camera straight above the table would see. This module knows no network, no grasps and no simulator.
 """
 
 from __future__ import annotations
@@ -37,16 +29,19 @@ from utils.transforms import RGBDFrame, deproject, known_depth, look_at, project
 
 @dataclass(frozen=True)
 class PixelScaling:
-    """u, v: scaled pixels per original pixel along each axis, > 0."""
+    """One factor for each image axis: u, v are scaled pixels per original pixel, > 0.
+
+    Integer coordinates lie at pixel centres, so pixel u becomes (u + 0.5) * factor - 0.5.
+    """
 
     u: float
     v: float
 
     @staticmethod
     def to_focal_length(K: np.ndarray, focal: float) -> PixelScaling:
-        """Makes the camera's two focal lengths equal to `focal` pixels, and so its pixels square.
+        """The scaling that makes both focal lengths equal to `focal` pixels, so the pixels square.
 
-        With square pixels already, this is one factor for both axes.
+        For pixels that are square already, both factors are equal.
         """
         return PixelScaling(focal / K[0, 0], focal / K[1, 1])
 
@@ -58,7 +53,7 @@ class PixelScaling:
         )
 
     def size(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """(H, W) of the scaled image: the pixels that the original covers whole."""
+        """(H, W) of the scaled image: the pixels that the original covers completely."""
         # Up to rounding: 0.7 * 320 must not lose a row to floating point.
         return int(shape[0] * self.v + 1e-6), int(shape[1] * self.u + 1e-6)
 
@@ -101,7 +96,9 @@ class PixelScaling:
         )
 
 
-MILLIMETRES = 0.001  # what whole numbers in a depth file are, unless the user says otherwise
+# --- A user's files -------------------------------------------------------------------------
+
+MILLIMETRES = 0.001  # unit of whole numbers in a depth file, unless the user gives another one
 SATURATED = 65535  # the other usual value of an unknown pixel in 16 bits, beside 0
 MAX_PIXEL_ASPECT = 1.5  # fx / fy: real sensors stay well below; swapped numbers do not
 RIGID_TOLERANCE = 1e-3  # of a rotation's orthonormality: poses are often printed with 4 digits
@@ -157,6 +154,47 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     if values.dtype == np.uint16:
         known &= values != SATURATED
     return np.where(known, values * np.float64(scale), 0).astype(np.float32)
+
+
+INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
+
+
+def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray:
+    """The (3, 3) K of an image of that size: from the four numbers fx fy cx cy as text, or from one
+    JSON file that names them, and may also name the width and height they belong to."""
+    if len(given) == 1 and Path(given[0]).suffix.lower() == ".json":
+        path = Path(given[0])
+        values = _intrinsics_in(path)
+        size = values.get("width", width), values.get("height", height)
+        if size != (width, height):
+            raise UserError(
+                f"{path}: intrinsics of an image of {size[0]}x{size[1]} pixels, the image has "
+                f"{width}x{height}"
+            )
+        return intrinsics_matrix([values[key] for key in INTRINSICS], width, height)
+    try:
+        numbers = [float(text) for text in given]
+    except ValueError:
+        raise UserError(
+            f"--intrinsics: got {' '.join(given)}, expected 4 numbers fx fy cx cy or a FILE.json"
+        ) from None
+    return intrinsics_matrix(numbers, width, height)
+
+
+def _intrinsics_in(path: Path) -> dict[str, float]:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read as JSON ({error})") from error
+    missing = [key for key in INTRINSICS if not isinstance(values, dict) or key not in values]
+    if missing:
+        raise UserError(f"{path}: has no {', '.join(missing)}; expected {', '.join(INTRINSICS)}")
+    for key in (*INTRINSICS, "width", "height"):
+        if not isinstance(values.get(key, 0), int | float):
+            raise UserError(f"{path}: {key} is {values[key]!r}, expected a number")
+    return values
 
 
 def intrinsics_matrix(numbers: Sequence[float], width: int, height: int) -> np.ndarray:
@@ -254,19 +292,22 @@ def _listed(numbers: Sequence[float]) -> str:
     return " ".join(f"{number:g}" for number in numbers)
 
 
+# --- The view from above --------------------------------------------------------------------
+# A network that was trained on images from above knows no other view.
+
 DISTANCE = 0.8  # m over the table, as the cell's overhead camera
-ON_TABLE = 0.01  # m over the table, up to which a pixel lends its colour to hidden table
+ON_TABLE = 0.01  # m over the table, up to which hidden table takes a pixel's colour
 PARTS = (-0.25, 0.25)  # each pixel stands for points of its square, two by two
 
 
 def overhead_view(
     frame: RGBDFrame, workspace: Workspace, metres_per_pixel: float, margin: float = 0.0
 ) -> RGBDFrame:
-    """The workspace widened by `margin` (metres) as seen from DISTANCE above its middle, in pixels
-    that span `metres_per_pixel` of the table, whose +v runs along the world's -y.
+    """The workspace, widened by `margin` metres, as a camera DISTANCE above its middle sees it.
 
-    The highest of the points that fall into a pixel is seen. Where there is none the depth is the
-    table's, and the colour that of the nearest table.
+    Pixels span `metres_per_pixel` of the table; +v runs along the world's -y. Each pixel shows the
+    highest of the frame's points that fall into it. Pixels without a point have the table's depth,
+    and the colour of the nearest table.
     """
     size = 8 * round((workspace.size + 2 * margin) / metres_per_pixel / 8)
     focal, middle = DISTANCE / metres_per_pixel, (size - 1) / 2

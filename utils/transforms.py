@@ -1,21 +1,17 @@
-"""Frames, poses and grasps: the conventions that every other module relies on.
+"""Frames, poses, grasps and rigid motions: the conventions that every other module relies on.
 
 Frames: W world (robot base, z up, x away from the robot), C camera optical frame (x right,
-y down, z forward), E point between the fingertips (z along the approach, y along the closing
-line). `T_AB` is the 4x4 matrix that takes a point in B to A. Quaternions are (x, y, z, w).
-Lengths are metres, angles radians. Pixels are (u, v) = (column, row); integer coordinates lie
-at pixel centres.
-
-This module knows no simulator and no network.
-
-Rigid motion: twists, exponential and logarithm of SE(3), velocities seen from another frame.
+y down, z forward), E the grasp's frame in the hand (z along the approach, y along the closing
+line). The origin of E is the middle between the two finger pads, 7.2 mm above the lowest point of
+the fingertips (`GripperGeometry.tip_below_centre`). `T_AB` is the 4x4 matrix that takes a point in
+B to A. Quaternions are (x, y, z, w). Lengths are metres, angles radians. Pixels are (u, v) =
+(column, row); integer coordinates lie at pixel centres.
 
 A twist is (v, w), linear first, in metres and radians (a displacement) or per second (a velocity).
-Formulas: Lynch and Park, Modern Robotics (2017), chapter 3; Chaumette and Hutchinson, "Visual
-servo control, part I", IEEE Robotics and Automation Magazine 13(4), 2006.
+Formulas of rigid motion: Lynch and Park, Modern Robotics (2017), chapter 3; Chaumette and
+Hutchinson, "Visual servo control, part I", IEEE Robotics and Automation Magazine 13(4), 2006.
 
-Written with scalars because a control loop calls these thousands of times a second and arrays of
-three numbers cost more to create than to compute. Knows no camera and no robot.
+This module knows no simulator and no network.
 """
 
 from __future__ import annotations
@@ -31,9 +27,10 @@ from scipy.spatial.transform import Rotation
 class Grasp:
     """A planar (top-down) grasp in the world frame.
 
-    position: (3,) centre of the fingertips at the moment of closing, metres in W.
+    position: (3,) metres in W, the origin of E at the moment of closing: the middle between the two
+        finger pads, 7.2 mm above the lowest point of the fingertips.
     angle: direction of the closing line about +z from the x axis, radians, modulo pi.
-    width: opening between the fingertips before closing, metres.
+    width: opening between the finger pads before closing, metres.
     quality: the planner's own score; higher is better. Only comparable within one planner.
     """
 
@@ -61,7 +58,7 @@ class Grasp:
 
     @property
     def pose(self) -> np.ndarray:
-        """(4, 4) T_WE of the gripper at the moment of closing: z down, y along the closing line."""
+        """(4, 4) T_WE at the moment of closing: z down, y along the closing line."""
         return top_down_pose(self.position, self.angle)
 
 
@@ -72,8 +69,9 @@ class ImageGrasp:
     pixel: (2,) centre (u, v), may be fractional.
     angle: direction of the closing line in the image, from +u (right) towards +v (down),
         radians, modulo pi.
-    depth: distance of the fingertips' centre along the optical axis, metres.
-    width: opening between the fingertips, metres (not pixels).
+    depth: of the grasp's position along the optical axis, metres; or that of the visible surface at
+        the pixel, where a function says so.
+    width: opening between the finger pads, metres (not pixels).
     """
 
     pixel: np.ndarray
@@ -85,15 +83,15 @@ class ImageGrasp:
 
 @dataclass(frozen=True)
 class RGBDFrame:
-    """What a camera saw, with everything needed to turn a pixel into a point.
+    """An RGB-D image and all that is needed to turn its pixels into points.
 
-    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; `known_depth`
-        tells where it is known.
+    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; 0, negative or not
+        finite where it is unknown (`known_depth`).
     K: (3, 3) pinhole matrix in pixels. T_WC: (4, 4) camera pose in the world.
     segmentation: (H, W) int32, the index of the object seen at each pixel in scene order, -1 for
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
-        claim to see only the depth image must not.
-    truth: the scene's true geometry, given only to privileged planners; otherwise None.
+        see only the depth image must not.
+    truth: the scene's true geometry for planners that need it; otherwise None.
     """
 
     rgb: np.ndarray
@@ -116,7 +114,7 @@ class RGBDFrame:
 
 
 def known_depth(depth: np.ndarray) -> np.ndarray:
-    """(...) bool, where a depth image was measured: 0, negative and not finite mean unknown."""
+    """(...) bool, True where a depth is known: 0, negative and not finite mean unknown."""
     return np.isfinite(depth) & (depth > 0)
 
 
@@ -245,6 +243,10 @@ def planar_part(T: np.ndarray) -> tuple[float, float, float]:
     return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
 
 
+# --- Rigid motion ---------------------------------------------------------------------------
+# Written with scalars: a control loop calls these functions thousands of times a second, and small
+# arrays take longer to create than their numbers to compute.
+
 SMALL_ANGLE = 1e-4  # below it the series to second order are exact to the last digit
 
 
@@ -262,8 +264,8 @@ def rotation_exp(rotation_vector) -> np.ndarray:
 def rotation_log(R: np.ndarray) -> np.ndarray:
     """Axis-angle vector theta u (3,) of a rotation (3, 3), theta in [0, pi].
 
-    By way of the quaternion whose largest component is found first (Shepperd, 1978): right at pi
-    about every axis, where the usual (R - R^T) / (2 sin theta) is 0 / 0.
+    The quaternion's largest component is computed first (Shepperd, 1978). So the result is right at
+    theta = pi about every axis, where the usual (R - R^T) / (2 sin theta) is 0 / 0.
     """
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     trace = a + e + i
@@ -308,7 +310,7 @@ def pose_log(T: np.ndarray) -> np.ndarray:
 
 
 def velocity_transform(T_AB: np.ndarray) -> np.ndarray:
-    """(6, 6) V with v_A = V v_B: one body's twist, told in frame A instead of in frame B.
+    """(6, 6) V with v_A = V v_B: one body's twist, expressed in frame A instead of frame B.
 
     V = [R, [t]x R; 0, R]; the upper right block is the lever arm between the two origins.
     """

@@ -1,0 +1,129 @@
+"""Files of a user's image, and images at another pixel size, against closed forms."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from utils.errors import UserError
+from utils.images import (
+    PixelScaling,
+    intrinsics_matrix,
+    read_depth,
+    read_intrinsics,
+    read_pose,
+)
+from utils.transforms import deproject, look_at, project
+
+OVERHEAD = look_at((0.5, 0.0, 0.8), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("factors", [(0.5, 0.5), (0.37, 0.37), (1.7, 1.7), (0.8, 1.3), (1.0, 1.0)])
+def test_scaled_ramps_are_where_the_formula_says(factors):
+    """A linear image stays linear, so its values tell where each pixel came from."""
+    scaling = PixelScaling(*factors)
+    v, u = np.mgrid[0:90, 0:120].astype(np.float32)
+    rows, columns = scaling.size(u.shape)
+    assert (rows, columns) == (int(90 * factors[1]), int(120 * factors[0]))
+    at = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+    original = scaling.original_pixels(at)
+    np.testing.assert_allclose(scaling.pixels(original), at, atol=1e-9)
+    inner = (slice(3, -3), slice(3, -3))
+    for axis, ramp in enumerate((u, v)):
+        scaled = scaling.image(ramp)
+        # The mean over a part of a pixel is that pixel's, 1/8 pixel off at most, either way.
+        wrong = scaled[inner] - original[inner][..., axis]
+        assert abs(wrong).max() < 0.13 and abs(wrong.mean()) < 0.01
+        back = scaling.original_map(scaled, u.shape)
+        assert abs(back - ramp)[8:-8, 8:-8].max() < 0.13
+
+
+def test_scaled_intrinsics_see_the_same_points():
+    K = intrinsics_matrix([600, 560, 301, 251], 640, 480)
+    scaling = PixelScaling.to_focal_length(K, 300)
+    assert scaling.intrinsics(K)[0, 0] == pytest.approx(scaling.intrinsics(K)[1, 1])
+    pixel = np.array([123.4, 56.7])
+    point = deproject(pixel, 0.9, K, OVERHEAD)
+    seen, _ = project(point, scaling.intrinsics(K), OVERHEAD)
+    np.testing.assert_allclose(seen, scaling.pixels(pixel))
+
+
+def test_angles_of_stretched_lines():
+    # A line at 45 degrees in an image that was squeezed to half its width was flatter before.
+    scaling = PixelScaling(0.5, 1.0)
+    assert scaling.original_angles(np.pi / 4) == pytest.approx(np.arctan(0.5))
+    assert scaling.original_angles(np.pi / 2) == pytest.approx(np.pi / 2)
+
+
+# --- Files ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "scale"),
+    [
+        ("metres.tiff", 1.0, None), ("mm.tif", 1e-3, None), ("mm.png", 1e-3, None),
+        ("tenths.png", 1e-4, 1e-4), ("metres.npy", 1.0, None), ("mm.npy", 1e-3, None),
+        ("metres.tiff", 1.0, 1.0),
+    ],
+)  # fmt: skip
+def test_depth_files_of_every_kind_hold_the_same(tmp_path, name, unit, scale):
+    metres = np.linspace(0.5, 0.9, 48, dtype=np.float32).reshape(6, 8)
+    metres[0, :2] = 0.0
+    values = metres if unit == 1.0 else np.rint(metres / unit).astype(np.uint16)
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, values.astype(float if unit == 1.0 else np.int32)[..., None])
+    else:
+        Image.fromarray(values).save(tmp_path / name)
+    depth = read_depth(tmp_path / name, scale)
+    assert depth.dtype == np.float32
+    np.testing.assert_allclose(depth, metres, atol=0.0006)
+    assert (depth[0, :2] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.txt", "\n".join(" ".join(map(repr, row)) for row in OVERHEAD.tolist())),
+        ("b.txt", "\n".join(", ".join(map(repr, row)) for row in OVERHEAD.tolist()) + "\n\n"),
+        ("c.json", json.dumps(OVERHEAD.tolist())),
+        ("d.json", json.dumps({"T_WC": OVERHEAD.ravel().tolist()})),
+        ("e.yaml", "T_WC:\n" + "\n".join(f"- {row}" for row in OVERHEAD.tolist())),
+    ],
+)
+def test_poses_of_every_kind(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_pose(tmp_path / name), OVERHEAD, atol=1e-12)
+    np.save(tmp_path / "pose.npy", OVERHEAD)
+    np.testing.assert_allclose(read_pose(tmp_path / "pose.npy"), OVERHEAD, atol=1e-12)
+
+
+def test_intrinsics_from_numbers_and_from_a_file_are_the_same(tmp_path):
+    expected = np.array([[615.0, 0, 320], [0, 614, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(read_intrinsics(["615", "614", "320", "240"], 640, 480), expected)
+    values = {"fx": 615, "fy": 614.0, "cx": 320, "cy": 240}
+    for more in ({}, {"width": 640, "height": 480}):
+        (tmp_path / "intrinsics.json").write_text(json.dumps(values | more))
+        found = read_intrinsics([str(tmp_path / "intrinsics.json")], 640, 480)
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"fx": 600, "fy": 600, "cx": 160}', "has no cy"),
+        ("[600, 600, 160, 120]", "has no fx, fy, cx, cy"),
+        ('{"fx": "a", "fy": 600, "cx": 160, "cy": 120}', "fx is 'a', expected a number"),
+        ('{"fx": 600, "fy": 600, "cx": 160, "cy": 120, "width": 640, "height": 480}',
+         "of an image of 640x480 pixels, the image has 320x240"),
+        ("no json", "cannot be read as JSON"),
+        (None, "no such file"),
+    ],
+)  # fmt: skip
+def test_an_intrinsics_file_that_does_not_fit_is_refused(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "k.json").write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_intrinsics([str(tmp_path / "k.json")], 320, 240)
