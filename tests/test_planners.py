@@ -1,5 +1,10 @@
 """Planners on scenes whose best grasp is known by construction."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +14,7 @@ from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame, angle_difference
 
+ROOT = Path(__file__).resolve().parent.parent
 DELIBERATE = ("heuristic", "oracle")
 
 
@@ -162,3 +168,24 @@ def test_ranking_is_sorted_and_distinct(name: str) -> None:
 def test_a_crumb_is_nothing_to_grasp(name: str) -> None:
     """4 mm x 6 mm x 12 mm: smaller than what counts as an object in a depth image."""
     assert planner(name)(boxes_frame([((0.004, 0.006, 0.012), 0.0, (0.5, 0.0))])) == []
+
+
+def test_the_planner_of_the_docs_runs_without_a_simulator(tmp_path, monkeypatch) -> None:
+    """Its box is 4 cm wide along the image's rows, which run along the world's x axis."""
+    text = (ROOT / "docs" / "planner.md").read_text(encoding="utf-8")
+    code = text.split("```python\n")[1].split("```")[0]
+    (tmp_path / "top_object.py").write_text(code, encoding="utf-8")
+    check = (
+        "import runpy, sys; runpy.run_path('top_object.py', run_name='__main__');"
+        "assert not {'pybullet', 'mujoco', 'envs'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["[0.5", "0.", "0.037]", "0", "degrees"]
+    monkeypatch.chdir(tmp_path)
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.4, (0.5, 0.0))])
+    best = planner("top_object:TopObject")(frame)[0]
+    assert np.rad2deg(angle_difference(best.angle, 0.4)) < 3
