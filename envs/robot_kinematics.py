@@ -54,7 +54,7 @@ def forward_kinematics(q: np.ndarray) -> np.ndarray:
 
 def tip_position(q: Sequence[float]) -> tuple[float, float, float]:
     """x, y, z of E in W, metres, for seven joint positions in rad: what `forward_kinematics` has in
-    its last column, in a tenth of the time, for whoever asks at every command."""
+    its last column, in a tenth of the time: each command to the arm needs it."""
     x, y, z = 0.0, 0.0, TOOL_LENGTH
     for (a, turn, d), angle in zip(_ARM_FROM_ITS_END, reversed(q)):
         cosine, sine = math.cos(angle), math.sin(angle)

@@ -1,17 +1,17 @@
-"""The gate that every command to the arm passes: what of it may be sent, and why not.
+"""The gates that commands to the arm pass: what of a command may be sent, and why not.
 
-`ArmGate` stands before the motors: whatever moves the arm, be it a planned motion, an action of
-the Gymnasium environment or a servo loop, passes it. It holds the workspace box and the joints'
+`ArmGate` stands before the motors: every command to them passes it, be it of a planned motion, an
+action of the Gymnasium environment or a servo loop. It holds the workspace box and the joints'
 limits, and slows a command that is too fast as a whole.
 
-`SafetyGate` is what a loop that goes by what it sees has to pass before: it holds the watchdog, the
-contact stop and the servo's own lower speeds, and approaches each limit so that the arm can still
-stop in front of it: a speed of at most sqrt(2 a d) where a room d is left and a is the deceleration
-that the arm has for certain.
+`SafetyGate` stands before that for loops that follow a camera: it holds the watchdog, the contact
+stop and the servo's own lower speeds, and approaches each limit so that the arm can still stop in
+front of it: a speed of at most sqrt(2 a d) where a distance d is left and a is the deceleration
+that the arm is certain to reach.
 
-Both slow the arm by one factor for all joints, so that its direction is kept; where nothing may be
-sent they say why in words. Pure Python and numpy: they know neither PyBullet nor cameras nor where
-a command comes from.
+Both slow the arm by one factor for all joints, which keeps its direction; where nothing may be
+sent, they give the reason as text. Pure Python and numpy: they know no simulator, no camera and not
+where a command comes from.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from envs.robot_kinematics import (
 from utils.config import RobotConfig, SafetyConfig
 from utils.errors import ServoError, UserError
 
-_LEAST_SHARE = 0.01  # of a wish: where a limit leaves less, the arm stops and says so
+_LEAST_SHARE = 0.01  # of a desired velocity: where a limit leaves less, the arm stops
 _FINGERTIPS = ((0.0, 0.0, 0.0),)
 _TOO_FAST = 1.0 + 1e-6  # of a speed limit: what is planned to be at the limit passes unchanged
 _LEAD = 0.001  # m by which a reference may be ahead of an arm that has stopped at the box's edge
@@ -62,11 +62,11 @@ def reaching_down(safety: SafetyConfig, floor: float) -> SafetyConfig:
 
 
 class ArmGate:
-    """Judges every command before it reaches the motors of one arm, whoever gives it.
+    """Checks every command before it reaches the motors of one arm.
 
-    Commands are joint references: it knows the one that was sent last. A reference outside the
-    joints' limits, or with E outside the workspace box, is refused, unless it brings the arm back.
-    In plain floats: a command takes about 4 us.
+    Commands are joint references; the gate keeps the one that was sent last. It refuses a reference
+    outside the joints' limits, or with E outside the workspace box, unless it brings the arm back.
+    In plain floats, a command takes about 4 us.
     """
 
     def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, floor: float):
@@ -81,21 +81,21 @@ class ArmGate:
         self.restart(robot.home)
 
     def restart(self, q: Sequence[float]) -> None:
-        """The arm is, and is told to be, at joint positions q (7,), rad, wherever that is."""
+        """Take joint positions q (7,), rad, as the reference sent last, wherever they are."""
         self._q = [float(angle) for angle in q]
         self._tip = tip_position(self._q)
-        self._judged = self._q, (None, self._tip)  # the last question and its answer
+        self._checked = self._q, (None, self._tip)  # the last reference and the answer to it
 
     def refusal(self, q: np.ndarray, tip: np.ndarray | None = None) -> str | None:
         """Why joint references q (7,), rad, may not be sent; None where they may. tip: (3,) m,
-        where they bring E, for who knows that already."""
+        E at these references, where the caller has it already."""
         angles = q.tolist()
-        self._judged = angles, self._judge(angles, None if tip is None else tuple(tip.tolist()))
-        return self._judged[1][0]
+        self._checked = angles, self._check(angles, None if tip is None else tuple(tip.tolist()))
+        return self._checked[1][0]
 
     def passed(self, q: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is sent of a reference q (7,) and its velocity (7,), rad/s, for one control period:
-        these very arrays where they are legal. Raises ArmStoppedError."""
+        """The reference q (7,) and its velocity (7,), rad/s, to be sent for one control period:
+        the same arrays where they are legal. Raises ArmStoppedError."""
         angles, rates = q.tolist(), velocity.tolist()
         if not math.isfinite(sum(angles) + sum(rates)):
             raise ArmStoppedError("the commanded joint positions or velocities are not finite")
@@ -110,19 +110,19 @@ class ArmGate:
         return q, velocity
 
     def admit(self, q: np.ndarray) -> None:
-        """Take note that joint references q (7,), rad, are sent; raises ArmStoppedError."""
+        """Record that joint references q (7,), rad, are sent; raises ArmStoppedError."""
         angles = q.tolist()
-        if angles != self._judged[0]:  # not asked about by `refusal` just now
-            self._judged = angles, self._judge(angles)
-        reason, tip = self._judged[1]
+        if angles != self._checked[0]:  # `refusal` has not just checked them
+            self._checked = angles, self._check(angles)
+        reason, tip = self._checked[1]
         if reason is not None:
             raise ArmStoppedError(reason)
         self._q, self._tip = angles, tip
 
-    def _judge(
+    def _check(
         self, q: list[float], tip: tuple | None = None
     ) -> tuple[str | None, tuple[float, float, float]]:
-        """Why not, and where E would be. A number that is not finite fails each comparison."""
+        """The reason to refuse, or None, and where E would be. NaN fails each comparison."""
         for number, (angle, before, (low, high)) in enumerate(zip(q, self._q, _JOINT_RANGES), 1):
             if not low <= angle <= high and not min(low, before) <= angle <= max(high, before):
                 return f"joint {number} would leave its limits ({angle:.3f} rad)", self._tip
@@ -144,11 +144,11 @@ class Verdict:
 
 
 class SafetyGate:
-    """Judges every wish for joint velocities of a loop that goes by what it sees.
+    """Checks the desired joint velocities of a loop that follows a camera.
 
     Keeps the guarded points within the workspace box and under a linear speed, the hand under an
     angular speed, and the joints within their limits of position, velocity and acceleration. A stop
-    is at once: nothing is sent on contact, or when what the wish was computed from is too old.
+    is immediate: nothing is sent on contact, or when the image behind it is too old.
     """
 
     def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, guarded_E=_FINGERTIPS):
@@ -167,20 +167,20 @@ class SafetyGate:
 
     def check(
         self,
-        wish: np.ndarray,
+        desired: np.ndarray,
         q: np.ndarray,
         contact_force: float,
         perception_age: float,
         before: np.ndarray | None = None,
     ) -> Verdict:
-        """What may be sent of the wished joint velocities (7,), rad/s.
+        """The part of the desired joint velocities (7,), rad/s, that may be sent.
 
         q: (7,) rad, where the joints are. contact_force: N on the arm and what it carries.
-        perception_age: seconds since the image was taken from which the wish was computed.
-        before: (7,) rad/s, what was sent last, from where the arm gets no faster or slower than its
-        acceleration limits allow; None: as if it had been this wish.
+        perception_age: seconds since the image was taken from which `desired` was computed.
+        before: (7,) rad/s, sent last; the change from there stays within the acceleration limits.
+        None: no limit on the change.
         """
-        reason = self._refusal(wish, q, perception_age)
+        reason = self._refusal(desired, q, perception_age)
         if reason is not None:
             return Verdict(np.zeros(7), reason)
         reason = contact_reason(contact_force, self.safety.contact_stop)
@@ -188,10 +188,10 @@ class SafetyGate:
             return Verdict(np.zeros(7), reason, contact=True)
         T_WE, J = forward_kinematics(q), geometric_jacobian(q)
         arms = self.guarded_E @ T_WE[:3, :3].T
-        twist = J @ wish
-        velocity = wish * self._speed_share(wish, _speeds(twist, arms), twist[3:])
+        twist = J @ desired
+        velocity = desired * self._speed_share(desired, _speeds(twist, arms), twist[3:])
         choices = [velocity]
-        if before is not None:  # the wish itself, where braking that gently would leave no room
+        if before is not None:  # `desired` itself, where braking that gently would leave no room
             change = velocity - before
             choices.insert(0, before + change * self._change_share(change))
         for velocity in choices:
@@ -201,10 +201,10 @@ class SafetyGate:
                 return Verdict(share * velocity)
         return Verdict(np.zeros(7), reason)
 
-    def _refusal(self, wish, q, perception_age) -> str | None:
+    def _refusal(self, desired, q, perception_age) -> str | None:
         """Why nothing at all may be sent. A number that is not finite fails each comparison."""
-        if not (np.isfinite(wish).all() and np.isfinite(q).all()):
-            return "the wished joint velocities or the joint positions are not finite"
+        if not (np.isfinite(desired).all() and np.isfinite(q).all()):
+            return "the desired joint velocities or the joint positions are not finite"
         if not perception_age <= self.safety.watchdog:
             return (
                 f"what was seen last is {1000 * perception_age:.0f} ms old, "
@@ -212,10 +212,10 @@ class SafetyGate:
             )
         return None
 
-    def _speed_share(self, wish, speeds, turn) -> float:
+    def _speed_share(self, desired, speeds, turn) -> float:
         """The factor, at most 1, that brings every speed within its limit."""
         excess = max(
-            float(np.max(np.abs(wish) / self._speed)),
+            float(np.max(np.abs(desired) / self._speed)),
             float(np.linalg.norm(speeds, axis=1).max()) / self.safety.linear_speed,
             float(np.linalg.norm(turn)) / self.safety.angular_speed,
         )
@@ -228,7 +228,8 @@ class SafetyGate:
         return 1.0 / max(excess, 1.0)
 
     def _room_share(self, velocity, q, points, speeds) -> tuple[float, str]:
-        """The factor, at most 1, that lets the arm stop before each limit; who sets it."""
+        """The factor, at most 1, that lets the arm stop before each limit, and the limit that sets
+        it."""
         joints = self._shares(velocity, q - self._lower, self._upper - q, self._joint_acceleration)
         box = self._shares(speeds, points - self._box[0], self._box[1] - points, self._deceleration)
         joint, place = int(joints.argmin()), np.unravel_index(box.argmin(), box.shape)

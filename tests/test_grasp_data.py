@@ -9,6 +9,7 @@ import pickle
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -35,11 +36,19 @@ from envs.data_generation import (
 from envs.objects import ObjectError
 from envs.pybullet_appearance import Appearance, Texture, draw_camera
 from envs.pybullet_cell import PybulletCell
+from tests.helpers.box_frames import boxes_frame
 from utils.config import load_config
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, SceneGeometry, SolidObject
+from utils.geometry import GripperGeometry, SceneGeometry, SolidObject, Workspace
 from utils.grasp_data import LabelledFrame, SimulatedDataset, read_trials, shard_path, write_shard
-from utils.grasp_labels import GraspLabels, LabelSettings, Trial, draw_pairs, label_truth
+from utils.grasp_labels import (
+    GraspLabels,
+    LabelSettings,
+    Trial,
+    dense_labels,
+    draw_pairs,
+    label_truth,
+)
 from utils.transforms import RGBDFrame, look_at, project
 
 SHAPE = (5, 7)
@@ -106,6 +115,19 @@ def test_what_is_stored_comes_back_to_half_a_unit(stored):
                 assert (u, v) == pytest.approx(tuple(expected), abs=1e-3)
     assert images.scenes == ["pile box 7"] * 4
     assert read_trials(folder) == 2 * trials
+
+
+def test_labels_of_a_wider_hand_are_stored_unclipped(tmp_path):
+    """A box of 9 cm: no label for the Panda's own hand, and labels over 9 cm for one of 10 cm."""
+    frame = boxes_frame([((0.09, 0.12, 0.05), 0.0, (0.5, 0.0))])
+    objects = np.where(frame.points()[..., 2] > 0.01, 0, -1).astype(np.int32)
+    hand = GripperGeometry(max_opening=0.10)
+    labels = dense_labels(frame, hand, Workspace())
+    assert labels.quality.max() > 0.5 and 0.09 < labels.width.max() <= 0.10
+    labelled = LabelledFrame(replace(frame, segmentation=objects), labels, "isolated boxes 0")
+    write_shard(shard_path(tmp_path, "train", 0), [labelled], [], hand.max_opening)
+    stored = SimulatedDataset(tmp_path, "train")[0].width.numpy()
+    assert np.abs(stored - labels.width).max() < 0.5 * 0.10 / 255 + 1e-7
 
 
 def test_depth_beyond_16_bits_is_cut_off_not_wrapped(tmp_path):

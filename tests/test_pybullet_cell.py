@@ -1,64 +1,23 @@
-"""The cell: scenes as pure functions of their seeds, execution and its judgement."""
+"""The cell in PyBullet: frames, physics steps, and what counts as gripped and lifted."""
 
 import numpy as np
 import pybullet
 import pytest
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
-from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
-from envs.cell_scenes import LAYOUTS, SceneError, make_scene
-from envs.execution import choose_posture, execute_grasp
-from envs.objects import load_object_set
+from envs.execution import choose_posture
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
 from envs.robot_kinematics import forward_kinematics, inverse_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.config import with_settings
-from utils.transforms import Grasp, top_down_pose
+from utils.transforms import top_down_pose
 
 
 @pytest.fixture(scope="module")
 def cell(config):
     with PybulletCell(config) as cell:
         yield cell
-
-
-@pytest.fixture(scope="module")
-def primitives(config):
-    return load_object_set("primitives", cache_dir=config.cache_folder)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_scene_is_a_pure_function_of_its_seed(layout, primitives, config, cell):
-    first = make_scene(layout, primitives, 7, config)
-    make_scene("pile", primitives, 8, config)  # other work in between
-    again = make_scene(layout, primitives, 7, config)
-    other = make_scene(layout, primitives, 9, config)
-    assert len(first.placements) == (1 if layout == "isolated" else config.scene.count)
-    for a, b in zip(first.placements, again.placements):
-        assert a.model.name == b.model.name
-        np.testing.assert_array_equal(a.position, b.position)
-        np.testing.assert_array_equal(a.quaternion, b.quaternion)
-    assert any((a.position != b.position).any() for a, b in zip(first.placements, other.placements))
-    for placement in first.placements:
-        offset = abs(placement.position[:2] - config.workspace.center)
-        assert offset.max() <= config.workspace.size / 2 and placement.position[2] > 0
-
-
-def test_packed_objects_stand_apart(primitives, config, cell):
-    scene = make_scene("packed", primitives, 3, config)
-    cell.load(scene)
-    for i, a in enumerate(cell.bodies):
-        for b in cell.bodies[:i]:
-            assert not pybullet.getContactPoints(a, b, physicsClientId=cell.client)
-
-
-def test_impossible_scene_is_refused(box_set, config):
-    crowded = with_settings(config, "scene", {"count": 50})
-    with pytest.raises(SceneError, match="scene.count"):
-        make_scene("packed", box_set, 0, crowded)
-    with pytest.raises(SceneError, match="isolated, packed, pile"):
-        make_scene("heap", box_set, 0, config)
 
 
 def test_frame_shows_the_cube_where_it_is(cell, box_set):
@@ -84,16 +43,6 @@ def test_wrist_camera_sees_the_workspace(config, box_set):
         np.testing.assert_allclose(cube.mean(axis=0), [0.42, 0.0, 0.06], atol=3e-3)
 
 
-def test_good_grasp_succeeds_and_the_cube_ends_in_the_bin(cell, box_set):
-    cell.load(cube_scene(box_set))
-    outcome = execute_grasp(cell, cube_grasp())
-    assert outcome.reason == "success" and outcome.success and outcome.object_index == 0
-    assert 3 < outcome.sim_seconds < 12
-    assert not cell.remaining
-    assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
-    np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
-
-
 @pytest.mark.parametrize("count", [2, 12, 20, 31])  # 31: rounding would lose a step
 def test_steps_in_one_call_are_the_same_steps(config, box_set, count):
     """A cube falls on the table and the hand presses on it: bit-identical to single steps."""
@@ -114,35 +63,6 @@ def test_steps_in_one_call_are_the_same_steps(config, box_set, count):
             state = [*cell.robot.joint_state(), cell.robot.contact_force()]
             ends.append(np.concatenate([np.ravel(x) for x in (*state, cell.object_pose(0))]))
     np.testing.assert_array_equal(*ends)
-
-
-@pytest.mark.parametrize(
-    ("grasp", "reason"),
-    [
-        (cube_grasp(offset=(0.15, 0, 0)), "missed"),
-        (cube_grasp(angle=np.pi / 4), "collision"),  # 8.5 cm across the diagonal
-        (cube_grasp(width=0.03), "collision"),  # the fingers come down on its top
-        (cube_grasp(offset=(0, 0, -0.05)), "collision"),  # into the table
-        (Grasp(np.array([1.5, 0.0, 0.03]), 0.0, 0.08, 1.0), "ik"),
-    ],
-)
-def test_failures_are_named(cell, box_set, grasp, reason):
-    cell.load(cube_scene(box_set))
-    outcome = execute_grasp(cell, grasp)
-    assert outcome.reason == reason and not outcome.success
-    assert cell.remaining == {0}
-    np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
-
-
-def test_a_frictionless_object_slips(cell, box_set):
-    cell.load(cube_scene(box_set))
-    # Pads and cube without any friction: the lift leaves the cube behind.
-    for body, link in ((cell.bodies[0], -1), *((cell.robot.body, f) for f in FINGERS)):
-        pybullet.changeDynamics(
-            body, link, lateralFriction=0.0, spinningFriction=0.0, rollingFriction=0.0,
-            physicsClientId=cell.client,
-        )  # fmt: skip
-    assert execute_grasp(cell, cube_grasp()).reason == "slipped"
 
 
 def test_an_object_flung_upwards_is_not_lifted(cell, box_set):
