@@ -26,7 +26,8 @@ _OBLIQUE_SHARE = 0.2  # of the camera poses are far from the configured one
 @dataclass(frozen=True)
 class Appearance:
     """table, objects: RGBA (1, 4) and (N, 4) in 0..1, None for the cell's own. textures: for the
-    table and then each object, None for none. light: what changes of `envs.pybullet_camera.DEFAULT_LIGHT`.
+    table and then each object, None for none. light: changed entries of
+    `envs.camera.DEFAULT_LIGHT`.
     noise: standard deviation of the colour noise, 0..255.
     """
 
