@@ -123,3 +123,17 @@ def test_architecture_lists_every_module_once():
         listed = re.findall(r"^\| `(\w+\.py)`", room, re.MULTILINE)
         there = {path.name for path in (ROOT / folder).glob("*.py")} - {"__init__.py"}
         assert sorted(listed) == sorted(there)
+
+
+def test_recipes_name_files_and_registries_that_exist():
+    """Each recipe of CONTRIBUTING: its files, and its registry as a name in one of them."""
+    table = text_of(ROOT / "CONTRIBUTING.md").split("## Ten changes")[1].split("\n## ")[0]
+    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| a")]
+    assert len(rows) >= 10
+    for change, file, registry, test in rows:
+        files = re.findall(r"`((?:envs|models|utils|configs)/\w+\.[\w.]+)`", file + registry)
+        assert len({name for name in files if "NAME" not in name}) <= 3, change
+        for name in re.findall(r"`([A-Z_]{3,})`", file + registry):
+            assert any(re.search(rf"^{name}\b", text_of(ROOT / one), re.M) for one in files), name
+        for path in re.findall(r"`(tests/\w+\.py)`", test):
+            assert (ROOT / path).exists(), path
