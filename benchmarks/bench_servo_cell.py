@@ -19,7 +19,7 @@ from envs.board import Board
 from envs.board_servo import BoardCamera, servo_settings, servo_to_goal, view_of
 from envs.camera import wrist_mount
 from envs.cell_scenes import Scene
-from envs.pybullet_bodies import CarriedBoard, add_board
+from envs.pybullet_bodies import PybulletCarriedBoard, add_board
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM
 from envs.robot_kinematics import TOOL_LENGTH, inverse_kinematics, rotation_vector
@@ -59,7 +59,7 @@ class Task:
     mounting: str
     board: Board
     body: int
-    carried: CarriedBoard | None
+    carried: PybulletCarriedBoard | None
     T_GO: np.ndarray
 
     def servo(self, law: str, **options) -> VisualServo:

@@ -16,6 +16,7 @@ Knows neither robot nor servo.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import cv2
@@ -118,6 +119,16 @@ class Board:
         vertices = self._place((black[:, None] + _SQUARE[::-1]).reshape(-1, 2))
         first = 4 * np.arange(len(black))[:, None]
         return vertices.tolist(), (first + [0, 1, 2, 0, 2, 3]).ravel().tolist()
+
+
+class CarriedBoard(ABC):
+    """A board screwed to the hand. corners_E: (4, 3) its corners in E, metres."""
+
+    corners_E: np.ndarray
+
+    @abstractmethod
+    def contact_force(self) -> float:
+        """Sum of the normal forces on the board in newtons."""
 
 
 def _marker_places() -> np.ndarray:

@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.board import Board
+from envs.board import Board, CarriedBoard
 from envs.camera import Intrinsics, wrist_mount
 from envs.cell import Cell
-from envs.pybullet_bodies import CarriedBoard
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.robot_safety import ArmStoppedError, SafetyGate
 from utils.config import SafetyConfig, ServoConfig

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from envs.board import BLACK, CARRIED_MASS, WHITE, Board
+from envs.board import BLACK, CARRIED_MASS, WHITE, Board, CarriedBoard
 from envs.cell_layout import (
     BIN_COLOUR,
     GRAVITY,
@@ -220,11 +220,10 @@ def add_board(client: int, board: Board, T_WO: np.ndarray, carried: bool = False
     )  # fmt: skip
 
 
-class CarriedBoard:
+class PybulletCarriedBoard(CarriedBoard):
     """A board screwed to a link of the robot: a body with mass that a constraint holds.
 
-    T_WO: (4, 4) where the board is now. T_EO: (4, 4) where it is on the hand. corners_E: (4, 3) its
-    corners in E, metres.
+    T_WO: (4, 4) where the board is now. T_EO: (4, 4) where it is on the hand.
     """
 
     def __init__(
@@ -244,7 +243,6 @@ class CarriedBoard:
         self.corners_E = transform_points(T_EO, board.outline)
 
     def contact_force(self) -> float:
-        """Sum of the normal forces on the board in newtons."""
         contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
         return sum(contact[9] for contact in contacts)
 

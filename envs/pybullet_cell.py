@@ -10,12 +10,12 @@ import math
 import numpy as np
 import pybullet
 
-from envs.board import Board
+from envs.board import Board, CarriedBoard
 from envs.cell import Cell, PhysicsError
 from envs.cell_scenes import Scene
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
-    CarriedBoard,
+    PybulletCarriedBoard,
     add_bin,
     add_board,
     add_table,
@@ -79,9 +79,8 @@ class PybulletCell(Cell):
         settle(self.client, self.bodies, self.config)
 
     def attach_board(self, board: Board, T_EO: np.ndarray) -> CarriedBoard:
-        """Screw a board to the hand at T_EO (4, 4)."""
         T_WO = forward_kinematics(self.robot.q) @ T_EO
-        return CarriedBoard(self.client, self.robot.body, ARM[-1], board, T_WO, T_EO)
+        return PybulletCarriedBoard(self.client, self.robot.body, ARM[-1], board, T_WO, T_EO)
 
     def _advance(self, count: int) -> None:
         while count > 0:
