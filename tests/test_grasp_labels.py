@@ -18,10 +18,13 @@ from utils.geometry import (
 from utils.grasp_labels import (
     GraspLabels,
     LabelSettings,
+    Trial,
     bin_angles,
     dense_labels,
+    draw_pairs,
     grasp_below_surface,
     grasp_depth,
+    label_truth,
 )
 from utils.transforms import (
     Grasp,
@@ -34,6 +37,7 @@ from utils.transforms import (
 )
 
 BOX = (0.04, 0.10, 0.05)
+OVERHEAD = look_at((0.5, 0.0, 0.8), (0.5, 0.0, 0.0), (1, 0, 0))
 
 
 def labels_of(frame: RGBDFrame) -> GraspLabels:
@@ -217,3 +221,72 @@ def test_labels_are_the_same_every_time() -> None:
     for name in ("quality", "width", "valid"):
         assert np.array_equal(getattr(one, name), getattr(two, name))
     assert ((one.width > 0) == (one.quality > 0)).all()
+
+
+# --- Labels against physics ----------------------------------------------------------------
+
+
+def test_label_truth_of_seven_trials():
+    truth = label_truth(
+        [
+            Trial(1.0, 2.0, True),
+            Trial(0.7, 4.0, False),
+            Trial(0.6, 1.0, True),
+            Trial(0.59, 10.0, True),
+            Trial(0.2, 3.0, True),
+            Trial(0.0, 5.0, True),
+            Trial(0.0, 5.0, False),
+        ]
+    )
+    assert (truth.executed, truth.positives) == (7, 3)
+    assert truth.precision == pytest.approx(2 / 3)
+    # Wilson's interval of 2 in 3 with z = 1.96, by hand.
+    assert truth.precision_ci95 == pytest.approx((0.2077, 0.9385), abs=1e-4)
+    assert truth.precision_weighted == pytest.approx(3 / 7)  # (2 + 1) of 2 + 4 + 1
+    assert truth.recall_weighted == pytest.approx(3 / 21)  # of 2 + 1 + 10 + 3 + 5
+    edges = [(low, high) for low, high, _, _ in truth.by_stratum]
+    assert edges == [
+        (0, 1e-6), (1e-6, 0.3), (0.3, 0.5), (0.5, 0.6), (0.6, 0.7), (0.7, 0.8), (0.8, 1)
+    ]  # fmt: skip
+    assert [count for _, _, count, _ in truth.by_stratum] == [2, 1, 0, 1, 1, 1, 1]
+    rates = [rate for _, _, _, rate in truth.by_stratum]
+    np.testing.assert_equal(rates, [0.5, 1, np.nan, 1, 1, 0, 1])
+
+
+def test_label_truth_of_nothing_is_not_a_number():
+    truth = label_truth([])
+    assert truth.executed == truth.positives == 0
+    assert np.isnan([truth.precision, truth.precision_weighted, truth.recall_weighted]).all()
+
+
+def test_pairs_are_drawn_from_every_stratum_with_weights_that_count_them_all():
+    """A surface 5 cm above the table in the left half of the image; table in the right half."""
+    height, width = 20, 30
+    depth = np.full((height, width), 0.8, np.float32)
+    segmentation = np.full((height, width), -1, np.int32)
+    depth[:, :15], segmentation[:, :15] = 0.75, 0
+    K = np.array([[60.0, 0, 14.5], [0, 60.0, 9.5], [0, 0, 1]])
+    frame = RGBDFrame(
+        np.zeros((height, width, 3), np.uint8), depth, K, OVERHEAD, segmentation, SceneGeometry(())
+    )
+    quality = np.zeros((18, height, width), np.float32)
+    quality[3, 0, :2] = 0.4  # fewer than are asked for
+    quality[7, 1, :10] = 0.65
+    quality[9, :, 20:] = 0.9  # on the table: not drawn
+    opening = np.where(quality > 0, 0.03, 0).astype(np.float32)
+    valid = np.ones((height, width), bool)
+    valid[19, :15] = False  # not labelled: not drawn
+    labels, rng = GraspLabels(quality, opening, valid), np.random.default_rng(0)
+    pairs = list(draw_pairs(frame, labels, GripperGeometry(), rng))
+
+    zeros = 18 * 19 * 15 - 12
+    found = sorted((q, weight) for _, q, weight in pairs)
+    expected = [(0, zeros / 6)] * 6 + [(0.4, 1.0)] * 2 + [(0.65, 10 / 3)] * 3
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    for grasp, q, _ in pairs:
+        assert grasp.width == pytest.approx(0.03 if q else GripperGeometry().max_opening)
+        tips = grasp.position[2] - GripperGeometry().tip_below_centre
+        assert tips == pytest.approx(0.05 - LabelSettings().depth, abs=1e-6)
+    angles = {round(np.degrees(g.angle)) for g, q, _ in pairs if q > 0.6}
+    # Bin 7 is 70 degrees on the image; +u is -y and +v is -x of this camera: -90 - 70, modulo 180.
+    assert angles == {20}

@@ -1,0 +1,342 @@
+"""Generation of simulated data: its folder, and the same bytes however often it is interrupted."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+
+from envs import data_generation
+from envs.camera import Intrinsics, camera_intrinsics
+from envs.cell import PhysicsError
+from envs.cell_scenes import SceneError
+from envs.data_generation import (
+    SPLITS,
+    data_folder,
+    draw_scene,
+    execute_pairs,
+    generate,
+    label_scene,
+    missing_shards,
+    object_sets,
+    with_other_physics,
+)
+from envs.objects import ObjectError
+from envs.pybullet_appearance import Appearance, Texture, draw_camera
+from envs.pybullet_cell import PybulletCell
+from utils.config import load_config
+from utils.errors import UserError
+from utils.grasp_data import SimulatedDataset, read_trials, shard_path
+from utils.grasp_labels import Trial
+from utils.transforms import look_at
+
+# --- The folder ------------------------------------------------------------------------------
+
+
+def folder_of(*overrides: str) -> Path:
+    return data_folder(load_config(None, overrides))
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "seed=1", "sim.frequency=120", "camera.width=128", "camera.fov_deg=30",
+        "workspace.size=0.25", "objects.density=500", "data.object_sets=primitives",
+        "data.max_objects=3", "data.randomise=false", "data.executed_share=0.5",
+    ],
+)  # fmt: skip
+def test_what_matters_to_an_image_changes_the_folder(override):
+    assert folder_of(override) != folder_of()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "data.frames=64", "data.validation_frames=32", "data.workers=3", "train.lr=1e-4",
+        "camera.depth_noise=kinect", "objects.split=train", "evaluate.rounds=3", "cache_dir=x",
+    ],
+)  # fmt: skip
+def test_what_does_not_matter_keeps_the_folder(override):
+    assert folder_of(override) == folder_of()
+
+
+def test_a_named_root_is_taken_as_it_is(tmp_path):
+    assert folder_of(f"data.root={tmp_path}") == tmp_path
+
+
+def test_a_root_of_other_settings_or_of_something_else_is_left_alone(tiny_data, tmp_path):
+    _, overrides = tiny_data
+    with pytest.raises(UserError, match="other settings.*content.yaml"):
+        generate(load_config(None, [*overrides, "seed=5"]))
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty and no data set"):
+        generate(load_config(None, [*overrides, f"data.root={tmp_path}"]))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_sets_that_cannot_be_parted_are_said_before_any_worker_starts(tmp_path):
+    with pytest.raises(UserError, match="box holds 1 object"):
+        generate(load_config(None, [f"data.root={tmp_path / 'a'}", "data.object_sets=box"]))
+    (tmp_path / "meshes").mkdir()
+    with pytest.raises((UserError, ObjectError), match="meshes"):
+        generate(
+            load_config(
+                None, [f"data.root={tmp_path / 'b'}", f"data.object_sets={tmp_path / 'meshes'}"]
+            )
+        )
+
+
+# --- Generation ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_interrupted_generation_goes_on_and_ends_in_the_same_bytes(tiny_data, tmp_path):
+    folder, overrides = tiny_data
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    shard_path(copy, "train", 0).unlink()
+    kept = os.stat(shard_path(copy, "validation", 0))
+    assert generate(load_config(None, [*overrides, f"data.root={copy}"])) == copy
+    again, first = (shard_path(data, "train", 0).read_bytes() for data in (copy, folder))
+    assert again == first
+    assert os.stat(shard_path(copy, "validation", 0)).st_mtime_ns == kept.st_mtime_ns
+
+
+def test_every_shard_has_one_owner_whatever_is_there_already(tmp_path):
+    config = load_config(None, ["data.frames=161", "data.validation_frames=64"])
+    everything = [("train", n) for n in range(6)] + [("validation", n) for n in range(2)]
+    shares = [missing_shards(config, tmp_path, rank, 3) for rank in range(3)]
+    assert sorted(sum(shares, [])) == everything
+    for job in shares[0]:  # the first process is done before the others start
+        shard_path(tmp_path, *job).parent.mkdir(exist_ok=True)
+        shard_path(tmp_path, *job).touch()
+    assert [missing_shards(config, tmp_path, rank, 3) for rank in range(3)] == [[], *shares[1:]]
+
+
+def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch):
+    begun = []
+
+    def make_shard(folder, split, number):
+        begun.append(number)
+        if number == 0:
+            raise OSError(errno.ENOSPC, "no space")
+        time.sleep(0.2)  # under way when the error is met
+        return 32
+
+    # A thread in place of the process, which would not know of the replaced functions.
+    monkeypatch.setattr(
+        data_generation, "ProcessPoolExecutor", lambda workers, **_: ThreadPoolExecutor(workers)
+    )
+    monkeypatch.setattr(data_generation, "_make_shard", make_shard)
+    config = load_config(None, [f"data.root={tmp_path / 'data'}", "data.frames=960",
+                                "data.object_sets=primitives", "data.workers=1"])  # fmt: skip
+    with pytest.raises(OSError, match="no space"):
+        generate(config)
+    assert len(begun) < 5
+
+
+def test_scenes_that_cannot_be_made_are_told(config, monkeypatch):
+    def none(*_):
+        raise SceneError("too many")
+
+    monkeypatch.setattr(data_generation, "make_scene", none)
+    given = load_config(None, ["data.object_sets=primitives"])
+    with (
+        PybulletCell(config) as cell,
+        pytest.raises(UserError, match="none of 100 .*data.max_objects"),
+    ):
+        draw_scene(given, "train", 1, object_sets(given), cell)
+
+
+def test_generated_frames_are_whole(tiny_data):
+    folder, _ = tiny_data
+    for split in SPLITS:
+        images = SimulatedDataset(folder, split)
+        assert len(images) == 32 and len(set(images.scenes)) == 8
+        graspable = [bool((images[i].quality > 0.5).any()) for i in range(32)]
+        assert np.mean(graspable) > 0.8  # of two primitives, nearly always one can be gripped
+        for i in range(32):
+            known = images[i].depth[images[i].depth > 0]
+            assert len(known) > 0.9 * images[i].depth.numel()
+            assert known.max() < 1.5 and known.min() > 0.4
+    assert not set(SimulatedDataset(folder, "train").scenes) & set(
+        SimulatedDataset(folder, "validation").scenes
+    )
+    trials = read_trials(folder)
+    assert {0.0} < {t.quality for t in trials} and any(t.success for t in trials)
+
+
+def test_pixels_lie_around_the_centre_of_their_object(tiny_data):
+    """In shards of the real cell: wherever an object is, the pixels that show it are around the
+    place that is stored as its centre of mass, and every object has a place of its own."""
+    folder, _ = tiny_data
+    images = SimulatedDataset(folder, "train")
+    distances = []
+    for image in (images[i] for i in range(len(images))):
+        on = image.centre[0].isfinite()
+        centres = image.centre[:, on].T.unique(dim=0)
+        assert len(centres) <= 2
+        for centre in centres:
+            v, u = torch.nonzero((image.centre == centre[:, None, None]).all(0), as_tuple=True)
+            if len(u) > 20:
+                middle = torch.stack([u.float().mean(), v.float().mean()])
+                distances.append(float(torch.linalg.norm(middle - centre)))
+    assert len(distances) > 32
+    assert np.median(distances) < 1.0 and np.max(distances) < 5.0  # of 64, an object spans 8 to 20
+
+
+def test_validation_keeps_every_tenth_training_object_and_no_test_object(config):
+    given = load_config(None, ["data.object_sets=primitives", "objects.split=test"])
+    parts = object_sets(given)
+    assert {key: len(part) for key, part in parts.items()} == {
+        ("primitives", "validation"): 90,
+        ("primitives", "train"): 810,
+    }
+    with PybulletCell(config) as cell:
+        for split, kept in (("train", False), ("validation", True)):
+            for seed in range(4):
+                scene, _ = draw_scene(given, split, seed, parts, cell)
+                for placed in scene.placements:
+                    number = int(placed.model.name[-4:])  # 900 and above are for testing
+                    assert number < 900 and (number % 10 == 0) is kept
+
+
+# --- Appearance and physics ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cell_with_scene(tiny_data):
+    config = load_config(None, tiny_data[1])
+    with PybulletCell(config) as cell:
+        scene, _ = draw_scene(config, "train", 3, object_sets(config), cell)
+        cell.load(scene)
+        yield cell, scene
+
+
+def test_without_randomisation_the_plain_camera_sees_plain_objects(tiny_data, cell_with_scene):
+    cell, scene = cell_with_scene
+    plain = load_config(None, [*tiny_data[1], "data.randomise=false", "data.executed_share=0"])
+    first, trials = next(label_scene(plain, scene, "primitives", cell))
+    cell.load(scene)
+    expected = cell.frame()
+    assert np.array_equal(first.frame.rgb, expected.rgb)
+    assert np.array_equal(first.frame.depth, expected.depth)
+    assert np.array_equal(first.frame.T_WC, look_at((0.5, 0, 0.8), (0.5, 0, 0), (1, 0, 0)))
+    assert np.array_equal(first.frame.K, expected.K) and trials == []
+    random = load_config(None, [*tiny_data[1], "data.executed_share=0"])
+    first, _ = next(label_scene(random, scene, "primitives", cell))
+    assert not np.allclose(first.frame.T_WC, expected.T_WC)
+
+
+def test_physics_of_labels(tiny_data, cell_with_scene):
+    """Friction 0.7 to 1.3 of the object's own, mass 0.5 to 1.5, inertia with it; each frame others;
+    what is labelled is what is simulated."""
+    cell, scene = cell_with_scene
+    config = load_config(None, [*tiny_data[1], "data.randomise_physics=true"])
+    first, again, second = (with_other_physics(scene, config, number) for number in (0, 0, 1))
+    for old, new, same, other in zip(*(s.placements for s in (scene, first, again, second))):
+        heavier = new.model.mass / old.model.mass
+        assert 0.7 <= new.model.friction / old.model.friction <= 1.3 and 0.5 <= heavier <= 1.5
+        np.testing.assert_allclose(new.model.inertia, heavier * old.model.inertia)
+        assert (new.model.friction, new.model.mass) == (same.model.friction, same.model.mass)
+        assert new.model.friction != other.model.friction
+        assert new.model.parts is old.model.parts
+    cell.build(first)
+    for number, solid in enumerate(cell.truth().objects):
+        simulated = pybullet.getDynamicsInfo(cell.bodies[number], -1, cell.client)
+        assert solid.friction == simulated[1] == first.placements[number].model.friction
+        assert simulated[0] == pytest.approx(first.placements[number].model.mass)
+
+
+def test_a_grasp_that_blows_up_the_simulation_has_failed(cell_with_scene, monkeypatch):
+    cell, scene = cell_with_scene
+    cell.load(scene)
+
+    def blow_up(*_):
+        raise PhysicsError("as if")
+
+    pairs = [("grasp", 0.9, 2.0), ("grasp", 0.0, 5.0)]
+    monkeypatch.setattr(data_generation, "draw_pairs", lambda *_: pairs)
+    monkeypatch.setattr(data_generation, "execute_grasp", blow_up)
+    trials = execute_pairs(cell, scene, None, None, np.random.default_rng(0))
+    assert trials == [Trial(0.9, 2.0, False), Trial(0.0, 5.0, False)]
+
+
+def stripes(strength: float) -> Texture:
+    """1 cm light, 1 cm dark along x."""
+    return Texture(
+        np.array([[2 * np.pi / 0.02, 0, 0]]), np.zeros(1), np.full(3, strength), hard=True
+    )
+
+
+def test_a_texture_colours_what_it_is_on_and_leaves_the_depth(cell_with_scene):
+    cell, scene = cell_with_scene
+    cell.load(scene)
+    view = camera_intrinsics(cell.config.camera), cell.camera_pose()
+    rng = np.random.default_rng(0)
+    plain = Appearance().photograph(cell, *view, rng)
+    count = len(scene.placements)
+    for index in range(-1, count):  # the table, then every object
+        textures = tuple(stripes(0.5) if i == index else None for i in range(-1, count))
+        seen = Appearance(textures=textures).photograph(cell, *view, rng)
+        assert np.array_equal(seen.depth, plain.depth)
+        changed = (seen.rgb != plain.rgb).any(axis=-1)
+        assert changed[plain.segmentation == index].mean() > 0.5
+        assert not changed[plain.segmentation != index].any()
+    noisy = Appearance(noise=5.0).photograph(cell, *view, rng)
+    assert np.array_equal(noisy.depth, plain.depth)
+    middle = (plain.rgb > 30) & (plain.rgb < 225)  # not cut off at 0 or 255
+    # Rounding down takes half a step from the mean and adds a variance of a twelfth.
+    error = noisy.rgb[middle].astype(float) - plain.rgb[middle]
+    assert error.mean() == pytest.approx(-0.5, abs=0.2)
+    assert error.std() == pytest.approx(np.sqrt(25 + 1 / 12), rel=0.1)
+
+
+def test_a_texture_of_one_wave_is_a_sine():
+    wave = Texture(
+        np.array([[2 * np.pi / 0.02, 0, 0]]), np.zeros(1), np.array([0.5, 0.2, 0]), False
+    )
+    points = np.array([[0.0, 1, 2], [0.005, 1, 2], [0.010, 3, 4], [0.015, 3, 4]])
+    np.testing.assert_allclose(
+        wave.factor(points),
+        [[1, 1, 1], [1.5, 1.2, 1], [1, 1, 1], [0.5, 0.8, 1]],
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(stripes(0.3).factor(points)[[1, 3]], [[1.3] * 3, [0.7] * 3])
+
+
+def test_drawn_textures_at_most_halve_or_add_half():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (500, 3))
+    reached = []
+    for _ in range(50):
+        texture = Texture.draw(rng)
+        change = np.abs(texture.factor(points) - 1)
+        assert (change <= texture.strength + 1e-12).all() and change.max() <= 0.5
+        reached.append(change.max())
+    assert max(reached) > 0.3
+
+
+def test_cameras_are_drawn_around_the_configured_one(config):
+    rng = np.random.default_rng(0)
+    tilts = []
+    for _ in range(300):
+        intrinsics, T_WC = draw_camera(rng, config.camera)
+        assert isinstance(intrinsics, Intrinsics)
+        assert 28 * 0.92 <= intrinsics.fov_deg <= 28 * 1.08
+        axis = T_WC[:3, 2]
+        distance = -T_WC[2, 3] / axis[2]  # to the table along the axis
+        hit = T_WC[:3, 3] + distance * axis
+        assert np.abs(hit[:2] - (0.5, 0.0)).max() <= 0.02 + 1e-9
+        assert abs(distance - 0.8) <= 0.12 + 1e-9
+        tilts.append(np.degrees(np.arccos(-axis[2])))
+    assert max(tilts) <= 25 + 1e-6
+    assert 0.65 < np.mean(np.array(tilts) <= 3) < 0.95  # four in five are near, some by chance
