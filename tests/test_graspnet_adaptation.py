@@ -6,7 +6,6 @@ import copy
 import json
 import math
 import shutil
-import signal
 from dataclasses import fields
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from models.graspnet_data import TrainingData
 from models.graspnet_io import KIND, load_graspnet
 from models.photographs import K, frame_of
 from tests.helpers.compare import same
+from tests.helpers.interruption import interrupt_after
 from tests.helpers.one_step import BATCH, joint_batch
 from tests.helpers.real_images import write_cornell
 from tests.helpers.trainings import SMALL, labelled
@@ -477,16 +477,8 @@ def test_the_script_adapts(finished):
 def test_an_interrupted_adaptation_goes_on_bit_for_bit(finished, tmp_path, monkeypatch):
     straight, arguments = finished
     monkeypatch.chdir(tmp_path)
-    take_step = AdaptingTrainer.train_step
-
-    def interrupted(trainer, batch):
-        done = take_step(trainer, batch)
-        if trainer.step == 6:
-            signal.raise_signal(signal.SIGINT)
-        return done
-
     with monkeypatch.context() as patch:
-        patch.setattr(AdaptingTrainer, "train_step", interrupted)
+        interrupt_after(patch, AdaptingTrainer, "train_step", lambda trainer: trainer.step == 6)
         assert train_graspnet.main(arguments) == 130
     (run,) = Path("runs/train_graspnet").iterdir()
     assert train_graspnet.main(["--resume", str(run)]) == 0

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores
 from models.graspnet_training import Trainer
 from tests.helpers.compare import same
+from tests.helpers.interruption import interrupt_after
 from tests.helpers.trainings import SMALL
 from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
@@ -102,57 +102,39 @@ def test_tensorboard_tells_training_from_validation_with_units(finished):
     assert rate == pytest.approx(expected, abs=1e-8)
 
 
-@pytest.mark.parametrize("stop", [3, 4])
+@pytest.mark.parametrize("stop", [4, 5])
 def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     finished, tmp_path, monkeypatch, capfd, stop
 ):
-    """A real Ctrl-C, within an epoch or in its last step; then it goes on with worker processes."""
+    """In the last step of an epoch or within one; the training continues with worker processes.
+
+    Only a finished training replaces the file of --weights.
+    """
     straight, arguments = finished
+    shipped = tmp_path / "shipped.pt"
+    shipped.write_text("the good old ones")
     monkeypatch.chdir(tmp_path)
-    take_step = Trainer.train_step
-
-    def interrupted(trainer, batch):
-        done = take_step(trainer, batch)
-        if trainer.step == stop:
-            signal.raise_signal(signal.SIGINT)
-        return done
-
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", interrupted)
-        assert train_graspnet.main(arguments) == 130
+        interrupt_after(patch, Trainer, "train_step", lambda trainer: trainer.step == stop)
+        assert train_graspnet.main([*arguments, f"--weights={shipped}"]) == 130
     (run,) = Path("runs/train_graspnet").iterdir()
     assert f"stopped after {stop} steps; go on with --resume {run}" in capfd.readouterr().out
     assert load_checkpoint(run / "last.pt", KIND)["step"] == stop
-    assert not (run / "results.json").exists()
+    first_epoch_is_over = stop > 4
+    for name in ("results.json", "graspnet.pt"):
+        assert (run / name).exists() == first_epoch_is_over
+    assert shipped.read_text() == "the good old ones"
 
-    assert train_graspnet.main(["--resume", str(run), "train.workers=2"]) == 0
+    assert (
+        train_graspnet.main(["--resume", str(run), "train.workers=2", f"--weights={shipped}"]) == 0
+    )
     for name in ("last.pt", "best.pt"):
         ours, theirs = (load_checkpoint(folder / name, KIND) for folder in (run, straight))
         for part in ("step", "model", "optimizer", "scheduler", "extra"):
             assert same(ours[part], theirs[part]), (name, part)
     ours, theirs = (json.loads((f / "results.json").read_text()) for f in (run, straight))
     assert ours == theirs
-
-
-def test_only_a_finished_training_replaces_the_weights(finished, tmp_path, monkeypatch):
-    arguments = [*finished[1], "--weights", str(tmp_path / "shipped.pt")]
-    (tmp_path / "shipped.pt").write_text("the good old ones")
-    monkeypatch.chdir(tmp_path)
-    take_step = Trainer.train_step
-
-    def interrupted(trainer, batch):
-        if trainer.step == 4:  # after the first epoch
-            signal.raise_signal(signal.SIGINT)
-        return take_step(trainer, batch)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", interrupted)
-        assert train_graspnet.main(arguments) == 130
-    (run,) = Path("runs/train_graspnet").iterdir()
-    assert (run / "graspnet.pt").exists()
-    assert (tmp_path / "shipped.pt").read_text() == "the good old ones"
-    assert train_graspnet.main(["--resume", str(run), *arguments[-2:]]) == 0
-    assert (tmp_path / "shipped.pt").read_bytes() == (run / "graspnet.pt").read_bytes()
+    assert shipped.read_bytes() == (run / "graspnet.pt").read_bytes()
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch):

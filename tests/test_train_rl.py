@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -24,6 +23,7 @@ from models.grasp_policy import GraspPPO, load_policy
 from models.ppo import KIND
 from models.ppo_rollouts import evaluate_policy
 from tests.helpers.compare import same
+from tests.helpers.interruption import interrupt_after
 from tests.helpers.ppo_step import SIZE, take_step
 from tests.test_ppo import batch_of, ppo_of
 from utils.checkpoint import load_checkpoint
@@ -223,16 +223,8 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
 ):
     """A real Ctrl-C; then it goes on, in worker processes too."""
     monkeypatch.chdir(tmp_path)
-    update = GraspPPO.update
-
-    def interrupted(ppo, *arguments):
-        done = update(ppo, *arguments)
-        if ppo.updates == stop:
-            signal.raise_signal(signal.SIGINT)
-        return done
-
     with monkeypatch.context() as patch:
-        patch.setattr(GraspPPO, "update", interrupted)
+        interrupt_after(patch, GraspPPO, "update", lambda ppo: ppo.updates == stop)
         assert train_rl.main(POINT) == 130
     (run,) = Path("runs/train_rl").iterdir()
     assert f"go on after 64 steps with --resume {run}" in capsys.readouterr().out
