@@ -107,7 +107,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def make_data(config: Config, processes: Team) -> TrainingData:
     """Make the simulated images that are still missing, and open them.
 
-    Raises UserError if the validation images could not tell a good network from a bad one.
+    Raises UserError if the validation images show nothing graspable.
     """
     folder = generate(config, processes.rank, processes.ranks)
     processes.wait()

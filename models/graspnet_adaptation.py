@@ -167,13 +167,13 @@ class AdaptingTrainer(Trainer):
         targets = type(labels)(*(t.to(device, non_blocking=True) for t in labels))
         mixed = self.precision != torch.float32
         with torch.autocast(device.type, dtype=self.precision, enabled=mixed):
-            ours = self.trained(source, SOURCE, self.reversal)
+            on_source = self.trained(source, SOURCE, self.reversal)
             with torch.set_grad_enabled(self.weight > 0):
-                theirs = self.trained(target, TARGET, self.reversal)
-        quality, angle, width, *offset = ours.task
+                on_target = self.trained(target, TARGET, self.reversal)
+        quality, angle, width, *offset = on_source.task
         total, parts = self.loss(quality, angle, width, targets, *offset)
-        between = domain_loss(ours.domain.float(), theirs.domain.float())
-        right = ((ours.domain <= 0).float().mean() + (theirs.domain > 0).float().mean()) / 2
+        between = domain_loss(on_source.domain.float(), on_target.domain.float())
+        right = ((on_source.domain <= 0).float().mean() + (on_target.domain > 0).float().mean()) / 2
         parts |= {"domain_loss": between.detach(), "domain_accuracy": right}
         return (total + between if self.weight > 0 else total), parts
 

@@ -1,8 +1,8 @@
-"""GraspNet on any camera's image: the scale it was trained at, and everything mapped back.
+"""GraspNet on the image of any camera: resampling to the scale of training, and back.
 
 Convolutions know sizes in pixels only. So the image is resampled, with square pixels, until one of
-its pixels spans as many metres at the median depth as in training; grasps and maps then return to
-the original's pixels. This module knows no simulator and no files.
+its pixels spans as many metres at the median depth as in training; grasps and maps are converted
+back to the original's pixels. This module knows no simulator and no files.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from utils.transforms import Grasp, ImageGrasp, RGBDFrame, deproject
 SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
 MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
 PEAKS = PeakSettings()
-CANDIDATES = 1000  # peaks that are looked at for some that stand on the table
+CANDIDATES = 1000  # peaks, of which those above the table remain
 
 
 @dataclass(frozen=True)
 class PredictedGrasp:
-    """on_image: on the visible surface, in pixels of the original image. in_world: where the
-    fingertips close, in W."""
+    """A grasp twice: on_image on the visible surface, in pixels of the original image; in_world in
+    W, at the place where the fingers close."""
 
     on_image: ImageGrasp
     in_world: Grasp
@@ -45,8 +45,11 @@ class PredictedGrasp:
 
 @dataclass(frozen=True)
 class Prediction:
-    """grasps: best first. quality, angle, width: (H, W) float32 at the original image's pixels:
-    in [0, 1], image angles in [0, pi), metres."""
+    """Ranked grasps and the network's maps.
+
+    grasps: best first. quality, angle, width: (H, W) float32 at the original image's pixels: in [0,
+    1], image angles in [0, pi), metres.
+    """
 
     grasps: list[PredictedGrasp]
     quality: np.ndarray
@@ -64,12 +67,12 @@ def predict(
     labels: LabelSettings = LABELS,
     peaks: PeakSettings = PEAKS,
 ) -> Prediction:
-    """The `count` best grasps of a frame, whatever its size, aspect ratio and focal lengths.
+    """Find the `count` best grasps in a frame of any size, aspect ratio and focal lengths.
 
-    metres_per_pixel: of the images that the model was trained on. table_height: z of the table
-    in W. peaks: in pixels at the training's scale. A grasp needs a surface that the fingertips
-    can go beside, as in the labels; peaks on the table are none. Raises UserError for images that
-    cannot be meant.
+    metres_per_pixel: the scale of the training images. table_height: z of the table in W, metres.
+    peaks: in pixels at the training's scale. A grasp needs a surface beside which the fingertips
+    fit, as in the labels; peaks on the table are left out. Raises UserError as `training_scale`
+    does.
     """
     scaling, maps = scaled_maps(model, metres_per_pixel, frame)
     grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)
@@ -91,8 +94,8 @@ def predict(
 def scaled_maps(
     model: GraspNet, metres_per_pixel: float, frame: RGBDFrame, centres: bool = False
 ) -> tuple[PixelScaling, tuple[torch.Tensor, ...]]:
-    """The scaling to the training's pixels, and the network's three maps there; with `centres` a
-    fourth one, of the centre head."""
+    """Return the scaling to the training's pixels and the network's three maps there; with
+    `centres` also the map of the centre head."""
     if model.input_channels != INPUT_CHANNELS:
         raise UserError(
             f"the network takes {model.input_channels} channels; an RGB-D image has "
@@ -111,7 +114,7 @@ def grasps_in_maps(
     labels: LabelSettings,
     peaks: PeakSettings,
 ) -> list[PredictedGrasp]:
-    """Grasps on whatever rises from the table, best first, at the original's pixels."""
+    """Return the grasps on surfaces above the table, best first, at the original's pixels."""
     found = find_peaks(*maps, PeakSettings(peaks.threshold, CANDIDATES, peaks.radius, peaks.blur))
     rows, columns = frame.depth.shape
     original = Peaks(
@@ -120,7 +123,7 @@ def grasps_in_maps(
         found.width,
         found.quality,
     )
-    # As far around in metres as one pixel at the training's scale.
+    # The same radius in metres as one pixel at the training's scale.
     radius = max(1, round(1 / min(scaling.u, scaling.v)))
     seen = surface_grasps(original, frame.depth, gripper, radius)
     pixels = np.array([grasp.pixel for grasp in seen]).reshape(-1, 2)
@@ -137,10 +140,9 @@ def grasps_in_maps(
 
 
 def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
-    """The scaling after which a pixel spans `metres_per_pixel` at the median known depth.
+    """Return the scaling after which a pixel spans `metres_per_pixel` at the median known depth.
 
-    Raises UserError for images that cannot be meant, and where the view would be far too small or
-    too wide.
+    Raises UserError as `check_rgbd` does, and for a view that is far too small or too wide.
     """
     distance = check_rgbd(frame.rgb, frame.depth)
     scaling = PixelScaling.to_focal_length(frame.K, distance / metres_per_pixel)
@@ -160,7 +162,7 @@ def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
 def run_network(
     model: GraspNet, frame: RGBDFrame, scaling: PixelScaling, centres: bool = False
 ) -> tuple[torch.Tensor, ...]:
-    """GraspNet's three maps of the scaled image, with `centres` four, on the CPU."""
+    """Return GraspNet's three maps of the scaled image, with `centres` four, on the CPU."""
     depth = scaling.image(fill_holes(frame.depth))
     image = to_input(scaling.image(frame.rgb), depth)
     device = next(model.parameters()).device

@@ -177,8 +177,8 @@ def check_export_path(path: Path) -> None:
     if not path.exists():
         return
     try:
-        ours = onnx.load(path, load_external_data=False).producer_name == PRODUCER
+        exported_here = onnx.load(path, load_external_data=False).producer_name == PRODUCER
     except Exception:  # protobuf and onnx raise several types for other files
-        ours = False
-    if not ours:
+        exported_here = False
+    if not exported_here:
         raise UserError(f"{path}: exists and is no export of this program; give another name")

@@ -195,9 +195,9 @@ def _small_cnn(feature_dim: int) -> nn.Module:
 def domain_loss(source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the binary cross-entropy of the domain classifier's logits (B,) on images of the
     source and of the target; both domains count alike."""
-    ours = F.binary_cross_entropy_with_logits(source, torch.zeros_like(source))
-    theirs = F.binary_cross_entropy_with_logits(target, torch.ones_like(target))
-    return (ours + theirs) / 2
+    of_source = F.binary_cross_entropy_with_logits(source, torch.zeros_like(source))
+    of_target = F.binary_cross_entropy_with_logits(target, torch.ones_like(target))
+    return (of_source + of_target) / 2
 
 
 # --- Training ---------------------------------------------------------------------------------
@@ -306,12 +306,12 @@ def train_domain_adaptation(
             group["lr"] = settings.lr / (1 + _SHARPNESS * progress) ** 0.75
         chosen_s, chosen_t = next(batches)
         reversal = settings.adversarial * reversal_weight(progress)
-        ours = model(images[chosen_s], SOURCE, reversal)
+        on_source = model(images[chosen_s], SOURCE, reversal)
         with torch.set_grad_enabled(bool(settings.adversarial)):
-            theirs = model(target[chosen_t], TARGET, reversal)
-        loss = task_loss(ours.task, labels[chosen_s])
+            on_target = model(target[chosen_t], TARGET, reversal)
+        loss = task_loss(on_source.task, labels[chosen_s])
         if settings.adversarial:
-            loss = loss + domain_loss(ours.domain, theirs.domain)
+            loss = loss + domain_loss(on_source.domain, on_target.domain)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -367,16 +367,16 @@ def _check(
     target: torch.Tensor, score: Loss,
 ) -> Check:  # fmt: skip
     """Score the network on held-out images, labels and target images."""
-    ours, theirs = predict(model, images, SOURCE), predict(model, target, TARGET)
-    right = torch.cat([ours.domain <= 0, theirs.domain > 0]).double()
+    on_source, on_target = predict(model, images, SOURCE), predict(model, target, TARGET)
+    correct = torch.cat([on_source.domain <= 0, on_target.domain > 0]).double()
     # Both domains count alike, however many images are held out.
-    sizes = len(ours.domain), len(theirs.domain)
+    sizes = len(on_source.domain), len(on_target.domain)
     weights = torch.cat([torch.full((n,), 0.5 / n, dtype=torch.double) for n in sizes])
     return Check(
         step,
-        float(score(ours.task, labels)),
-        mutual_information(theirs.task),
-        float((right * weights).sum()),
+        float(score(on_source.task, labels)),
+        mutual_information(on_target.task),
+        float((correct * weights).sum()),
     )
 
 

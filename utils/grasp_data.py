@@ -147,8 +147,8 @@ class SimulatedDataset(Dataset):
         """Return (2, H, W) the pixel of the object's centre of mass; NaN where there is none."""
         K, T_WC = self.cameras[index]
         pixels, _ = project(centres, K, T_WC)
-        nowhere = np.full((1, 2), np.nan)
-        return np.moveaxis(np.vstack([pixels, nowhere])[instance], -1, 0).astype(np.float32)
+        no_object = np.full((1, 2), np.nan)
+        return np.moveaxis(np.vstack([pixels, no_object])[instance], -1, 0).astype(np.float32)
 
     def table_distance(self, index: int) -> float:
         """Return the distance from the camera to the table (z = 0) along the optical axis, m."""
