@@ -19,10 +19,10 @@ import pybullet
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
-from envs.execution import choose_posture
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import UnreachableError, moved
+from envs.robot_postures import choose_posture
 from models.planners import make_planner
 from utils.config import load_config, run_script
 from utils.errors import TargetLostError
@@ -115,7 +115,7 @@ def sightings(
         about = planar(*T_WB[:2, 3], 0.0)
         motion = about @ motion @ inverse_pose(about)
         try:
-            q = choose_posture(cell, moved(T_WE, np.append(beside, tilt)))
+            q = choose_posture(moved(T_WE, np.append(beside, tilt)), cell.home)
         except UnreachableError:
             continue
         cell.robot.place(q)

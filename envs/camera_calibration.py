@@ -1,10 +1,10 @@
-"""Where the cameras are believed to be, and where they are: what a calibration gets wrong.
+"""The calibration of the cell's cameras, and its errors.
 
-Images come from the cameras' true poses; whoever reasons about them has only these beliefs. Both
-cameras are off in a miscalibrated cell, each in a direction of its own. The one thing that a wrong
-belief cannot spoil is what was shown: `teach` has the wrist camera look at a board on a jig that
-sits at a known place before the fingers (teaching by showing), so that goals can be told as they
-look to that very camera.
+Images come from the cameras' true poses; planners and loops know the poses of a `CameraCalibration`
+only. In a miscalibrated cell both cameras are off, each in a direction of its own. What a camera
+has seen itself is free of that error: `teach` lets the wrist camera look at a board on a jig at a
+known place before the fingers (teaching by showing), from which goals follow as views of that very
+camera.
 """
 
 from __future__ import annotations
@@ -28,15 +28,19 @@ _BOARD_TURN = np.diag([1.0, -1.0, -1.0])  # its face towards the camera
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """T_WC: (4, 4) overhead camera. T_EC: (4, 4) wrist camera in the gripper. levelled: whether
-    depth images are turned and lifted until the table in them lies where it is known to be."""
+    """The poses of the cameras that the program assumes.
+
+    T_WC: (4, 4) overhead camera. T_EC: (4, 4) wrist camera in the gripper. levelled: whether frames
+    are turned and lifted until their table lies at its known height.
+    """
 
     T_WC: np.ndarray
     T_EC: np.ndarray
     levelled: bool = False
 
     def frame(self, frame: RGBDFrame, mount: str, T_WE: np.ndarray) -> RGBDFrame:
-        """A frame as it is believed to have been taken; T_WE: (4, 4) the gripper, by encoders."""
+        """A frame with the assumed camera pose. mount: overhead or wrist. T_WE: (4, 4) the gripper
+        by its encoders."""
         T_WC = self.T_WC if mount == "overhead" else T_WE @ self.T_EC
         frame = replace(frame, T_WC=T_WC)
         return level(frame) if self.levelled else frame
@@ -49,7 +53,8 @@ def true_calibration(cell: Cell) -> CameraCalibration:
 def wrong_calibration(
     cell: Cell, rng: np.random.Generator, distance: float, angle: float
 ) -> CameraCalibration:
-    """Both cameras believed `distance` metres and `angle` radians off, in random directions."""
+    """A calibration in which both cameras are `distance` metres and `angle` radians off, each in
+    random directions."""
     true = true_calibration(cell)
     T_WC, T_EC = (displaced(T, rng, distance, angle) for T in (true.T_WC, true.T_EC))
     return CameraCalibration(T_WC, T_EC, levelled=True)
@@ -65,9 +70,9 @@ def displaced(T: np.ndarray, rng: np.random.Generator, distance: float, angle: f
 
 
 def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
-    """The frame with its camera turned about its own place and lifted so that the table that it
-    shows is level at z = `table`: a planner that believes the table to stand two centimetres in
-    the air plans nothing. Place and heading stay as wrong as they were."""
+    """The frame with its camera turned in place and lifted, so that its table is level at z =
+    `table`. Horizontal position and heading keep their errors. Without this a planner finds the
+    table two centimetres in the air and plans nothing."""
     normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), table)
     up = frame.T_WC[:3, :3] @ normal
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
@@ -79,14 +84,14 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
 
 @functools.lru_cache(maxsize=2)
 def teach(cell: Cell) -> np.ndarray:
-    """(4, 4) T_CE as the wrist camera itself shows it: the board's pose in one image, taken while
-    the jig holds the board at a known pose in E. Empties the cell, the first time: a camera has to
-    be shown something once only."""
+    """(4, 4) T_CE as the wrist camera itself shows it: from the board's pose in one image, taken
+    while the jig holds the board at a known pose in E. The first call empties the cell; later calls
+    return the same pose."""
     servo, camera = cell.config.servo, cell.config.camera
     intrinsics = Intrinsics(
         servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far
     )
-    T_EB = np.eye(4)  # how the jig is built: the board's middle before the camera's nominal place
+    T_EB = np.eye(4)  # the jig: the board's middle lies before the camera's nominal place
     T_EB[:3, :3] = wrist_mount(camera)[:3, :3] @ _BOARD_TURN
     T_EB[:3, 3] = np.add(camera.wrist_position, [0.0, 0.0, _BOARD_DEPTH])
     board = Board(cell=0.009)

@@ -1,28 +1,20 @@
-"""The last centimetres of a closed-loop grasp, in which the camera sees the object no more.
+"""Closed-loop grasping: the arm follows a grasp that it finds again in every wrist image.
 
-The hand goes straight on along the grasp's axis and along with the object's motion as it was
-foreseen, and follows it while the fingers close. Images go on being taken: the watchdog stops the
-arm here too when they stop coming. All velocities pass the safety gate (`ServoArm`).
-
-Which way round to grasp: the fingers are alike, so every grasp is two, half a turn apart.
-
-The way round is chosen by the wrist, the last joint: it may turn by less than a whole turn, and an
-object that turns takes it along.
-
-Closed-loop grasping: the object is found again in every image of the wrist camera, all the way.
-
-An `Approach` for `envs.execution`, which closes, lifts and judges. Three stages:
+`ClosedLoop` is an `Approach` for `envs.execution`, which closes, lifts and judges. It has three
+stages:
 
 far     position-based for every controller, until the object is near the middle of the view: an
-        image-based law backs away where the turn is large (see docs/servo.md).
-near    the controller's own law, towards a goal that sinks along the grasp's axis as far as the
-        camera sees the object. The object's own velocity, as the filter tells it, is added to
-        the law's, which takes away the lag behind what moves.
-blind   the rest of the way, some centimetres, without looking (`envs.closed_loop`).
+        image-based law retreats where the turn is large (see docs/servo.md).
+near    the controller's own law, towards a goal that sinks along the grasp's axis as long as the
+        camera sees the object. The object's velocity from the motion filter is fed forward, which
+        removes the lag behind a moving object.
+final   the last centimetres, in which the object is too near to be seen: straight down along the
+        grasp's axis and along with the predicted motion of the object, while the fingers close as
+        well. Images are still taken: the watchdog stops the arm when none arrive.
 
-All velocities pass the safety gate (`ServoArm`). Reads depth images and encoders; where the
-cameras are comes from `CameraCalibration` alone. Frames: W world, E gripper, C camera, O object on the
-table below its grasp.
+All velocities pass the safety gate (`envs.servo_arm`). The loop reads depth images and encoders;
+camera poses come from a `CameraCalibration` alone. Frames: W world, E gripper, C camera, O object
+on the table below its grasp, G goal.
 """
 
 from __future__ import annotations
@@ -34,31 +26,26 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from envs.board_servo import ServoArm, servo_period
 from envs.camera import Intrinsics
 from envs.camera_calibration import CameraCalibration
 from envs.cell import Cell
 from envs.closed_loop_tracker import ObjectTracker, WristCamera, WristImage
-from envs.execution import HALF_TURN, ApproachResult, GraspFailure
+from envs.execution import ApproachResult, GraspFailure
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
-    UnreachableError,
     forward_kinematics,
     geometric_jacobian,
-    inverse_kinematics,
     pose_error,
 )
+from envs.robot_postures import HALF_TURN, must_flip, should_flip
 from envs.robot_safety import ArmStoppedError, reaching_down
-from utils.errors import (
-    CollinearPointsError,
-    FeatureCountError,
-    ServoError,
-    TargetLostError,
-)
+from envs.servo_arm import ServoArm, image_period
+from utils.errors import CollinearPointsError, FeatureCountError, ServoError, TargetLostError
 from utils.result_records import OPEN_LOOP
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
+from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.servo_loop import ServoView, VisualServo
 from utils.transforms import (
     Grasp,
@@ -69,171 +56,40 @@ from utils.transforms import (
     top_down_pose,
     transform_points,
 )
-from utils.visual_servo import (
-    HybridVisualServo,
-    ImageBasedVisualServo,
-    PositionBasedVisualServo,
-)
 
-DAMPING = 0.02  # of the arm's Jacobian
-AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's flight from limits
-_GAIN = 8.0  # 1/s, towards the foreseen path
-_REACHED = 0.0015  # m from the end of the path that count as there
-_NEAR_ENOUGH = 0.005  # m that do when the time is over
-_BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, down to this
-_SLACK_SECONDS = 0.35  # beyond what the path takes, for its end
-
-
-class FinalApproach:
-    """A path that is fixed now, in the object's motion: from `start`, down by `height` metres.
-
-    start: (4, 4) T_WE above the grasp. camera: gives a sight, or None where no new image has come.
-    """
-
-    def __init__(
-        self,
-        arm: ServoArm,
-        camera: Callable[[], WristImage | None],
-        target: ObjectTracker,
-        start: np.ndarray,
-        height: float,
-    ):
-        self.arm, self.cell, self.camera, self.target = arm, arm.cell, camera, target
-        self.settings = arm.cell.config.closed_loop
-        self.start, self.start_seconds, self.height = start, arm.cell.seconds, height
-        self.gone = 0.0  # m of the height
-        self._steps_to_image = 0  # physics steps
-        self._holds = False  # something is gripped, or in the way of the closing hand
-
-    def go(self) -> None:
-        """Down to the grasp; raises ServoError where the arm is stopped, or does not get there in
-        time."""
-        speed = self.settings.descend_speed
-        end = self.cell.seconds + self.height / speed + _SLACK_SECONDS
-        while True:
-            rest = self.height - self.gone
-            off = self._step(min(speed, max(_BRAKE * rest, _SLOWEST)) if rest > 0 else 0.0)
-            if rest <= 0 and off < _REACHED:
-                return
-            if self.cell.seconds > end:
-                if off < _NEAR_ENOUGH:
-                    return
-                raise ServoError(f"{1000 * off:.0f} mm off the foreseen path at its end")
-
-    def follow(self, steps: int) -> None:
-        """Let physics steps pass while the fingers close, along with the object; hold still once
-        something presses harder than the gate allows, which is what a grip does."""
-        for _ in range(steps):
-            try:
-                if not self._holds:
-                    self._step(0.0)
-                    continue
-            except ArmStoppedError as stop:
-                if not stop.contact:
-                    raise
-                self._holds = True
-            self.arm.wait()
-
-    def _step(self, sink: float) -> float:
-        """Follow the path for one physics step, sinking at `sink` m/s; metres off it before."""
-        self._keep_watch()
-        dt, now = self.cell.dt, self.cell.seconds
-        if now - self.target.found_seconds > self.settings.final_seconds:
-            raise TargetLostError(f"not seen for {self.settings.final_seconds} s")
-        self.gone = min(self.gone + sink * dt, self.height)
-        path = self.target.motion.motion(self.start_seconds, now) @ self.start
-        path[:3, 3] += self.gone * path[:3, 2]
-        q = self.cell.robot.q
-        T_WE = forward_kinematics(q)
-        error = pose_error(T_WE, path)
-        twist = self.target.twist(path[:3, 3], now) + _GAIN * error
-        twist[:3] += sink * path[:3, 2] * (self.gone < self.height)
-        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, AVOIDANCE_GAIN)
-        wish = joint_velocities(geometric_jacobian(q), twist, away, DAMPING)[0]
-        # The object is too near to be seen: by design the wish is based on what was foreseen, for
-        # no longer than final_seconds, and as long as the camera shows that it lives.
-        self.arm.move(wish, now - self.target.image_seconds)
-        return float(np.linalg.norm(error[:3]))
-
-    def _keep_watch(self) -> None:
-        """Take the image that is due, only to know that the camera lives."""
-        if self._steps_to_image == 0:
-            self._steps_to_image = servo_period(self.cell)
-            sight = self.camera()
-            if sight is not None:
-                self.target.image_seconds = sight.seconds
-        self._steps_to_image -= 1
-
-
-_ROOM = 0.6  # rad to the wrist's limits that a way round should leave
-_LITTLE_ROOM = 0.3  # rad of it at which the other way round is looked at
-_LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
-
-
-def turned_is_better(cell: Cell, T_WE: np.ndarray) -> bool:
-    """Whether to turn a gripper pose (4, 4) round before setting out for it: the smaller turn of
-    the wrist that leaves it room to turn with the object. Raises UnreachableError if neither way
-    is in reach."""
-    ways, now = _ways(cell, T_WE), cell.robot.q[-1]
-    roomy = [turned for turned, q in ways.items() if _wrist_room(q) > _ROOM] or list(ways)
-    return min(roomy, key=lambda turned: abs(ways[turned][-1] - now))
-
-
-def must_turn(cell: Cell, T_WE: np.ndarray) -> bool:
-    """Whether to turn round on the way to a gripper pose (4, 4), where the wrist, following the
-    object, is about to meet its limit."""
-    try:
-        ways, now = _ways(cell, T_WE), cell.robot.q[-1]
-    except UnreachableError:  # at this moment, which is no reason to change anything
-        return False
-    kept, other = (_wrist_room(ways[turned]) if turned in ways else 0.0 for turned in (0, 1))
-    # A law takes the shorter turn; a longer one than half a turn would be the wrong way.
-    return kept < _LITTLE_ROOM < other and abs(ways[True][-1] - now) < _LONGEST_TURN
-
-
-def _ways(cell: Cell, T_WE: np.ndarray) -> dict[bool, np.ndarray]:
-    """Joint positions (7,) at a pose as it is (False) and turned by half a turn (True), those that
-    can be reached; raises UnreachableError if there are none."""
-    ways, error = {}, None
-    for turned, pose in ((False, T_WE), (True, T_WE @ HALF_TURN)):
-        try:
-            ways[turned] = inverse_kinematics(pose, cell.home, cell.home)
-        except UnreachableError as unreachable:
-            error = unreachable
-    if not ways:
-        raise error
-    return ways
-
-
-def _wrist_room(q: np.ndarray) -> float:
-    """Radians from the last joint to the nearer one of its limits."""
-    return float(min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1]))
-
-
-_RECONSIDER_ANGLE = 0.2  # rad by which the object has to turn for another look at the way round
-_NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis where the law takes over
-_FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
-_SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
-_NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
-
-# By controller: the visual servo of the near stage, and its own arguments. Another entry is another
+# By controller: the visual servo of the near stage, and its own arguments. A new entry is a new
 # name for `closed_loop.controller`.
 LAWS = {
     "pbvs": (PositionBasedVisualServo, {}),
     "ibvs": (ImageBasedVisualServo, {"interaction": "mean"}),
-    "hybrid": (HybridVisualServo, {"scheme": "2.5d"}),
+    "hybrid": (HybridVisualServo, {"scheme": "2.5d"}),  # 2 1/2-D
 }
 CONTROLLERS = (OPEN_LOOP, *LAWS)
-_TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are told as they look to the camera
+_TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are views that the camera itself has shown
+
+_DAMPING = 0.02  # of the arm's Jacobian
+_AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's motion away from its limits
+
+_RECONSIDER_ANGLE = 0.2  # rad of the object's turn after which a wrist flip is considered again
+_NEAR_DISTANCE, _NEAR_ANGLE = 0.03, 0.35  # m and rad off the axis at which the near stage begins
+_FUNNEL = 0.12  # m off the axis allowed for each m above the height of commitment
+_SEEN_AT_GOAL = 0.75  # share of the object that the goal's view has to show
+_NEAR_PLANE = 0.005  # m kept to the nearest depth that the camera measures
+
+_PATH_GAIN = 8.0  # 1/s, towards the path of the final approach
+_REACHED = 0.0015  # m from the end of the path that count as its end
+_NEAR_ENOUGH = 0.005  # m that suffice when the time is over
+_BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, down to this speed
+_SLACK_SECONDS = 0.35  # beyond the path's own time
 
 
 @dataclass
 class LoopRecord:
     """What a closed loop did, for tests and figures.
 
-    turn_seconds: wall-clock time of every turn, from the image to the joint velocities, rendering
-    left out. seconds, errors: simulated time and the law's correction (6,) in C, minus the way
-    still to go, at every turn of the near stage. stage: the last one that was reached.
+    turn_seconds: wall-clock time of every turn of the loop, from the image to the joint velocities,
+    without rendering. seconds, errors: simulated time and the law's correction (6,) in C at every
+    turn of the near stage. stage: the last stage that was reached: far, near, final or closing.
     """
 
     turn_seconds: list[float] = field(default_factory=list)
@@ -243,19 +99,21 @@ class LoopRecord:
 
 
 def make_law(controller: str, K: np.ndarray, T_EC: np.ndarray, gain: float, dt: float):
-    """The visual servo of a controller's near stage; T_EC as it is believed."""
+    """The visual servo of a controller's near stage. T_EC: (4, 4) from the calibration."""
     config = {"intrinsics": K, "mounting": "eye_in_hand", "T_EC": T_EC}
     servo, own = LAWS[controller]
     return servo(config, lambda_=gain, dt=dt, damping=0.0, **own)
 
 
 class ClosedLoop:
-    """The approach of one controller to one grasp, seen in the frame that it was planned on.
+    """The approach of one controller to one grasp.
 
-    controller: pbvs, ibvs or hybrid. frame: as it is believed to have been taken. taught_T_CE:
-    (4, 4) the gripper in the wrist camera as that camera showed it (`envs.camera_calibration.teach`), from
-    which ibvs and hybrid have their goal images. camera: gives a WristImage, or None where no new
-    image has come. target: the object, once it is looked for.
+    controller: a key of LAWS. frame: the frame on which the grasp was planned, with the
+    calibration's camera pose. taught_T_CE: (4, 4) the gripper in the wrist camera as that camera
+    has shown it (`envs.camera_calibration.teach`); the goal views of ibvs and hybrid come from it.
+    latency: s.
+    camera: returns a WristImage, or None where no new image has arrived; None: the cell's.
+    target: the tracked object, once the approach has begun.
     """
 
     target: ObjectTracker
@@ -276,7 +134,7 @@ class ClosedLoop:
         grasp = cell.config.closed_loop
         intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
         self.K, self.size = intrinsics.K, (grasp.width, grasp.height)
-        period = servo_period(cell) * cell.dt
+        period = image_period(cell) * cell.dt
         self.law = make_law(controller, self.K, self.T_EC, grasp.gain, period)
         self.far_law = make_law("pbvs", self.K, self.T_EC, grasp.gain, period)
         T_CE = taught_T_CE if controller in _TAUGHT else inverse_pose(self.T_EC)
@@ -288,29 +146,29 @@ class ClosedLoop:
         robot, settings = cell.robot, cell.config.closed_loop
         robot.command_gripper(grasp.width)
         arm = ServoArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
-        with _told_as_failure(arm):
+        with _servo_errors_as_failures(arm):
             guided = GuidedApproach(self, arm, grasp)
             end = cell.seconds + settings.seconds
-            while (start := guided.look()) is None:
+            while (start := guided.update()) is None:
                 if cell.seconds > end:
                     raise ServoError(f"not at the grasp after {settings.seconds} s")
-                guided.go()
+                guided.follow()
             self.record.stage = "final"
-            blind = FinalApproach(arm, self.camera, self.target, start, guided.height)
-            blind.go()
+            final = FinalApproach(arm, self.camera, self.target, start, guided.height)
+            final.descend()
         self.record.stage = "closing"
 
         def wait(steps: int) -> None:
-            with _told_as_failure(arm):
-                blind.follow(steps)
+            with _servo_errors_as_failures(arm):
+                final.follow(steps)
 
         return ApproachResult(wait, None)
 
 
 @contextlib.contextmanager
-def _told_as_failure(arm: ServoArm) -> Iterator[None]:
-    """Whatever ends the block early leaves the arm at rest; what a servo can stop for is told as
-    the failure of the grasp."""
+def _servo_errors_as_failures(arm: ServoArm) -> Iterator[None]:
+    """Bring the arm to rest when an exception leaves the block, and turn a ServoError into the
+    GraspFailure with its reason."""
     try:
         yield
     except BaseException as error:
@@ -328,11 +186,11 @@ def _reason_of(error: ServoError) -> str:
 
 
 class GuidedApproach:
-    """The far and the near stage of one approach: what the arm does while it sees the object."""
+    """The far and the near stage of one approach, in which the camera sees the object."""
 
     def __init__(self, loop: ClosedLoop, arm: ServoArm, grasp: Grasp):
-        """Takes the first image that comes; raises TargetLostError, and UnreachableError where the
-        grasp is out of reach."""
+        """Waits for the first image. Raises TargetLostError, and UnreachableError where the grasp
+        is out of reach."""
         self.loop, self.cell, self.arm = loop, loop.cell, arm
         self.settings = settings = loop.cell.config.closed_loop
         self.target = loop.target = ObjectTracker(
@@ -341,20 +199,21 @@ class GuidedApproach:
         )  # fmt: skip
         self.T_OE = top_down_pose([0, 0, grasp.position[2]], 0.0)
         self.chosen_at = planar_part(self.target.T_WO)[2]  # rad, direction of the object
-        if turned_is_better(self.cell, self._hand_above(self.target.T_WO)):
+        if should_flip(self._hand_above(self.target.T_WO), self.cell.home, self.cell.robot.q):
             self.T_OE = self.T_OE @ HALF_TURN
         self.near, self.height = False, np.inf
         self.lowest = self._lowest_view()
-        self.wish = np.zeros(7)
-        self._wait_for_sight()
+        self.desired = np.zeros(7)
+        self._wait_for_first_sight()
 
-    def look(self) -> np.ndarray | None:
-        """Take in what the camera has, and wish for a velocity. Where the blind stage begins, the
-        (4, 4) T_WE that its path starts from, `height` above the grasp; None before."""
-        new = self.target.take_in(self.loop.camera())
+    def update(self) -> np.ndarray | None:
+        """Take an image and compute the desired joint velocities. Returns None, and at the end of
+        the near stage the (4, 4) T_WE at which the final approach starts, `height` above the grasp.
+        """
+        new = self.target.update(self.loop.camera())
         start = time.perf_counter()
         if not self.near:
-            self._reconsider_way_round()
+            self._reconsider_flip()
         q, now = self.cell.robot.q, self.cell.seconds
         T_WE = forward_kinematics(q)
         T_CO = inverse_pose(T_WE @ self.loop.T_EC) @ self.target.at(now)
@@ -374,31 +233,31 @@ class GuidedApproach:
             self.loop.record.seconds.append(now)
             self.loop.record.errors.append(step.correction)
             if self._may_commit(off, step.correction):
-                return self._where_the_goal_is(T_WE, step.correction)
-        self.wish = self._joint_wish(q, T_WE, step.velocity, law, sink)
+                return self._pose_at_goal(T_WE, step.correction)
+        self.desired = self._joint_velocities(q, T_WE, step.velocity, law, sink)
         if new:
             spent = self.target.spent + time.perf_counter() - start
             self.loop.record.turn_seconds.append(spent)
         return None
 
-    def go(self) -> None:
-        """Send the wish until the next image. While images come but do not show the object, the arm
-        stands still: what it would go by is too old."""
+    def follow(self) -> None:
+        """Send the desired velocities until the next image. While images arrive that do not show
+        the object, the arm stands still: its last sight of the object is too old."""
         watchdog, target = self.arm.gate.safety.watchdog, self.target
-        for _ in range(servo_period(self.cell)):
+        for _ in range(image_period(self.cell)):
             now = self.cell.seconds
             if now - target.image_seconds <= watchdog < now - target.found_seconds:
                 self.arm.wait()
             else:
-                self.arm.move(self.wish, now - target.found_seconds)
+                self.arm.move(self.desired, now - target.found_seconds)
 
-    def _wait_for_sight(self) -> None:
-        """Hold still until a first image has come (it may be late) and shows the object."""
+    def _wait_for_first_sight(self) -> None:
+        """Hold still until a first image has arrived, perhaps late, and shows the object."""
         end = self.cell.seconds + self.settings.lost_seconds
-        while not self.target.take_in(self.loop.camera()):
+        while not self.target.update(self.loop.camera()):
             if self.cell.seconds > end:
-                raise TargetLostError(f"no image has come for {self.settings.lost_seconds} s")
-            for _ in range(servo_period(self.cell)):
+                raise TargetLostError(f"no image has arrived for {self.settings.lost_seconds} s")
+            for _ in range(image_period(self.cell)):
                 self.arm.wait()
 
     def _hand_above(self, T_WO: np.ndarray) -> np.ndarray:
@@ -407,14 +266,14 @@ class GuidedApproach:
         T_WE[2, 3] += self.settings.look_height
         return T_WE
 
-    def _reconsider_way_round(self) -> None:
-        """Turn round where the wrist, following the object, is about to meet its limit."""
-        foreseen = self.target.foreseen(self.cell.seconds)
-        direction = planar_part(foreseen)[2]
+    def _reconsider_flip(self) -> None:
+        """Flip the wrist where it would meet its limit while it follows the object."""
+        predicted = self.target.predicted(self.cell.seconds)
+        direction = planar_part(predicted)[2]
         if abs(direction - self.chosen_at) < _RECONSIDER_ANGLE:
             return
         self.chosen_at = direction
-        if must_turn(self.cell, self._hand_above(foreseen)):
+        if must_flip(self._hand_above(predicted), self.cell.home, self.cell.robot.q):
             self.T_OE = self.T_OE @ HALF_TURN
 
     def _goal(self, height: float) -> np.ndarray:
@@ -428,13 +287,13 @@ class GuidedApproach:
         heights = np.arange(self.settings.commit_height, self.settings.look_height, 0.01)
         nearest = self.cell.config.camera.near + _NEAR_PLANE
         for height in heights:
-            if self.target.tracker.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
+            if self.target.matcher.seen_share(self._goal(height), nearest) >= _SEEN_AT_GOAL:
                 return float(height)
         return self.settings.look_height
 
     def _off_axis(self, T_CO: np.ndarray) -> tuple[float, float, float]:
-        """How far off the grasp's axis (m), how high above the grasp (m) and how far turned (rad)
-        the gripper is, as the controller has it."""
+        """Distance of the gripper from the grasp's axis (m), its height above the grasp (m) and its
+        turn about the axis (rad), by the controller's own goal."""
         T_EO = inverse_pose(self.loop.goal_T_CE) @ T_CO
         T_GE = inverse_pose(self.T_OE) @ inverse_pose(T_EO)  # G: the gripper at the grasp
         turn = abs(np.arctan2(T_GE[1, 0], T_GE[0, 0]))
@@ -448,8 +307,8 @@ class GuidedApproach:
             self.loop.law.reset()
 
     def _sink(self, off: tuple[float, float, float]) -> tuple[float, float]:
-        """The goal's height above the grasp by the next image and the speed (m/s) at which it
-        sinks, as long as the gripper is in the funnel above the grasp."""
+        """The goal's height above the grasp at the next image and the speed (m/s) at which it
+        sinks, which is 0 while the gripper is outside the funnel above the grasp."""
         distance, height, turn = off
         above = max(height - self.lowest, 0.0)
         settings = self.settings
@@ -457,7 +316,7 @@ class GuidedApproach:
         speed = 0.0
         if distance < 2 * allowed and turn < settings.aligned_angle + 2 * above:
             speed = min(settings.descend_speed, settings.gain * above)
-        dt = servo_period(self.cell) * self.cell.dt
+        dt = image_period(self.cell) * self.cell.dt
         self.height = max(min(self.height, height) - speed * dt, self.lowest)
         return self.height, speed
 
@@ -472,8 +331,8 @@ class GuidedApproach:
         )
 
     def _views(self, T_CO: np.ndarray, T_GO: np.ndarray, near: bool) -> tuple[ServoView, ServoView]:
-        """What is seen and what should be seen: the template's points and its pose. Of the points
-        those count that lie within the image; raises FeatureCountError where they are too few."""
+        """Current and desired view: the template's points and its pose. In the near stage only the
+        points within the image count; raises FeatureCountError where they are too few."""
         views = []
         seen = np.ones(len(self.target.template.points), bool)
         for T in (T_CO, T_GO):
@@ -490,18 +349,101 @@ class GuidedApproach:
                 )
         return tuple(ServoView(v.points[seen], v.depths[seen], v.T_CO) for v in views)
 
-    def _joint_wish(
+    def _joint_velocities(
         self, q: np.ndarray, T_WE: np.ndarray, v_C: np.ndarray, law: VisualServo, sink: float
     ) -> np.ndarray:
-        """(7,) rad/s: the law's velocity, and with it the object's own and the goal's."""
+        """(7,) rad/s: the law's velocity plus those of the object and of the sinking goal."""
         J = geometric_jacobian(q)
-        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, AVOIDANCE_GAIN)
-        wish = law.compute_joint_velocities(T_WE, v_C, J, away, DAMPING)
+        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
+        desired = law.compute_joint_velocities(T_WE, v_C, J, away, _DAMPING)
         ahead = self.target.twist(T_WE[:3, 3], self.cell.seconds)
         ahead[2] -= sink
-        return wish + joint_velocities(J, ahead, damping=DAMPING)[0]
+        return desired + joint_velocities(J, ahead, damping=_DAMPING)[0]
 
-    def _where_the_goal_is(self, T_WE: np.ndarray, correction: np.ndarray) -> np.ndarray:
-        """(4, 4) T_WE of a gripper that the law has nothing to correct of."""
+    def _pose_at_goal(self, T_WE: np.ndarray, correction: np.ndarray) -> np.ndarray:
+        """(4, 4) T_WE of the gripper once the law's correction is done."""
         T_EC = self.loop.T_EC
         return T_WE @ T_EC @ pose_exp(-correction) @ inverse_pose(T_EC)
+
+
+class FinalApproach:
+    """The final stage: a path from `start` straight down by `height` metres, which moves along with
+    the predicted motion of the object.
+
+    start: (4, 4) T_WE above the grasp. camera: returns a WristImage, or None where no new image has
+    arrived.
+    """
+
+    def __init__(
+        self,
+        arm: ServoArm,
+        camera: Callable[[], WristImage | None],
+        target: ObjectTracker,
+        start: np.ndarray,
+        height: float,
+    ):
+        self.arm, self.cell, self.camera, self.target = arm, arm.cell, camera, target
+        self.settings = arm.cell.config.closed_loop
+        self.start, self.start_seconds, self.height = start, arm.cell.seconds, height
+        self.descended = 0.0  # m of the height
+        self._steps_to_image = 0  # physics steps
+        self._holds = False  # the hand grips something, or something blocks it
+
+    def descend(self) -> None:
+        """Descend to the grasp. Raises ServoError where the arm is stopped or late."""
+        speed = self.settings.descend_speed
+        end = self.cell.seconds + self.height / speed + _SLACK_SECONDS
+        while True:
+            rest = self.height - self.descended
+            off = self._step(min(speed, max(_BRAKE * rest, _SLOWEST)) if rest > 0 else 0.0)
+            if rest <= 0 and off < _REACHED:
+                return
+            if self.cell.seconds > end:
+                if off < _NEAR_ENOUGH:
+                    return
+                raise ServoError(f"{1000 * off:.0f} mm off the predicted path at its end")
+
+    def follow(self, steps: int) -> None:
+        """Move along with the object for some physics steps while the fingers close; hold still
+        once a contact force exceeds the gate's limit, as that of a grip does."""
+        for _ in range(steps):
+            try:
+                if not self._holds:
+                    self._step(0.0)
+                    continue
+            except ArmStoppedError as stop:
+                if not stop.contact:
+                    raise
+                self._holds = True
+            self.arm.wait()
+
+    def _step(self, sink: float) -> float:
+        """Follow the path for one physics step, sinking at `sink` m/s; the distance from it before,
+        in metres."""
+        self._keep_watch()
+        dt, now = self.cell.dt, self.cell.seconds
+        if now - self.target.found_seconds > self.settings.final_seconds:
+            raise TargetLostError(f"not seen for {self.settings.final_seconds} s")
+        self.descended = min(self.descended + sink * dt, self.height)
+        path = self.target.motion.motion(self.start_seconds, now) @ self.start
+        path[:3, 3] += self.descended * path[:3, 2]
+        q = self.cell.robot.q
+        T_WE = forward_kinematics(q)
+        error = pose_error(T_WE, path)
+        twist = self.target.twist(path[:3, 3], now) + _PATH_GAIN * error
+        twist[:3] += sink * path[:3, 2] * (self.descended < self.height)
+        away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
+        desired = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)[0]
+        # The object is too near to be seen: by design the velocity rests on a prediction, for no
+        # longer than final_seconds, and only as long as images arrive.
+        self.arm.move(desired, now - self.target.image_seconds)
+        return float(np.linalg.norm(error[:3]))
+
+    def _keep_watch(self) -> None:
+        """Take the image that is due, only to check that the camera still delivers."""
+        if self._steps_to_image == 0:
+            self._steps_to_image = image_period(self.cell)
+            image = self.camera()
+            if image is not None:
+                self.target.image_seconds = image.seconds
+        self._steps_to_image -= 1

@@ -1,13 +1,10 @@
-"""The depth camera in the hand as a closed loop reads it: images with their times, perhaps late,
-and as noisy as `camera.depth_noise` has the cell's cameras.
+"""The object of a grasp in the wrist camera: found in every image, predicted in between.
 
-Knows neither what is looked for in the images nor where anybody believes the camera to be.
-
-The object of a grasp as the wrist camera sees it: found in every image, foreseen in between.
-
-Reads depth images and the encoders at which they were taken, and believes where the camera sits on
-the hand. Knows no control law and no stage of an approach. Frames: W world, E gripper, C camera, O
-object on the table below its grasp.
+`WristCamera` gives depth images with the times at which they were taken, perhaps late and perhaps
+with the noise of `camera.depth_noise`; `ObjectTracker` finds the object in them and filters its
+motion. Reads images and encoders, and takes the camera's mount from a calibration. Knows no control
+law and no stage of an approach. Frames: W world, E gripper, C camera, O object on the table below
+its grasp.
 """
 
 from __future__ import annotations
@@ -30,7 +27,8 @@ _NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
 
 
 class WristImage(NamedTuple):
-    """A depth image (H, W), metres, the joint positions (7,) when it was taken, and that time."""
+    """A depth image (H, W), metres, the joint positions (7,), rad, at which it was taken, and that
+    time, s."""
 
     depth: np.ndarray
     q: np.ndarray
@@ -38,10 +36,10 @@ class WristImage(NamedTuple):
 
 
 class WristCamera:
-    """The depth camera in the hand, whose images arrive `latency` seconds after they were taken.
+    """The depth camera in the hand. Its images arrive `latency` seconds after they were taken.
 
-    The noise is a function of the scene's seed, the number of frames planned on so far, and that of
-    the image: every controller meets the same.
+    The noise is a function of the scene's seed, the number of frames planned on so far, and the
+    image's own number: every controller meets the same.
     """
 
     def __init__(self, cell: Cell, latency: float = 0.0):
@@ -56,7 +54,7 @@ class WristCamera:
         self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
 
     def __call__(self) -> WristImage | None:
-        """Take an image now; the newest that has arrived by now, or None."""
+        """Take an image now; the newest image that has arrived since the last call, or None."""
         cell = self.cell
         depth = cell.look(self.intrinsics, cell.camera_pose("wrist")).depth
         if self._noise is not None:
@@ -68,16 +66,16 @@ class WristCamera:
         return arrived
 
 
-_FORESIGHT = 1.5  # s, about what is left of the way in the far stage of an approach
-_TURNING_KNOWN = 0.15  # rad/s, standard deviation of a turning rate that can be relied on
+_HORIZON = 1.5  # s, about what the far stage of an approach has left to go
+_TURNING_KNOWN = 0.15  # rad/s, standard deviation below which a turning rate is trusted
 
 
 class ObjectTracker:
-    """Where the object is, as far as images tell.
+    """The pose and the motion of the object, from images.
 
-    T_WO: (4, 4) as last seen. motion: how it moves; None until it was seen. image_seconds,
-    found_seconds: when the last image was taken, and the last one that showed the object. spent: s
-    of wall-clock time that the last image took.
+    T_WO: (4, 4) as last seen. motion: the filter; None until an image has shown the object.
+    image_seconds, found_seconds: times of the last image and of the last one that showed the
+    object. spent: wall-clock seconds that the last image took.
     """
 
     def __init__(
@@ -90,65 +88,65 @@ class ObjectTracker:
         lost_seconds: float,
         seconds: float,
     ):
-        """frame: that the grasp was planned on. K (3, 3), size (width, height in pixels), T_EC
-        (4, 4): of the camera that looks from now, `seconds`, on. lost_seconds: for which images may
-        not show the object. Raises TargetLostError where nothing stands at the grasp."""
+        """frame: the frame on which the grasp was planned. K (3, 3), size (width and height in
+        pixels), T_EC (4, 4): of the wrist camera. lost_seconds: longest time without a sight of
+        the object. seconds: now. Raises TargetLostError where nothing stands at the grasp."""
         self.template = make_template(frame, grasp)
-        self.tracker = TemplateMatcher(self.template, K, size)
+        self.matcher = TemplateMatcher(self.template, K, size)
         self.T_EC, self.lost_seconds = T_EC, lost_seconds
         self.T_WO = grasp_frame(grasp)
         self.motion: PlanarMotion | None = None
         self.image_seconds = self.found_seconds = seconds
         self.spent = 0.0
 
-    def take_in(self, sight: WristImage | None) -> bool:
-        """Find the object in a new image; whether there was one. Raises TargetLostError where the
-        first image does not show it, or none has for too long."""
-        if sight is None:
+    def update(self, image: WristImage | None) -> bool:
+        """Find the object in a new image. Returns whether there was one. Raises TargetLostError
+        where the first image does not show the object, or none has for too long."""
+        if image is None:
             return False
         start = time.perf_counter()
-        self.image_seconds = sight.seconds
-        T_WC = forward_kinematics(sight.q) @ self.T_EC
-        expected = self.at(sight.seconds)
+        self.image_seconds = image.seconds
+        T_WC = forward_kinematics(image.q) @ self.T_EC
+        expected = self.at(image.seconds)
         try:
-            found = self.tracker.find(
-                sight.depth, inverse_pose(T_WC) @ expected, inverse_pose(T_WC)
+            found = self.matcher.find(
+                image.depth, inverse_pose(T_WC) @ expected, inverse_pose(T_WC)
             )
         except TargetLostError as error:
             if self.motion is None:
                 raise
-            if sight.seconds - self.found_seconds > self.lost_seconds:
+            if image.seconds - self.found_seconds > self.lost_seconds:
                 raise TargetLostError(f"{error}, for {self.lost_seconds} s") from error
             self.spent = time.perf_counter() - start
             return True
-        T_WO, believed = T_WC @ found.T_CO, True
+        T_WO, accepted = T_WC @ found.T_CO, True
         pose = planar_part(T_WO)
         if self.motion is None:
-            self.motion = PlanarMotion(pose, sight.seconds, turns=not self.tracker.round)
+            self.motion = PlanarMotion(pose, image.seconds, turns=not self.matcher.round)
         else:
             axes = planar(0, 0, pose[2])[:3, :3]
             covariance = axes @ found.covariance @ axes.T
-            believed = self.motion.see(pose, covariance, sight.seconds)
-        if believed:  # a false match shows no more than an image without the object
-            self.T_WO, self.found_seconds = T_WO, sight.seconds
+            accepted = self.motion.see(pose, covariance, image.seconds)
+        if accepted:  # a false match counts as an image without the object
+            self.T_WO, self.found_seconds = T_WO, image.seconds
         self.spent = time.perf_counter() - start
         return True
 
     def at(self, seconds: float) -> np.ndarray:
-        """(4, 4) T_WO expected at a time: as last seen, moved to where the filter has it."""
+        """(4, 4) T_WO predicted for a time: as last seen, moved by the filter's motion."""
         if self.motion is None:
             return self.T_WO
         x, y, turn = self.motion.at(seconds)[:3]
         x0, y0, turn0 = planar_part(self.T_WO)
         return planar(x, y, turn) @ inverse_pose(planar(x0, y0, turn0)) @ self.T_WO
 
-    def foreseen(self, now: float) -> np.ndarray:
-        """(4, 4) T_WO a little before the fingers close, once it is known how the object moves."""
+    def predicted(self, now: float) -> np.ndarray:
+        """(4, 4) T_WO shortly before the fingers close; as last seen until the motion is known."""
         known = self.motion is not None and self.motion.covariance[5, 5] < _TURNING_KNOWN**2
-        return self.at(now + _FORESIGHT) if known else self.T_WO
+        return self.at(now + _HORIZON) if known else self.T_WO
 
     def twist(self, place: np.ndarray, seconds: float) -> np.ndarray:
-        """(6,) in W of a point at `place` (3,) that is carried along with the object."""
+        """(6,) v_W of a point at `place` (3,) that moves along with the object."""
         x, y, _, vx, vy, omega = self.motion.at(seconds)
         arm = place[:2] - (x, y)
         return np.array([vx - omega * arm[1], vy + omega * arm[0], 0.0, 0.0, 0.0, omega])

@@ -1,14 +1,13 @@
-"""What happens to objects while the arm is on its way to them.
+"""Scenarios: what makes a scene harder than its layout, such as a disturbance or late images.
 
-Everything that is still on the table is carried along one motion in the plane, as if on a tray: in
-every physics step each body is put where the motion has it by then, with the motion's velocity.
-That ends for good, and the body is left to the physics with the velocity that it had, as soon as
-the robot touches one of the bodies, or when the motion is over. Knows no camera and no controller.
+A scenario may displace the objects while the arm is on its way, carry them on a conveyor, assume a
+wrong calibration, or delay the images. Each draws from the round's seed and the attempt's number,
+so that every policy and every controller meets the same. SCENARIOS lists them by name; a new entry
+is a new name for `evaluate.scenarios`.
 
-What makes a scenario hard beside its layout: a disturbance, a wrong calibration, late images.
-
-Each is drawn from the round's seed and the number of the attempt, so that every policy and every
-controller meets the same.
+A motion moves all remaining objects in the plane, as on a tray: in every physics step each body is
+set to the motion's pose and velocity. When the robot touches one of the bodies, or the motion is
+over, physics alone moves them from there on. Knows no control law.
 """
 
 from __future__ import annotations
@@ -23,13 +22,14 @@ from envs.camera_calibration import CameraCalibration, true_calibration, wrong_c
 from envs.cell import Cell
 from utils.transforms import inverse_pose, planar
 
-_START_SECONDS = 0.2  # in which a conveyor gets up to speed: what stands must not topple
+_START_SECONDS = 0.2  # in which a conveyor gets up to speed, so that objects do not topple
+_STREAM = 7  # keeps these draws apart from the scene's of the same seed
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Moved by `shift` (2,) metres and `turn` rad about its centre, within `duration` seconds from
-    `start` seconds on; a quintic in time (smooth, at rest before and after)."""
+    """A motion by `shift` (2,) metres and `turn` rad about the object's centre, `duration` seconds
+    long from `start` seconds on; a quintic in time (smooth, at rest before and after)."""
 
     shift: np.ndarray
     turn: float
@@ -48,8 +48,8 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Conveyor:
-    """Carried at `speed` m/s, first in the direction `heading` rad about +z from +x, on a path that
-    turns by `turn_rate` rad/s; the object turns with it."""
+    """A motion at `speed` m/s, first in the direction `heading` rad about +z from +x, on a path
+    that turns by `turn_rate` rad/s; the object turns with it."""
 
     speed: float
     heading: float
@@ -60,7 +60,7 @@ class Conveyor:
         return np.inf
 
     def __call__(self, seconds: float) -> tuple[float, float, float]:
-        # Time as the belt counts it: its speed grows in a line over the start.
+        # The belt's distance over its speed: the speed grows linearly over the start.
         ramp = min(seconds, _START_SECONDS)
         time = max(ramp**2 / (2 * _START_SECONDS) + max(seconds - _START_SECONDS, 0.0), 0.0)
         turn = self.turn_rate * time
@@ -75,7 +75,7 @@ class Conveyor:
 
 @contextlib.contextmanager
 def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[None]:
-    """Within the block a motion carries the objects of the cell, from now on, unless it is None."""
+    """Within the block `motion` moves the objects of the cell, from now on; None moves nothing."""
     if motion is None or not cell.remaining:
         yield
         return
@@ -87,7 +87,7 @@ def disturbed(cell: Cell, motion: Displacement | Conveyor | None) -> Iterator[No
 
 
 class _Carrier:
-    """Carries all bodies along one motion, until something ends it."""
+    """Moves all bodies along one motion, until it is over or the robot touches one of them."""
 
     def __init__(self, cell: Cell, motion: Displacement | Conveyor):
         self.motion, self.start = motion, cell.seconds
@@ -115,15 +115,15 @@ class _Carrier:
         return self.pivot @ planar(*self.motion(seconds)) @ inverse_pose(self.pivot)
 
 
-_STREAM = 7  # keeps these draws apart from the scene's of the same seed
-
-
 @dataclass(frozen=True)
 class Scenario:
-    """moved: objects are displaced during the approach. speed: m/s of a conveyor. turning: whether
-    it goes round a corner. crossing: whether it goes through the middle of the workspace, in
-    whatever direction that is, instead of sideways. miscalibrated: whether the cameras' believed
-    poses are off. latency: seconds by which images arrive late. Scenes are laid out as `layout`."""
+    """The conditions of a round.
+
+    layout: of the scene (`envs.cell_scenes`). moved: whether objects are displaced during the
+    approach. speed: m/s of a conveyor, 0: none. turning: whether the conveyor's path turns.
+    crossing: whether it leads through the middle of the workspace instead of sideways.
+    miscalibrated: whether the calibration is wrong. latency: seconds by which images arrive late.
+    """
 
     layout: str
     moved: bool = False
@@ -134,7 +134,7 @@ class Scenario:
     latency: float = 0.0
 
     def motion(self, cell: Cell, attempt: int) -> Displacement | Conveyor | None:
-        """What happens to the objects during an attempt, 0 being the first."""
+        """The motion of the objects during an attempt, counted from 0; None: they rest."""
         rng = self._rng(cell, attempt)
         if not cell.remaining:
             return None
@@ -152,9 +152,9 @@ class Scenario:
         """The calibration that the round assumes, the same in each of its attempts."""
         if not self.miscalibrated:
             return true_calibration(cell)
-        off = cell.config.closed_loop
+        error = cell.config.closed_loop
         rng = self._rng(cell, -1)
-        return wrong_calibration(cell, rng, off.camera_shift, np.radians(off.camera_turn_deg))
+        return wrong_calibration(cell, rng, error.camera_shift, np.radians(error.camera_turn_deg))
 
     def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
         return np.random.default_rng([cell.scene.seed, attempt + 1, _STREAM])
@@ -163,8 +163,8 @@ class Scenario:
 def displacement(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, reach: float
 ) -> Displacement:
-    """3 to 8 cm in a direction that stays in the workspace, and up to 45 degrees, begun 0.2 to
-    0.8 s after the arm has set out."""
+    """A displacement of 3 to 8 cm in a direction that stays in the workspace, and of up to 45
+    degrees, which begins 0.2 to 0.8 s after the arm has set out."""
     for _ in range(100):
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.08)
         shift = distance * np.array([np.cos(angle), np.sin(angle)])
@@ -176,8 +176,8 @@ def displacement(
 def conveyor(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float, turning: bool
 ) -> Conveyor:
-    """Sideways past the robot, away from the bin (whose walls the hand would hit), up to 30 degrees
-    askew towards the middle of the workspace; turning by 0.2 to 0.4 rad/s that way, too."""
+    """A conveyor sideways past the robot, away from the bin (whose walls the hand would hit), up to
+    30 degrees askew towards the middle of the workspace; `turning` that way by 0.2 to 0.4 rad/s."""
     inwards = 1.0 if place[0] > centre[0] else -1.0  # left of +y lies -x
     heading = np.pi / 2 + inwards * rng.uniform(0, np.pi / 6)
     turn_rate = inwards * rng.uniform(0.2, 0.4) if turning else 0.0
@@ -187,8 +187,8 @@ def conveyor(
 def crossing(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float
 ) -> Conveyor:
-    """Straight towards the middle of the workspace and on, up to 30 degrees askew: from where the
-    object lies that can be towards the robot, away from it, or sideways."""
+    """A conveyor towards the middle of the workspace and on, up to 30 degrees askew: towards the
+    robot, away from it or sideways, depending on the object's place."""
     x, y = centre - place
     return Conveyor(speed, float(np.arctan2(y, x)) + rng.uniform(-np.pi / 6, np.pi / 6))
 

@@ -9,7 +9,6 @@ import pybullet
 import pytest
 
 from envs import closed_loop_tracker
-from envs.board_servo import ServoArm
 from envs.camera import wrist_mount
 from envs.camera_calibration import displaced, level, teach, true_calibration, wrong_calibration
 from envs.cell_scenes import make_scene
@@ -20,6 +19,7 @@ from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian, inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbed
+from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config
 from utils.table_plane import fit_table_plane
@@ -313,11 +313,11 @@ def test_the_hand_is_fed_forward_the_way_the_object_goes(cell, scene):
     q = cell.robot.q
     T_WE, J = forward_kinematics(q), geometric_jacobian(q)
 
-    class NoWish:
+    class NoVelocity:
         def compute_joint_velocities(self, *args):
             return np.zeros(7)
 
-    twist = J @ descent._joint_wish(q, T_WE, np.zeros(6), NoWish(), 0.05)
+    twist = J @ descent._joint_velocities(q, T_WE, np.zeros(6), NoVelocity(), 0.05)
     rx, ry = T_WE[:2, 3] - (x, y)
     expected = [0.04 - 0.3 * ry, -0.03 + 0.3 * rx, -0.05, 0, 0, 0.3]
     np.testing.assert_allclose(twist, expected, atol=4e-3)

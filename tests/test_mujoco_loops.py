@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 import evaluate
-from envs.board_servo import ServoArm
 from envs.camera import wrist_mount
 from envs.camera_calibration import teach, true_calibration
 from envs.cell_layout import GRAVITY
@@ -25,6 +24,7 @@ from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import inverse_kinematics
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS, Conveyor, disturbed
+from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.transforms import planar_part, top_down_pose
 

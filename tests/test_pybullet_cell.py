@@ -5,7 +5,7 @@ import pybullet
 import pytest
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
-from envs.execution import choose_posture
+from envs.robot_postures import choose_posture
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
 from envs.robot_kinematics import forward_kinematics, inverse_kinematics
@@ -75,7 +75,7 @@ def test_an_object_flung_upwards_is_not_lifted(cell, box_set):
 
 def test_a_fist_on_the_cube_is_no_grip(cell, box_set):
     cell.load(cube_scene(box_set))
-    above = choose_posture(cell, top_down_pose([0.5, 0.0, 0.075], 0.0))
+    above = choose_posture(top_down_pose([0.5, 0.0, 0.075], 0.0), cell.home)
     cell.robot.place(above, opening=0.0)
     target = forward_kinematics(above)
     target[2, 3] -= 0.03
@@ -106,7 +106,7 @@ def test_a_cube_lying_on_the_fingers_is_no_grip(cell, box_set):
 
 def test_a_gripped_object_that_stands_on_the_table_is_not_lifted(cell, box_set):
     cell.load(cube_scene(box_set))
-    posture = choose_posture(cell, cube_grasp().pose)
+    posture = choose_posture(cube_grasp().pose, cell.home)
     cell.robot.place(posture, opening=0.08)
     cell.robot.command_gripper(0.0)
     cell.step(240)
