@@ -10,20 +10,15 @@ import pytest
 from benchmarks import bench_servo_cell
 from benchmarks.bench_servo_cell import LAWS, make_task, pose
 from envs.board import Board
-from envs.board_servo import (
-    ArmStoppedError,
-    ServoArm,
-    Sight,
-    servo_settings,
-    servo_to_goal,
-    view_of,
-)
+from envs.board_servo import Sight, servo_settings, servo_to_goal, view_of
 from envs.camera import Intrinsics
 from envs.cell_scenes import Scene
 from envs.pybullet_bodies import add_board, static_box
 from envs.pybullet_camera import PybulletCamera
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
+from envs.robot_safety import ArmStoppedError
+from envs.servo_arm import ServoArm
 from utils.config import load_config
 from utils.errors import TargetLostError, UserError
 from utils.servo_features import MOUNTINGS
