@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.board import Board, CarriedBoard
+from envs.board import Board
 from envs.camera import Intrinsics, wrist_mount
 from envs.cell import Cell
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
