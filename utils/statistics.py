@@ -1,4 +1,4 @@
-"""How sure a rate is, how two policies differ, and how well one world foretells another.
+"""Intervals of rates, paired differences of policies, and how well a simulation predicts reality.
 
 This module knows numbers only, nothing of grasps or simulators.
 """
@@ -85,7 +85,8 @@ def paired_difference_interval(
 
 
 def pearson_correlation(a: ArrayLike, b: ArrayLike) -> float | None:
-    """Pearson's r of two lists of numbers (N,): 1 where one grows in a line with the other.
+    """Pearson's r of two lists of numbers (N,): 1 where one is a growing linear function of the
+    other.
 
     None where it is undefined: fewer than two numbers, or a list that never changes. Raises
     ValueError on lists that do not pair up.
@@ -101,11 +102,11 @@ def pearson_correlation(a: ArrayLike, b: ArrayLike) -> float | None:
 def mean_maximum_rank_violation(real: ArrayLike, simulated: ArrayLike) -> float | None:
     """How badly a simulation mixes up the order of policies, 0 (not at all) to 1.
 
-    real, simulated: (N,) success rates of N policies in both worlds. Where the simulation orders
-    two policies otherwise than they really are, the violation is the real difference of their
-    rates; of each policy the worst counts, and of these the mean. Li et al., "Evaluating real-world
-    robot manipulation policies in simulation" (SIMPLER, CoRL 2024), section 3.2. None for no
-    policy. Raises ValueError on lists that do not pair up.
+    real, simulated: (N,) success rates of N policies in reality and in simulation. Where the
+    simulation orders two policies differently, the violation is the real difference of their rates;
+    the result is the mean over the policies of each one's worst violation. Li et al., "Evaluating
+    real-world robot manipulation policies in simulation" (SIMPLER, CoRL 2024), section 3.2. None
+    for no policy. Raises ValueError on lists that do not pair up.
     """
     real, simulated = _paired("mean_maximum_rank_violation", real, simulated)
     if len(real) == 0:
