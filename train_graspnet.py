@@ -158,16 +158,16 @@ def train(
     save = partial(
         trainer.save, config=config, metres_per_pixel=data.metres_per_pixel, history=history
     )
-    main = processes.is_main
-    if main:
+    is_main = processes.is_main
+    if is_main:
         adapted = f", adapted to {config.adaptation.target}" if config.adaptation.target else ""
         print(
             f"{trainer.describe()}, on {len(data.train)} {config.data.kind} images{adapted}, for "
             f"{config.train.epochs} epochs, seed {config.seed}; results in {run}",
             flush=True,
         )
-    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if main else None
-    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not main)
+    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if is_main else None
+    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not is_main)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:
         for epoch in range(len(history), config.train.epochs):
@@ -177,12 +177,12 @@ def train(
                 bar.update()
                 bar.set_postfix(loss=f"{losses[-1]['loss']:.3f}", epoch=epoch + 1)
                 stop = processes.any(interrupted.is_set())
-                if main and (stop or time.monotonic() - last_save > SAVE_SECONDS):
+                if is_main and (stop or time.monotonic() - last_save > SAVE_SECONDS):
                     save(run / "last.pt", losses=losses)
                     last_save = time.monotonic()
                 if stop:
                     return history, False
-            if main:
+            if is_main:
                 row = {"epoch": epoch + 1, "step": trainer.step} | mean_of(losses)
                 row |= data.score(trainer.model)
                 history.append(row)
