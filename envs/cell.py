@@ -22,6 +22,7 @@ from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, 
 from envs.robot_safety import ArmGate
 from utils.config import Config
 from utils.depth import make_depth_noise
+from utils.domain_randomization import Randomizable
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.random_view import RandomView
@@ -131,6 +132,19 @@ class Cell(ABC):
     def _new_gate(self) -> ArmGate:
         config = self.config
         return ArmGate(config.safety, config.robot, self.dt, config.closed_loop.floor)
+
+    def detailed_twin(self) -> Cell | None:
+        """A new cell with detailed visual meshes, for pictures; None in a simulator whose cell
+        shows all that there is. `mirror` has it show the state of another cell. Close it."""
+        return None
+
+    def randomizable(self) -> Randomizable:
+        """The scene as built, whose physics and colours can be changed: the same object until the
+        next build. Raises UserError in a simulator that does not implement it."""
+        raise UserError(
+            f"simulator={self.config.simulator}: its cell cannot be randomised; use "
+            "simulator=pybullet"
+        )
 
     @abstractmethod
     def close(self) -> None:

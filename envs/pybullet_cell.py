@@ -25,7 +25,8 @@ from envs.pybullet_bodies import (
 )
 from envs.pybullet_camera import PybulletCamera, load_renderer
 from envs.pybullet_files import write_welded_panda
-from envs.pybullet_panda import ARM, PybulletPanda
+from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
+from envs.pybullet_randomization import PybulletRandomizable
 from envs.robot_kinematics import forward_kinematics
 from utils.config import Config
 from utils.errors import UserError
@@ -72,8 +73,31 @@ class PybulletCell(Cell):
             spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)
             for p in scene.placements
         ]
+        self._randomizable: PybulletRandomizable | None = None
         if board is not None:
             add_board(self.client, board, T_WO)
+
+    def detailed_twin(self) -> PybulletCell:
+        return PybulletCell(self.config, fine=True)
+
+    def mirror(self, cell: PybulletCell) -> None:
+        """Show another cell's scene, with robot and objects where they are there now."""
+        if self.scene is not cell.scene:
+            self.build(cell.scene)
+        joints = [*ARM, *FINGERS]
+        states = pybullet.getJointStates(cell.robot.body, joints, physicsClientId=cell.client)
+        for joint, state in zip(joints, states):
+            pybullet.resetJointState(self.robot.body, joint, state[0], physicsClientId=self.client)
+        for body, copy in zip(cell.bodies, self.bodies):
+            pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
+            pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=self.client)
+
+    def randomizable(self) -> PybulletRandomizable:
+        if self._randomizable is None:
+            self._randomizable = PybulletRandomizable(
+                self.client, self.dt, self.robot, self.table, self.bodies, self.remaining
+            )
+        return self._randomizable
 
     def _settle(self) -> None:
         settle(self.client, self.bodies, self.config)

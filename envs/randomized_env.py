@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
-from envs.pybullet_panda import ARM, FINGERS
 from utils.domain_randomization import DomainRandomizer
 
 
@@ -31,7 +30,7 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.randomizer = DomainRandomizer(self.cell, self.config.randomization, ARM, FINGERS)
+        self.randomizer = DomainRandomizer(self.cell, self.config.randomization)
         self._recorded: Mapping[str, Any] | None = None
         self.journal: Path | None = None
         self.cell.on_build = self._change_world

@@ -1,20 +1,19 @@
-"""Pictures for people: a twin of a cell with detailed meshes, shadows and a scenic camera.
+"""Pictures and films for people: a scenic camera with shadows and, where there are any, fine meshes.
 
-The twin has no physics of its own; it copies the poses of the cell that it shows. To see a scene,
-and what the cell's camera sees of it:
+To see a scene, and what the cell's camera sees of it:
 
     python -m envs.studio --objects primitives --layout pile --output scene.png seed=3
     python -m envs.studio --layout packed --rgbd runs/scene
 
-`--rgbd` makes a folder of color.png, depth.png (16 bits, millimetres) and T_WC.txt, as predict.py
-takes them, and scene.png, which is for people.
-
-Films of episodes, for any Gymnasium environment that renders "rgb_array".
+`--rgbd` makes a folder of color.png, depth.png (16 bits, millimetres), intrinsics.json (pixels) and
+T_WC.txt, which predict.py reads, and scene.png, which is for people; it prints the command of
+predict.py. `film_episode` films any Gymnasium environment that renders "rgb_array".
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -24,50 +23,37 @@ from typing import Any
 import gymnasium
 import imageio.v2 as imageio
 import numpy as np
-import pybullet
 
 from envs.camera import Intrinsics
 from envs.cell import Cell
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
-from envs.pybullet_panda import ARM, FINGERS
 from envs.registries import check_names
+from envs.simulators import make_cell
 from utils.config import parse_args, run_script
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
+_HOLD = 6  # pictures for which the last one of an episode stays
 
 
 class Studio:
-    """Takes pictures of a cell. Close it, or use it in a `with` block."""
+    """Takes pictures of a cell, of its detailed twin where it has one. Close it, or use it in a
+    `with` block."""
 
     def __init__(self, cell: Cell, width: int = 640, height: int = 480):
-        self._cell = cell
-        # Only PyBullet's cell has detailed meshes to show; another shows itself.
-        self._twin = (
-            PybulletCell(cell.config, fine=True) if isinstance(cell, PybulletCell) else None
-        )
+        self._cell, self._twin = cell, cell.detailed_twin()
         self._intrinsics = Intrinsics(width, height, fov_deg=45.0, near=0.05, far=5.0)
         self._T_WC = look_at(SCENIC_EYE, SCENIC_TARGET)
 
     def picture(self) -> np.ndarray:
         """(H, W, 3) uint8 picture of the cell as it is now."""
-        cell, twin = self._cell, self._twin
-        if twin is None:
-            return cell.image(self._intrinsics, self._T_WC, _LIGHT).rgb
-        if twin.scene is not cell.scene:
-            twin.build(cell.scene)
-        joints = [*ARM, *FINGERS]
-        states = pybullet.getJointStates(cell.robot.body, joints, physicsClientId=cell.client)
-        for joint, state in zip(joints, states):
-            pybullet.resetJointState(twin.robot.body, joint, state[0], physicsClientId=twin.client)
-        for body, copy in zip(cell.bodies, twin.bodies):
-            pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
-            pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=twin.client)
-        return twin.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
+        if self._twin is None:
+            return self._cell.image(self._intrinsics, self._T_WC, _LIGHT).rgb
+        self._twin.mirror(self._cell)
+        return self._twin.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
 
     def close(self) -> None:
         if self._twin is not None:
@@ -97,75 +83,18 @@ class Film:
     def write(self, path: Path, speed: float = 2.0) -> None:
         """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
         self._cell.on_step = None
-        if not self._pictures:  # nothing was done: at least show the scene
+        if not self._pictures:  # the arm has not moved: at least show the scene
             self._pictures.append(self._studio.picture())
         self._studio.close()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".gif":
-            imageio.mimwrite(path, self._pictures, duration=1000 / (speed * self._rate), loop=0)
-        else:
-            imageio.mimwrite(path, self._pictures, fps=speed * self._rate, quality=6)
-
-
-def write_rgbd(frame: RGBDFrame, folder: Path) -> None:
-    """color.png, depth.png in millimetres and T_WC.txt of a frame, in a new folder; UserError if
-    there is such a one."""
-    if folder.exists():
-        raise UserError(f"--rgbd {folder}: exists; give a folder that does not")
-    folder.mkdir(parents=True)
-    imageio.imwrite(folder / "color.png", frame.rgb)
-    imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
-    np.savetxt(folder / "T_WC.txt", frame.T_WC)
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Write a picture of one scene, and what the cell's camera sees of it."""
-
-    def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(
-            "--output",
-            type=Path,
-            help="PNG or JPEG file; default: scene.png, in the folder of --rgbd",
-        )
-        parser.add_argument("--objects", default="primitives", help="a named set or a folder")
-        parser.add_argument("--layout", default="pile", choices=LAYOUTS)
-        parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
-
-    config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
-    check_names(config)
-    objects = load_object_set(
-        chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
-    )
-    with PybulletCell(config) as cell:
-        cell.load(make_scene(chosen.layout, objects, config.seed, config))
-        with Studio(cell) as studio:
-            picture = studio.picture()
-        if chosen.rgbd is not None:
-            frame, folder = cell.frame(), chosen.rgbd
-            write_rgbd(frame, folder)
-        output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
-        imageio.imwrite(output, picture)
-        print(f"wrote {output}")
-        if chosen.rgbd is not None:
-            numbers = " ".join(f"{frame.K[i]:.6g}" for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            files = {"rgb": "color.png", "depth": "depth.png", "camera-pose": "T_WC.txt"}
-            given = [part for k, name in files.items() for part in (f"--{k}", str(folder / name))]
-            print(f"{shlex.join([sys.executable, 'predict.py', *given])} --intrinsics {numbers}")
-
-
-if __name__ == "__main__":
-    run_script(main)
-
-
-_HOLD = 6  # pictures for which the last one stays
+        _write(path, self._pictures, speed * self._rate)
 
 
 def film_episode(
     env: gymnasium.Env, act: Callable[[Any], np.ndarray], seed: int, path: Path,
     options: dict[str, Any] | None = None,
 ) -> str:  # fmt: skip
-    """Play an episode, write it to an MP4 or GIF in real time; how it ended, in a word. options: of
-    its reset."""
+    """Play an episode and write it to an MP4 or GIF in real time; returns the word for how it
+    ended. options: of its reset."""
     observation, info = env.reset(seed=seed, options=options)
     pictures, ended, terminated = [env.render()], False, False
     while not ended:
@@ -178,9 +107,74 @@ def film_episode(
 
 def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     """Write an MP4 or GIF of `rate` pictures a second; the last one stays for a while."""
-    pictures = [*pictures, *[pictures[-1]] * _HOLD]
+    _write(path, [*pictures, *[pictures[-1]] * _HOLD], rate)
+
+
+def _write(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".gif":
         imageio.mimwrite(path, pictures, duration=1000 / rate, loop=0)
     else:
         imageio.mimwrite(path, pictures, fps=rate, quality=6)
+
+
+def write_rgbd(frame: RGBDFrame, folder: Path) -> list[str]:
+    """Write color.png, depth.png in millimetres, intrinsics.json in pixels and T_WC.txt of a frame
+    into a new folder; returns the arguments with which predict.py reads them.
+
+    Raises UserError if the folder exists.
+    """
+    if folder.exists():
+        raise UserError(f"--rgbd {folder}: this folder exists; give one that does not")
+    folder.mkdir(parents=True)
+    imageio.imwrite(folder / "color.png", frame.rgb)
+    imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
+    height, width = frame.depth.shape
+    (fx, _, cx), (_, fy, cy) = frame.K[:2].tolist()
+    numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
+    (folder / "intrinsics.json").write_text(json.dumps(numbers) + "\n", encoding="utf-8")
+    np.savetxt(folder / "T_WC.txt", frame.T_WC)
+    files = {
+        "--rgb": "color.png", "--depth": "depth.png", "--intrinsics": "intrinsics.json",
+        "--camera-pose": "T_WC.txt", "--out": "grasps",
+    }  # fmt: skip
+    return [text for option, name in files.items() for text in (option, str(folder / name))]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write a picture of one scene, and what the cell's camera sees of it."""
+
+    def options(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(
+            "--output",
+            type=Path,
+            help="PNG or JPEG file; default: scene.png, in the folder of --rgbd",
+        )
+        parser.add_argument(
+            "--objects", default="primitives", help="a named set, a folder or an import path"
+        )
+        parser.add_argument("--layout", default="pile", choices=LAYOUTS)
+        parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
+
+    config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
+    check_names(config)
+    objects = load_object_set(
+        chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
+    )
+    command = None
+    with make_cell(config) as cell:
+        cell.load(make_scene(chosen.layout, objects, config.seed, config))
+        with Studio(cell) as studio:
+            picture = studio.picture()
+        if chosen.rgbd is not None:
+            arguments = write_rgbd(cell.frame(), chosen.rgbd)
+            command = shlex.join([sys.executable, "predict.py", *arguments])
+    output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
+    imageio.imwrite(output, picture)
+    print(f"wrote {output}")
+    if command is not None:
+        print(command)
+
+
+if __name__ == "__main__":
+    run_script(main)

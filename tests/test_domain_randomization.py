@@ -118,7 +118,7 @@ def states(cell: PybulletCell) -> list:
 
 
 def randomizer_of(cell: PybulletCell, config=None) -> DomainRandomizer:
-    return DomainRandomizer(cell, (config or cell.config).randomization, ARM, FINGERS)
+    return DomainRandomizer(cell, (config or cell.config).randomization)
 
 
 def test_restore_brings_the_nominal_cell_back(cell, scene):
@@ -190,6 +190,21 @@ def test_the_sample_tells_every_parameter(cell):
             spec = getattr(section, name)
             assert operation == spec.operation
             assert all(spec.low <= v <= spec.high for v in np.atleast_1d(values))
+
+
+def test_a_client_s_number_is_answered_by_what_to_give(cell):
+    """The tutorial's call; with a cell alone the ranges are those of its config."""
+    with pytest.raises(UserError, match="got 0, expected a cell such as envs.pybullet_cell"):
+        DomainRandomizer(0)
+    assert DomainRandomizer(cell).randomize(seed=4) == randomizer_of(cell).randomize(seed=4)
+
+
+def test_a_depth_noise_of_the_camera_replaces_the_randomised_one(cell, monkeypatch):
+    own = cell.config.camera.model_copy(update={"depth_noise": "kinect"})
+    drawn = DomainRandomizer(cell).randomize(seed=4)
+    monkeypatch.setattr(cell, "config", cell.config.model_copy(update={"camera": own}))
+    assert drawn["depth_noise"]
+    assert DomainRandomizer(cell).randomize(seed=4) == drawn | {"depth_noise": False}
 
 
 def dynamics(cell: PybulletCell, body: int, link: int = -1) -> dict:
@@ -588,7 +603,7 @@ def test_the_record_of_a_round_replays_its_world(tmp_path):
     with PybulletCell(config) as cell:
         plain = run_round(cell, scene, lambda frame: [], policy="p", objects="box", max_failures=1)
         assert plain.randomization is None
-        randomizer = DomainRandomizer(cell, config.randomization, ARM, FINGERS)
+        randomizer = DomainRandomizer(cell, config.randomization)
         cell.on_build = lambda cell: randomizer.replay(kept.randomization)
         cell.load(scene)
         (body,) = cell.bodies

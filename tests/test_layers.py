@@ -30,11 +30,6 @@ DEMONSTRATIONS = {
     ("envs.grasping_env", "envs.scripted_pick"),
     ("utils.visual_servo", "utils.servo_reference"),
 }
-STILL_TO_BE_MOVED = {
-    ("envs.studio", "pybullet"),
-    ("utils.domain_randomization", "pybullet"),
-    ("utils.random_physics", "pybullet"),
-}
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +54,7 @@ def test_only_a_simulators_own_modules_import_it(imports):
         for package, beginning in SIMULATORS.items()
         if package in imported and not module.startswith(beginning)
     }
-    assert strangers <= STILL_TO_BE_MOVED
+    assert not strangers
 
 
 def test_no_circle_of_imports(imports):

@@ -1,9 +1,10 @@
-"""Domain randomisation: every episode in a slightly different world, on record.
+"""Domain randomisation: every episode in a slightly different cell, drawn, recorded and replayed.
 
 After Tobin et al., "Domain randomization for transferring deep neural networks from simulation to
-the real world" (IROS 2017). What varies, how much and how often is the config's section
-`randomization`. This module draws, records and replays; `utils.random_physics` and
-`utils.random_view` apply. It knows the cell only as far as `World` says.
+the real world" (IROS 2017). The config's section `randomization` says what varies, how much and how
+often. This module draws samples and knows no simulator: a cell applies them, each simulator's in
+its own way (`Randomizable`; `envs.pybullet_randomization` implements it). `utils.random_view`
+changes what the cameras see.
 """
 
 from __future__ import annotations
@@ -12,95 +13,119 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import pybullet
 
+from utils.config import Config
 from utils.config_types import RandomizationConfig, Range
 from utils.errors import UserError
-from utils.random_physics import RandomPhysics
-from utils.random_physics import World as PhysicsWorld
-from utils.random_ranges import changed, draw, ranges_of
+from utils.random_ranges import Change, changed, draw, ranges_of
 from utils.random_view import RandomView, TextureRandomizer, random_colour
-from utils.transforms import pose_matrix
 
-__all__ = ["DomainRandomizer", "TextureRandomizer", "World"]
+__all__ = ["DomainRandomizer", "Randomizable", "RandomizableCell", "TextureRandomizer"]
 
 _VERSION = 2  # of a sample
 _PHYSICS_STREAM, _VISION_STREAM, _ACTION_STREAM = 0, 1, 3
 _EACH_AXIS = ("light_colour", "camera_shift", "camera_turn", "white_balance")  # three values
+_LONGEST_ACTION = 8  # entries
 
 
-class World(PhysicsWorld, Protocol):
-    """A cell: physics, the view that its cameras look through (None: as it is), and the sample that
-    made it what it is (None: nominal)."""
+class Randomizable(Protocol):
+    """One scene as built, whose physics and colours a simulator can change and bring back exactly.
 
+    surfaces: the simulator's numbers of the table and then each object, as in a rendered image.
+    """
+
+    surfaces: Sequence[int]
+
+    def sizes(self) -> dict[str, int | None]:
+        """How many values a parameter takes: one an object or joint, None for a single one."""
+
+    def apply(self, changes: Mapping[str, Change]) -> None:
+        """Make all physics nominal but for the changes; their names are the keys of the config's
+        section randomization.physics. The cell ignores those of actions."""
+
+    def paint(self, colours: Sequence[Sequence[float]] | None) -> None:
+        """Colour the surfaces: RGBA in 0..1 for each, None for the nominal colours."""
+
+    def pose(self, body: int) -> np.ndarray:
+        """(4, 4) pose in W of a surface's body."""
+
+
+class RandomizableCell(Protocol):
+    """A cell as far as randomisation needs it. view: the change of what its cameras see, None for
+    none. sample: what was applied to the scene, None for a nominal one."""
+
+    config: Config
     view: RandomView | None
     sample: dict[str, Any] | None
 
+    def randomizable(self) -> Randomizable:
+        """The scene as built: the same object until the cell is built again. Raises UserError in a
+        simulator that cannot be randomised."""
+
 
 class DomainRandomizer:
-    """Draws a world for each episode, applies it to a cell, and takes it back.
+    """Draws a sample for each episode, applies it to a cell, and brings the nominal cell back.
 
-    Call `randomize` when the cell's scene has been built (`PybulletCell.on_build`); in between, `act` gives
-    what becomes of each action (`PybulletCell.on_action`). A sample is a plain dict of text, numbers, lists
-    and dicts, the same after a journey through JSON; with the same scene and actions,
-    `replay(sample)` gives the same episode bit for bit. It holds:
+    Call `randomize` when the cell's scene has been built (`Cell.on_build`) and pass every action of
+    a policy through `act` (`Cell.on_action`). A sample is plain data of text, numbers, lists and
+    dicts and survives JSON; with the same scene and actions, `replay(sample)` gives the same
+    episode bit for bit. It holds:
 
         version, seed: the seed is of all that is drawn anew at each action and image
         physics, vision: by parameter [operation, value or list of values]
         each_step: by parameter its Range, where it is drawn anew
         colours: RGB for the table and each object, or None. textures: likewise, each None or a
-            description by `TextureRandomizer.draw`. shadow: 0 or 1. depth_noise: true or false
+            description by `TextureRandomizer.draw`. shadow: 0 or 1. depth_noise: whether the depth
+            has the noise of a Kinect whose parameters vary; never where `camera.depth_noise` gives
+            the cell a noise of its own
 
-    world: of PyBullet; UserError for another. arm, fingers: link numbers of the robot. seed: of
-    what `randomize` draws when it is given none.
+    settings: None for those of the cell's config. seed: of what `randomize` draws when it is given
+    none. Raises UserError for PyBullet's client number, which the tutorial passes.
     """
 
     def __init__(
-        self,
-        world: World,
-        settings: RandomizationConfig,
-        arm: Sequence[int] = range(7),
-        fingers: Sequence[int] = (7, 8),
-        seed: int = 0,
+        self, cell: RandomizableCell, settings: RandomizationConfig | None = None, seed: int = 0
     ):
-        if world.client is None:
+        if not hasattr(cell, "randomizable"):
             raise UserError(
-                "DomainRandomizer changes PyBullet's physics: it needs a cell of PyBullet"
+                f"DomainRandomizer: got {cell!r:.60}, expected a cell such as "
+                "envs.pybullet_cell.PybulletCell: a physics client alone does not say which of its "
+                "bodies are objects, and what is nominal"
             )
-        self._world, self._settings = world, settings
-        self._arm, self._fingers = tuple(arm), tuple(fingers)
+        settings = settings or cell.config.randomization
+        self._cell, self._settings = cell, settings
         self._seeds = np.random.default_rng(seed)
         self.textures = TextureRandomizer(settings.texture_folder)
         self._varies_view = "vision" in settings.parts
-        self._physics_ranges = ranges_of(settings.physics) if "physics" in settings.parts else {}
+        self._varies_depth = self._varies_view and cell.config.camera.depth_noise == "none"
+        self._physics = ranges_of(settings.physics) if "physics" in settings.parts else {}
         self._vision = ranges_of(settings.vision) if self._varies_view else {}
-        self._built: object = None  # the robot of the build that `_physics` belongs to
+        self._scene: Randomizable | None = None  # the build that was randomised last
 
     @property
     def sample(self) -> dict[str, Any] | None:
-        """What was applied to the cell last; None for a nominal one."""
-        return self._world.sample
+        """The sample that was applied to the cell last; None for a nominal cell."""
+        return self._cell.sample
 
     def randomize(self, seed: int | None = None) -> dict[str, Any]:
-        """Draw a world, apply it to the scene as built, and return the sample.
+        """Draw a sample, apply it to the scene as built, and return it.
 
         The same seed, scene and ranges give the same sample.
         """
-        self._remember_nominal()
+        self._scene = self._cell.randomizable()
         seed = int(self._seeds.integers(2**31)) if seed is None else int(seed)
         sample = self._draw(seed)
         self._apply(sample)
         return sample
 
     def replay(self, sample: Mapping[str, Any]) -> None:
-        """Apply a recorded sample. Raises UserError where it is of another version or scene."""
-        self._remember_nominal()
-        count = len(self._world.bodies)
+        """Apply a recorded sample. Raises UserError for one of another version or scene."""
+        self._scene = self._cell.randomizable()
         if sample.get("version") != _VERSION:
             raise UserError(
                 f"randomisation sample: version {sample.get('version')!r}, expected {_VERSION}"
             )
-        recorded = len(sample["textures"]) - 1
+        recorded, count = len(sample["textures"]) - 1, len(self._scene.surfaces) - 1
         if recorded != count:
             raise UserError(
                 f"randomisation sample: recorded with {recorded} objects, the scene has {count}"
@@ -108,30 +133,29 @@ class DomainRandomizer:
         self._apply(sample)
 
     def restore(self) -> None:
-        """Bring the nominal cell back; objects stay where they are. Without a sample, nothing."""
-        if self.sample is None or self._built is not self._world.robot:
-            self._world.sample, self._world.view = None, None  # a new build is nominal
-            return
-        self._physics.restore()
-        self._paint(self._colours)
-        self._world.view = None
-        self._world.sample = None
+        """Bring the nominal cell back; the objects stay where they are. A scene that was built
+        since is nominal already."""
+        if self.sample is not None and self._scene is self._cell.randomizable():
+            self._scene.apply({})
+            self._scene.paint(None)
+        self._cell.sample, self._cell.view = None, None
 
     def act(self, action: np.ndarray) -> np.ndarray:
-        """(n,) what becomes of an action (n,) in [-1, 1]: biased, noisy and still in [-1, 1].
+        """(n,) the action that the cell carries out for an action (n,) in [-1, 1]: with bias and
+        noise, and still in [-1, 1].
 
         Begins a new step: what is drawn at each step changes now.
         """
         if self.sample is None:
             return action
-        changes = self._physics_at(self._steps)
-        if self._each_step_physics:
-            self._physics.apply(changes)
+        changes = self._changes("physics", self._steps, _PHYSICS_STREAM)
+        if self.sample["each_step"]["physics"]:
+            self._scene.apply(changes)
         rng = np.random.default_rng([self.sample["seed"], _ACTION_STREAM, self._steps])
         self._steps += 1
-        deviation = _plain(changes, "action_noise")
+        deviation = _from_zero(changes, "action_noise")
         # The bias is as long as the longest action there is; a shorter one takes its beginning.
-        bias = np.asarray(_plain(changes, "action_bias", [0.0]))
+        bias = np.asarray(_from_zero(changes, "action_bias", [0.0]))
         bias = np.resize(bias, len(action))
         noisy = action + bias + deviation * rng.standard_normal(len(action))
         return np.clip(noisy, -1.0, 1.0).astype(np.asarray(action).dtype)
@@ -140,41 +164,37 @@ class DomainRandomizer:
 
     def _draw(self, seed: int) -> dict[str, Any]:
         settings, rng = self._settings, np.random.default_rng(seed)
-        physics = self._physics_ranges
         sizes = self._sizes()
-        count = len(self._world.bodies)
+        count = len(self._scene.surfaces)
         coloured = bool(rng.random() < settings.colour_share)
-        colours = [random_colour(rng).tolist() for _ in range(count + 1)]
+        colours = [random_colour(rng).tolist() for _ in range(count)]
         textures = [
             self.textures.draw(rng) if coloured and rng.random() < settings.texture_share else None
-            for _ in range(count + 1)
+            for _ in range(count)
         ]
         shadow, noisy = rng.random(2) < (settings.shadow_share, settings.depth_noise_share)
         if not self._varies_view:
-            coloured, textures, shadow, noisy = False, [None] * (count + 1), False, False
+            coloured, textures, shadow = False, [None] * count, False
         return {
             "version": _VERSION,
             "seed": seed,
             "colours": colours if coloured else None,
             "textures": textures,
             "shadow": int(shadow),
-            "depth_noise": bool(noisy),
-            "physics": _draws(physics, rng, sizes, "episode"),
+            "depth_noise": bool(noisy) and self._varies_depth,
+            "physics": _draws(self._physics, rng, sizes, "episode"),
             "vision": _draws(self._vision, rng, sizes, "episode"),
             "each_step": {
                 part: {name: list(spec) for name, spec in ranges.items() if spec.every == "step"}
-                for part, ranges in (("physics", physics), ("vision", self._vision))
+                for part, ranges in (("physics", self._physics), ("vision", self._vision))
             },
         }
 
     def _sizes(self) -> dict[str, int | None]:
-        sizes = self._physics.sizes() | dict.fromkeys(_EACH_AXIS, 3)
+        sizes = self._scene.sizes() | dict.fromkeys(_EACH_AXIS, 3)
         return sizes | {"action_bias": _LONGEST_ACTION}
 
-    def _physics_at(self, step: int) -> dict[str, Any]:
-        return self._at("physics", step, _PHYSICS_STREAM)
-
-    def _at(self, part: str, step: int, stream: int) -> dict[str, Any]:
+    def _changes(self, part: str, step: int, stream: int) -> dict[str, Change]:
         """All changes of a part in a step, those of the episode and those of the step."""
         sample = self.sample
         each = sample["each_step"][part]
@@ -186,55 +206,25 @@ class DomainRandomizer:
 
     # --- Applying -----------------------------------------------------------------------------
 
-    def _remember_nominal(self) -> None:
-        """Take what is nominal from a scene that was just built; once for each build."""
-        world = self._world
-        if self._built is world.robot:
-            return
-        self._built = world.robot
-        self._physics = RandomPhysics(world, self._arm, self._fingers)
-        self._colours = [
-            pybullet.getVisualShapeData(body, physicsClientId=world.client)[0][7]
-            for body in self._surfaces()
-        ]
-
     def _apply(self, sample: Mapping[str, Any]) -> None:
-        world = self._world
-        world.sample, self._steps = dict(sample), 0
-        self._each_step_physics = bool(sample["each_step"]["physics"])
-        self._physics.apply(self._physics_at(0))
+        cell, scene = self._cell, self._scene
+        cell.sample, self._steps = dict(sample), 0
+        scene.apply(self._changes("physics", 0, _PHYSICS_STREAM))
         colours = sample["colours"]
-        self._paint(self._colours if colours is None else [(*rgb, 1.0) for rgb in colours])
+        scene.paint(None if colours is None else [(*rgb, 1.0) for rgb in colours])
         textures = {
             body: self.textures.make(description)
-            for body, description in zip(self._surfaces(), sample["textures"])
+            for body, description in zip(scene.surfaces, sample["textures"])
             if description is not None
         }
-        world.view = RandomView(
-            lambda frame: self._at("vision", frame, _VISION_STREAM),
+        cell.view = RandomView(
+            lambda frame: self._changes("vision", frame, _VISION_STREAM),
             sample["seed"],
             sample["shadow"],
             sample["depth_noise"],
             textures,
-            self._pose,
+            scene.pose,
         )
-
-    def _surfaces(self) -> list[int]:
-        return [self._world.table, *self._world.bodies]
-
-    def _paint(self, colours: Sequence[Sequence[float]]) -> None:
-        for body, colour in zip(self._surfaces(), colours):
-            pybullet.changeVisualShape(
-                body, -1, rgbaColor=list(colour), physicsClientId=self._world.client
-            )
-
-    def _pose(self, body: int) -> np.ndarray:
-        return pose_matrix(
-            *pybullet.getBasePositionAndOrientation(body, physicsClientId=self._world.client)
-        )
-
-
-_LONGEST_ACTION = 8  # entries
 
 
 def _draws(
@@ -247,7 +237,7 @@ def _draws(
     }
 
 
-def _plain(changes: Mapping[str, Any], name: str, nominal: Any = 0.0) -> Any:
+def _from_zero(changes: Mapping[str, Change], name: str, nominal: Any = 0.0) -> Any:
     """The value of a parameter whose nominal value is 0."""
     if name not in changes:
         return nominal

@@ -1,6 +1,6 @@
 """Parameters drawn from a range: distributions, and how a drawn value changes a nominal one.
 
-Knows nothing of what the parameters are.
+This module does not know what the parameters mean.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 
 from utils.config_types import Range
 
+Change = tuple[str, Any]  # operation, and a value or a list of them
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
 
 

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from utils.depth import KinectNoise
 from utils.errors import UserError
-from utils.random_ranges import changed
+from utils.random_ranges import Change, changed
 from utils.transforms import deproject, known_depth
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -216,8 +216,6 @@ LIGHTS = {
     "light_diffuse": "lightDiffuseCoeff",
     "light_specular": "lightSpecularCoeff",
 }
-
-Change = tuple[str, Any]  # operation, and a value or a list of them
 
 
 class RandomView:
