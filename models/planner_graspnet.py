@@ -121,7 +121,7 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
 
 
 class GraspNetPlanner(SearchPlanner):
-    """Antipodal search ranked by a network, which sees nothing but the RGB-D image.
+    """Antipodal search ranked by a network, on the RGB-D image alone.
 
     checkpoint: file of the network, unless `network` is given. Raises UserError if the file cannot
     be loaded.

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from models.planners import PLANNERS, make_planner, needs_truth, reset_planner
 from tests.helpers.box_frames import boxes_frame
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
+from utils.grasp_labels import dense_labels
 from utils.transforms import Grasp, RGBDFrame, angle_difference
 
+HAND = GripperGeometry()
 ROOT = Path(__file__).resolve().parent.parent
 DELIBERATE = ("heuristic", "oracle")
 
@@ -128,6 +131,18 @@ def test_an_empty_table_has_nothing_to_grasp(name: str) -> None:
 def test_a_box_wider_than_the_gripper_is_left_alone(name: str, degrees: int) -> None:
     frame = boxes_frame([((0.09, 0.10, 0.05), np.deg2rad(degrees), (0.5, 0.0))])
     assert planner(name)(frame) == []
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+def test_a_wider_hand_grasps_a_wider_box(name: str) -> None:
+    hand = replace(HAND, max_opening=0.10)
+    frame = boxes_frame([((0.088, 0.12, 0.05), 0.0, (0.5, 0.0))])
+    assert planner(name)(frame) == []
+    best = make_planner(name, hand, Workspace(), 0)(frame)[0]
+    assert 0.088 < best.width <= 0.10
+    middle = [dense_labels(frame, gripper, Workspace()).width[:, 111, 111].max()
+              for gripper in (hand, HAND)]  # fmt: skip
+    assert 0.088 < middle[0] <= 0.10 and middle[1] == 0
 
 
 @pytest.mark.parametrize("name", ("random", "heuristic"))

@@ -20,7 +20,7 @@ import numpy as np
 from utils.geometry import GripperGeometry, SceneGeometry, intersect_lines
 from utils.height_map import HeightMap
 
-_REACH = 0.108  # m of map around every grasp: half the palm's length and a little
+_RIM = 0.004  # m of map beyond the hand around every grasp
 _SMALLEST_HALF = 0.004  # m, half the smallest opening that is tried
 _NEAR_FACE = 0.008  # m, lines across the pad within this gap belong to the face that is fitted
 _TOUCH = 0.0025  # m, and those within this gap touch it
@@ -87,8 +87,8 @@ def undersides(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
     """(R, C) float32 lowest matter, z in W, of the object that is on top in each cell; the table's
     height where no object is. Pads meet nothing below it."""
     under = np.full(heights.height.shape, np.inf)
-    for number, thing in enumerate(scene.objects):
-        for solid in thing.solids:
+    for number, item in enumerate(scene.objects):
+        for solid in item.solids:
             low, high = solid.vertices[:, :2].min(axis=0), solid.vertices[:, :2].max(axis=0)
             (top, bottom), (left, right) = (heights.index(np.stack([low, high]))[i] for i in (0, 1))
             label = heights.label[top : bottom + 1, left : right + 1]
@@ -109,7 +109,7 @@ class _TurnedMap:
     """The height map around some points, with the closing line along its rows.
 
     Steps are `cell` along (columns) and 2 * cell across (rows). height, label: (R, C). row, column:
-    (N,) int32, where the points lie; there are `_REACH` metres of map on all sides of them.
+    (N,) int32, where the points lie; there are `reach` metres of map on all sides of them.
     """
 
     height: np.ndarray
@@ -126,15 +126,16 @@ class _TurnedMap:
         under: np.ndarray,
         along: np.ndarray,
         across: np.ndarray,
+        reach: float,
     ) -> _TurnedMap:
         cell, middle = heights.cell, (heights.height.shape[0] - 1) / 2
         from_middle = (xy - heights.origin) / cell - middle
         column = np.rint(from_middle @ along).astype(np.int32)
         row = np.rint(from_middle @ across / 2).astype(np.int32)
-        reach = int(_REACH / cell)
-        first_column, first_row = column.min() - reach, row.min() - reach // 2
+        rim = int(reach / cell)
+        first_column, first_row = column.min() - rim, row.min() - rim // 2
         column, row = column - first_column, row - first_row
-        size = (int(column.max()) + reach + 1, int(row.max()) + reach // 2 + 1)
+        size = (int(column.max()) + rim + 1, int(row.max()) + rim // 2 + 1)
         warp = np.column_stack(
             [along, 2 * across, middle + first_column * along + 2 * first_row * across]
         )
@@ -196,7 +197,9 @@ def grasp_quality(
     """
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
-    turned = _TurnedMap.around(surface[:, :2], heights, under, along, across)
+    finger_end = gripper.max_opening / 2 + gripper.finger_outline[-1][0]
+    reach = max(gripper.palm_half_length, finger_end) + _RIM
+    turned = _TurnedMap.around(surface[:, :2], heights, under, along, across, reach)
     depth = grasp_depth(surface[:, 2], heights.table_height, settings)
     tip = (surface[:, 2] - depth).astype(np.float32)
     limit = tip - settings.clearance
@@ -209,7 +212,7 @@ def grasp_quality(
         return found
     face = _faces(turned, index, tip[index], half, gripper)
     offset = heights.centres[face.label] - np.column_stack([surface[index, :2], tip[index]])
-    friction = np.array([thing.friction for thing in scene.objects])[face.label]
+    friction = np.array([item.friction for item in scene.objects])[face.label]
     quality = _quality(
         face, offset[:, :2] @ along, offset[:, :2] @ across, offset[:, 2], friction, half,
         gripper, settings,

@@ -1,11 +1,8 @@
-"""Local maxima of an image, some distance apart: non-maximum suppression by a sliding window.
-
-This module knows neither what the image means nor what becomes of its peaks.
-
-Orthographic height maps in the world frame, from a depth image or from the true geometry.
+"""Orthographic height maps in the world frame, from a depth image or from the true geometry.
 
 A height map answers "how high is the scene above (x, y)?", which is all that a straight descent
-has to know. This module knows no simulator and no network.
+has to know. `local_maxima` finds the peaks of such a map, or of any image. This module knows no
+simulator and no network.
 """
 
 from __future__ import annotations
@@ -21,35 +18,10 @@ from utils.depth import HOLE_REACH, depth_of_plane, near_side, nearest_values, r
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
 
-
-def local_maxima(
-    image: np.ndarray, radius: int, above: float, count: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns (N,) of the highest pixels of their windows of side 2 radius + 1 in an
-    `image` (H, W), highest first; only those `above` a value, and no more than `count`.
-
-    Of equal pixels less than a window apart, the first in reading order stands for all.
-    """
-    side = 2 * radius + 1
-    highest = cv2.dilate(image, np.ones((side, side), np.uint8))
-    rows, columns = np.nonzero((image > above) & (image >= highest))
-    free = np.ones(image.shape, bool)
-    chosen: list[int] = []
-    for peak in np.argsort(-image[rows, columns], kind="stable"):
-        if len(chosen) == count:
-            break
-        row, column = rows[peak], columns[peak]
-        if free[row, column]:
-            chosen.append(peak)
-            top, left = max(row - radius, 0), max(column - radius, 0)
-            free[top : row + radius + 1, left : column + radius + 1] = False
-    return rows[chosen], columns[chosen]
-
-
-# Depth cameras lose thin things whole, such as the mast of a toy ship. So matter in a hole may be
+# Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole may be
 # this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
-WALL = 0.05  # m, over all that is known: what counts as standing in a hole too wide to fill
+WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 
 
 @dataclass(frozen=True)
@@ -84,7 +56,7 @@ class HeightMap:
 
     def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
         """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
-        window of one of OpenCV's `shape`s. Worked out once."""
+        window of one of OpenCV's `shape`s. The result is kept."""
         if (surface, radius, shape) not in self._highest:
             window = cv2.getStructuringElement(shape, (2 * radius + 1, 2 * radius + 1))
             self._highest[surface, radius, shape] = cv2.dilate(getattr(self, surface), window)
@@ -104,11 +76,11 @@ def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.nd
 def height_map_from_frame(
     frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = 0.08
 ) -> HeightMap:
-    """Height map of what a depth image shows; uses nothing of the frame but depth, K and T_WC.
+    """The height map of a depth image; uses nothing of the frame but depth, K and T_WC.
 
-    Unknown pixels count as the nearest surface beside them (`near_side`), and what may be there
-    is bounded a little higher. Labels are the pieces between height discontinuities; their centres
-    are volume centroids of the columns between the table and the visible surface.
+    Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over them is
+    a little higher. Labels are the pieces between height discontinuities; their centres are volume
+    centroids of the columns between the table and the visible surface.
     """
     measured = known_depth(frame.depth)
     if not measured.all():
@@ -122,7 +94,7 @@ def height_map_from_frame(
     # OpenCV pads with the largest float, which a cell far outside the view would inherit.
     lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
     height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, table), seen), table)
-    # The rays that graze an edge bound what may stand in its shadow.
+    # The rays that graze an edge bound the matter in its shadow.
     ceiling = _highest(_grazing_points(frame, origin, cell), grid.shape[:2])
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
     if not measured.all():
@@ -131,7 +103,7 @@ def height_map_from_frame(
         ceiling = np.maximum(ceiling, risen)
     label = label_pieces(height, table, cell)
     centres = _column_centroids(height - table, label, grid, table)
-    # Anything may stand where nothing is known even of the surroundings: a wall, not an object.
+    # Where even the surroundings are unknown any matter is possible: a wall, not an object.
     unknown = hidden & np.isfinite(
         _highest(_table_points(frame, table, origin, cell), height.shape)
     )
@@ -146,8 +118,8 @@ def height_map_from_scene(
     grid, origin = grid_points(workspace, margin, cell)
     height = np.full(grid.shape[:2], scene.table_height)
     label = np.full(grid.shape[:2], -1)
-    for number, thing in enumerate(scene.objects):
-        for solid in thing.solids:
+    for number, item in enumerate(scene.objects):
+        for solid in item.solids:
             low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
             high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
             low, high = np.maximum(low, 0), np.maximum(high, 0)
@@ -162,14 +134,15 @@ def height_map_from_scene(
             label[window] = np.where(top > height[window], number, label[window])
             height[window] = np.maximum(top, height[window])
     height = height.astype(np.float32)
-    centres = np.array([thing.centre_of_mass for thing in scene.objects]).reshape(-1, 3)
+    centres = np.array([item.centre_of_mass for item in scene.objects]).reshape(-1, 3)
     return HeightMap(height, height, label, centres, origin, cell, scene.table_height)
 
 
 def label_pieces(
     height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = 0.004
 ) -> np.ndarray:
-    """(R, C) labels of the pieces that rise over `floor`, cut where neighbours differ by `step`.
+    """(R, C) labels of the pieces higher than `floor` over the table, cut where neighbouring cells
+    differ by `step`, all in metres.
 
     Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece.
     """
@@ -185,7 +158,7 @@ def label_pieces(
 def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float) -> np.ndarray:
     """Labels (R, C) as in `label_pieces`, of pieces of more than `smallest` cells."""
     rows, columns = height.shape
-    # Every second pixel is a cell; the pixel between two is set where they belong together.
+    # Every second pixel is a cell; the pixel between two cells is set where they are connected.
     linked = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
     linked[::2, ::2] = above
     linked[::2, 1::2] = above[:, :-1] & above[:, 1:] & (np.abs(np.diff(height, axis=1)) < step)
@@ -219,7 +192,7 @@ def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
     Each part holds columns and rows, in cells, and z (metres) of points, (3, ...).
     """
     rows, cols = shape
-    height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for what lies outside
+    height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for points outside
     for col, row, z in parts:
         index = np.rint(np.clip(row, -1, rows)) + 1
         index *= cols + 2
@@ -241,7 +214,7 @@ def _surface_points(
     depth[unknown] = 0
     to_cells = np.diag([1 / cell, 1 / cell, 1.0])
     start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
-    # A ray is the sum of what a pixel's column, its row and the optical axis give.
+    # A ray is the sum of three parts: for the pixel's column, for its row, and the optical axis.
     by_u, by_v, axis = (to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)).T
     v, u = (np.arange(count, dtype=float) for count in depth.shape)
     sub = (np.arange(split) + 0.5) / split - 0.5
@@ -287,3 +260,30 @@ def _grazing_points(
         cells = np.linalg.norm((far - near)[:2], axis=0).max()
         share = np.linspace(0, 1, int(np.clip(2 * cells, 2, 60)))[:, None]
         yield near[:, None] + share * (far - near)[:, None]
+
+
+# --- Local maxima ---------------------------------------------------------------------------
+
+
+def local_maxima(
+    image: np.ndarray, radius: int, above: float, count: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (N,) of the highest pixels of an `image` (H, W), in falling order.
+
+    Each is the highest in the window of side 2 radius + 1 around it, and `above` a value; there are
+    at most `count`. Of equal pixels in one window, the result has the first in reading order.
+    """
+    side = 2 * radius + 1
+    highest = cv2.dilate(image, np.ones((side, side), np.uint8))
+    rows, columns = np.nonzero((image > above) & (image >= highest))
+    free = np.ones(image.shape, bool)
+    chosen: list[int] = []
+    for peak in np.argsort(-image[rows, columns], kind="stable"):
+        if len(chosen) == count:
+            break
+        row, column = rows[peak], columns[peak]
+        if free[row, column]:
+            chosen.append(peak)
+            top, left = max(row - radius, 0), max(column - radius, 0)
+            free[top : row + radius + 1, left : column + radius + 1] = False
+    return rows[chosen], columns[chosen]

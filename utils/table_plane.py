@@ -1,8 +1,8 @@
 """The table's plane in images of depth or of distance.
 
 Each situation has a fit of its own: `fit_table_plane` improves a plane that is known to a few
-centimetres; `dominant_plane` and `find_table` search the plane of an image of which nothing is
-known (RANSAC, then least squares); `find_table_camera` finds both the table and the place from
+centimetres; `dominant_plane` and `find_table` search the plane where nothing is known before
+(RANSAC, then least squares); `find_table_camera` finds both the table and the place from
 which an image's distances are measured. All go through `fit_plane` or `robust_fit`.
 
 Frames: C camera, W world, P the table as the camera sees it (origin below the camera, z up). This
@@ -323,7 +323,7 @@ def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
 
 
 def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
-    """How badly a table explains an image (H, W) of metres, for each thing that it may hold.
+    """How badly a table explains an image (H, W) of metres, for each reading of its values.
 
     The value is the median distance, in metres, of the middle's pixels from the table that fits
     best. Six parameters explain an image of distances from a base, three an image of depths or of
