@@ -18,11 +18,9 @@ import numpy as np
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
-from models.ppo_rollouts import derived_seeds
+from models.ppo_rollouts import FRESH, derived_seeds
 from utils.config import Config, load_config, run_script
 from utils.statistics import wilson_interval
-
-FRESH = 3  # none of train_rl.py's purposes of seeds
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -170,16 +170,16 @@ def whole_updates(config: Config, steps: int) -> int:
 
 
 def train_ours(env: str, seed: int, steps: int) -> Result:
-    from envs.vector_env import vector_envs
+    from envs.vector_env import training_envs
+    from models.grasp_policy import make_ppo
     from models.ppo_rollouts import RolloutCollector, derived_seeds, evaluate_policy
-    from train_rl import make_ppo
     from utils.distributed import ALONE
     from utils.runs import Stopwatch
 
     config = config_of(env, seed)
     count, watch = whole_updates(config, steps), Stopwatch()
-    with vector_envs(config, config.rl.envs) as envs:
-        ppo = make_ppo(config, envs, ALONE)
+    with training_envs(config, config.rl.envs) as envs:
+        ppo = make_ppo(envs.observation_space, envs.action_space, config)
         collector = RolloutCollector(envs, ppo.layout, config.rl.rollout_steps, ALONE.device, watch)
         collector.restart(derived_seeds(envs.num_envs, seed))
         ppo.generator.manual_seed(seed)
@@ -235,10 +235,10 @@ def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
 
 def step_only(env: str, seed: int, steps: int) -> float:
     """Steps a second of the same environments with random actions and nothing learned."""
-    from envs.vector_env import vector_envs
+    from envs.vector_env import training_envs
 
     config = config_of(env, seed)
-    with vector_envs(config, config.rl.envs) as envs:
+    with training_envs(config, config.rl.envs) as envs:
         envs.action_space.seed(seed)
         envs.restart([seed] * envs.num_envs)
         count, start = max(1, steps // envs.num_envs // 4), time.perf_counter()

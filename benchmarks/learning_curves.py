@@ -51,9 +51,9 @@ def training_success(run: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps (N,) and the share of episodes that succeeded (N,) in the rollout before each."""
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
-    if "rollout/success" not in events.Tags()["scalars"]:
-        raise UserError(f"{run}: no rollout/success in its TensorBoard events; give a run's folder")
-    points = events.Scalars("rollout/success")
+    if "training/success_share" not in events.Tags()["scalars"]:
+        raise UserError(f"{run}: no training/success_share in its TensorBoard events; give a run's folder")
+    points = events.Scalars("training/success_share")
     return np.array([p.step for p in points]), np.array([p.value for p in points])
 
 

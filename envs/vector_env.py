@@ -1,8 +1,9 @@
-"""Many copies of a Gymnasium environment, each in a worker process, that fail loudly.
+"""The environments of a training: copies of one Gymnasium environment, each in a worker process.
 
-A worker that raises, dies or hangs ends the call with what is known about it; nothing waits for
-ever. Environments never reset on their own, so that no final observation is lost. This module knows
-no policy.
+`make_env` makes one from the config's section `rl`, `training_envs` all of them. A worker that
+raises, dies or hangs ends the call with an error that says what is known about it; no call waits
+for ever. Environments never reset on their own, so that no final observation is lost. This module
+knows no policy.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
@@ -30,25 +31,25 @@ from utils.config import Config
 from utils.errors import UserError
 
 RANDOMIZED = "RandomizedGrasping-v0"
-OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # are given the whole config
+OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # take the whole config as an argument
 REPOSITORY = Path(__file__).resolve().parent.parent
 
-# Gymnasium tells of a worker's error in warnings, several times; a WorkerError says it all once.
+# Gymnasium reports a worker's error in several warnings; a WorkerError says it all once.
 warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
 
 
 class WorkerError(RuntimeError):
-    """A worker process raised something, died or did not answer; the message holds its traceback,
-    as far as there is one."""
+    """A worker process raised an error, died or did not answer; the message holds its traceback, if
+    there is one."""
 
 
 @contextmanager
-def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
+def training_envs(config: Config, count: int) -> Iterator[TrainingEnvs]:
     """`count` environments of the config's section `rl`, closed at the end.
 
-    Raises UserError for an environment that does not exist or cannot be made from its arguments.
+    Raises UserError for an environment that does not exist or does not take its arguments.
     """
-    envs = VectorEnvs(config, count)
+    envs = TrainingEnvs(config, count)
     try:
         yield envs
     except BaseException:
@@ -58,13 +59,14 @@ def vector_envs(config: Config, count: int) -> Iterator[VectorEnvs]:
 
 
 def full_difficulty(env_id: str) -> dict[str, Any]:
-    """Options of a reset for an episode of the task itself, whatever makes training easier."""
+    """Options of a reset for an episode of the task itself, without what makes training easier."""
     return {"start": "home"} if env_id in OWN_ENVS else {}
 
 
-class VectorEnvs:
-    """See `models.ppo_rollouts.VectorEnvs` for the methods that stepping takes.
+class TrainingEnvs:
+    """`count` environments of one training, stepped together; see `training_envs`.
 
+    They implement `models.ppo_rollouts.VectorEnvs`, which documents `restart` and `step`.
     observation_space, action_space: of a single environment.
     """
 
@@ -78,7 +80,7 @@ class VectorEnvs:
         if self._parallel:
             # Not forked from here: threads, GPU contexts and OpenGL do not survive that.
             multiprocessing.set_forkserver_preload(loaded_here())
-            with worker_environment(), _told(self._died):
+            with worker_environment(), _as_worker_errors(self._died):
                 self._envs = AsyncVectorEnv(
                     makers, context="forkserver", copy=False, autoreset_mode=AutoresetMode.DISABLED
                 )
@@ -89,7 +91,7 @@ class VectorEnvs:
 
     def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
         options = self._options | ({} if which is None else {"reset_mask": which})
-        with _told(self._died):
+        with _as_worker_errors(self._died):
             if not self._parallel:
                 return self._envs.reset(seed=list(seeds), options=options or None)[0]
             self._envs.reset_async(seed=list(seeds), options=options or None)
@@ -98,16 +100,15 @@ class VectorEnvs:
     def step(
         self, actions: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        with _told(self._died):
+        with _as_worker_errors(self._died):
             if not self._parallel:
                 return self._envs.step(actions)
             self._envs.step_async(actions)
             return self._envs.step_wait(self._timeout)
 
-    def keep_episodes(self, folder: Path | None, first: int = 0) -> None:
-        """Have environments that change their world write down every episode from now on, each in a
-        new file of its own in a folder: env0.jsonl and so on, counted from `first`. None: no more.
-        """
+    def record_episodes(self, folder: Path | None, first: int = 0) -> None:
+        """Let randomised environments record every episode from now on, each in a new file of its
+        own in a folder: env0.jsonl and so on, counted from `first`. None: record no more."""
         if self._id != RANDOMIZED:
             return
         journals: list[Path | None] = [None] * self.num_envs
@@ -116,24 +117,24 @@ class VectorEnvs:
             journals = [folder / f"env{first + number}.jsonl" for number in range(self.num_envs)]
             for journal in journals:
                 journal.unlink(missing_ok=True)
-        with _told(self._died):
+        with _as_worker_errors(self._died):
             self._envs.set_attr("journal", journals)
 
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:
-        """Episodes begun in here are as hard as the task, whatever makes training easier."""
-        with self._begun_with(full_difficulty(self._id)):
+        """Within this context episodes begin as the task has them, never made easier."""
+        with self._reset_options(full_difficulty(self._id)):
             yield
 
     @contextmanager
-    def looking(self) -> Iterator[None]:
-        """Episodes begun in here, which are not played, begin anywhere that one may lead to."""
-        with self._begun_with({"start": "pretraining"}):
+    def pretraining(self) -> Iterator[None]:
+        """Within this context episodes begin in any state that an episode may lead to."""
+        with self._reset_options({"start": "pretraining"}):
             yield
 
     @contextmanager
-    def _begun_with(self, options: dict[str, Any]) -> Iterator[None]:
-        """Options of the cell's resets; other environments know none of them."""
+    def _reset_options(self, options: dict[str, Any]) -> Iterator[None]:
+        """Resets of this project's environments get these options; others do not know them."""
         self._options = options if self._id in OWN_ENVS else {}
         try:
             yield
@@ -142,7 +143,7 @@ class VectorEnvs:
 
     @property
     def processes(self) -> list[multiprocessing.Process]:
-        """The workers, if there are any."""
+        """The worker processes; none where rl.parallel is false."""
         return self._envs.processes if self._parallel else []
 
     def close(self) -> None:
@@ -160,7 +161,7 @@ class VectorEnvs:
             self._envs.close()
 
     def _died(self) -> str:
-        """Which workers do not live any more."""
+        """A sentence about the workers that have died."""
         if not hasattr(self, "_envs"):
             return "a worker process died while it was started; its message stands above"
         wait([process.sentinel for process in self.processes], timeout=1.0)
@@ -170,8 +171,8 @@ class VectorEnvs:
 
 
 @contextmanager
-def _told(died) -> Iterator[None]:
-    """Turns how Gymnasium reports a lost worker into a WorkerError."""
+def _as_worker_errors(died: Callable[[], str]) -> Iterator[None]:
+    """Turn Gymnasium's errors about a lost worker into WorkerError; `died` describes the loss."""
     try:
         yield
     except (EOFError, BrokenPipeError, ConnectionResetError) as error:
@@ -183,8 +184,8 @@ def _told(died) -> Iterator[None]:
 
 
 def loaded_here() -> list[str]:
-    """Modules that a worker would import, as it imports the script: their common parent does so
-    once for all of them."""
+    """Modules that every worker imports with the script: the workers' common parent imports them
+    once."""
     own = {path.stem for path in REPOSITORY.iterdir() if path.suffix in ("", ".py")}
     names = [name for name in sys.modules if name.partition(".")[0] in own]
     return [*names, "torch.utils.tensorboard"]
@@ -192,8 +193,8 @@ def loaded_here() -> list[str]:
 
 @contextmanager
 def worker_environment() -> Iterator[None]:
-    """Processes started in here find this project, and compute with one thread each: there are as
-    many of them as cores."""
+    """Processes started within this context find this project, and compute with one thread each,
+    because there are as many of them as cores."""
     path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
     changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
     before = {name: os.environ.get(name) for name in changes}
@@ -209,8 +210,8 @@ def worker_environment() -> Iterator[None]:
 
 
 def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> gymnasium.Env:
-    """One environment of the config's section `rl`, with all that is to be seen in its
-    observations. Raises UserError if it cannot be made."""
+    """One environment of the config's section `rl`, whose observations hold all entries that policy
+    and critic see. Raises UserError if it cannot be made."""
     if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     settings = config.rl
@@ -230,7 +231,7 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
     seen = settings.policy_observations, settings.privileged_observations
     wanted = [name for names in (*seen, settings.estimated_observations) for name in names or ()]
-    return Watched(with_info(env, wanted), index)
+    return CheckedEnv(with_info(env, wanted), index)
 
 
 def with_info(env: gymnasium.Env, wanted: Sequence[str]) -> gymnasium.Env:
@@ -275,10 +276,10 @@ class InfoInObservation(gymnasium.ObservationWrapper):
             raise UserError(f"info entry {name!r} is no number or vector: {info[name]!r}") from None
 
 
-class Watched(gymnasium.Wrapper):
-    """Checks what an environment returns, and turns what it raises into one message.
+class CheckedEnv(gymnasium.Wrapper):
+    """Checks the observations of an environment, and turns its errors into one message.
 
-    The message has to be text: an error that cannot be pickled would never leave its process.
+    The message is text, because an error that cannot be pickled would never leave its process.
     """
 
     def __init__(self, env: gymnasium.Env, index: int):
@@ -302,7 +303,7 @@ class Watched(gymnasium.Wrapper):
             result = call()
         except UserError as error:
             raise UserError(f"environment {self._index}: {error}") from None
-        except Exception:  # whatever the environment of a user raises: told with its traceback
+        except Exception:  # a user's environment may raise anything; the message holds its traceback
             raise WorkerError(
                 f"environment {self._index} raised an error:\n{traceback.format_exc()}"
             ) from None

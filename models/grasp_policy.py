@@ -1,7 +1,8 @@
 """GraspPolicyNetwork: RGB-D image and robot state in, a distribution of actions out.
 
-The network knows nothing of environments; `policy_for` fits one to a Gymnasium env's spaces, and
-`load_policy` rebuilds it from a checkpoint. How it learns stands in `models.ppo` (GraspPPO).
+The network knows nothing about environments: `policy_for` fits one to a Gymnasium environment's
+spaces, `make_ppo` makes one with its training (`models.ppo.GraspPPO`), and `load_policy` rebuilds
+one from a checkpoint.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from models.ppo_observations import (
 )
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config import with_current_keys
-from utils.config_schema import RLConfig
+from utils.config_schema import Config, RLConfig
+from utils.distributed import ALONE, Team
 from utils.errors import UserError
 
 __all__ = [
@@ -35,6 +37,7 @@ __all__ = [
     "GraspPolicyNetwork",
     "SavedPolicy",
     "load_policy",
+    "make_ppo",
     "policy_for",
     "save_policy",
 ]
@@ -43,16 +46,16 @@ ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
-PIXEL_STEP = 4  # of pixels whose statistics are taken, along rows and columns; others are alike
+PIXEL_STEP = 4  # every so many rows and columns a pixel enters the statistics
 ESTIMATE_BETA = 0.1  # of the normalised error, from which on the estimates' loss is linear
 LOG_2PI = math.log(2 * math.pi)
 
 
 class ActionDistribution(NamedTuple):
-    """A diagonal Gaussian over latent actions; squashed: the action is the latent's tanh.
+    """A diagonal Gaussian over latent actions; where squashed, the action is the latent's tanh.
 
-    Latents, not actions, are sampled, stored and asked about: an action at the edge of tanh, or
-    clipped to the bounds of the action space, has lost which latent it came from.
+    PPO samples, stores and evaluates latents, not actions: an action at the edge of tanh, or
+    clipped to the bounds of the action space, no longer determines its latent.
 
     mean: (B, A). log_std: (A,).
     """
@@ -88,22 +91,22 @@ def log_tanh_slope(x: torch.Tensor) -> torch.Tensor:
 
 
 class GraspPolicyNetwork(nn.Module):
-    """Policy and critic: an image encoder that both share, and layers of their own.
+    """Policy and critic: a shared image encoder, and fully connected layers of their own.
 
-    image_feature_dim: numbers that an image becomes. state_dim, action_dim: sizes of the state and
-    action vectors. hidden_dim, hidden_layers: units and number of the policy's and of the critic's
-    layers. image_channels: 4 for RGB-D; 0 for a policy without an image. privileged_dim: numbers
-    that only the critic sees (asymmetric actor-critic, Pinto et al., RSS 2018).
-    conv_channels: of the encoder's 3x3 convolutions with stride 2. squash: see ActionDistribution.
-    normalise: by running statistics, see `observe`. relief: the encoder also sees how far each
-    pixel stands out of the image's median depth (that of the table, mostly): a centimetre there is
-    little in the depth of half a metre. The last image channel is then the depth.
+    image_feature_dim: size of the vector that an image is encoded to. state_dim, action_dim: sizes
+    of the state and action vectors. hidden_dim, hidden_layers: units and number of the policy's and
+    of the critic's layers. image_channels: 4 for RGB-D, 0 for a policy without an image.
+    privileged_dim: size of the vector that only the critic sees (asymmetric actor-critic, Pinto et
+    al., RSS 2018). conv_channels: of the encoder's 3x3 convolutions with stride 2. squash: see
+    ActionDistribution. normalise: by running statistics, see `observe`. relief: the encoder gets
+    one more channel, how far each pixel stands out of the image's median depth (mostly the
+    table's), because a centimetre is little in a depth of half a metre; the last image channel must
+    be the depth.
 
-    estimated_dim: of the privileged numbers, the first so many are estimated from image and state
-    by layers of their own, the `eyes`: encoder and estimator. Policy and critic then see these
-    estimates in the image's place, as given numbers: what the eyes learn they learn from
-    `estimate_loss` alone, which is to be brought down while there is a simulator to tell the truth.
-    The policy never sees it.
+    estimated_dim: so many of the privileged numbers, the first ones, are estimated from image and
+    state by the state estimator: the encoder and layers of its own. Policy and critic then see the
+    estimates in the image's place, and their loss does not train the estimator; `estimate_loss`
+    does, as long as a simulator provides the true numbers. The policy never sees those.
 
     Weights start orthogonal, with gain sqrt 2, or 0.01 for the mean and 1 for the value, so that a
     new policy acts around 0 (Huang et al., "The 37 implementation details of PPO", 2022).
@@ -160,8 +163,8 @@ class GraspPolicyNetwork(nn.Module):
         self.register_buffer("action_high", torch.full((action_dim,), 1.0))
 
     def forward(self, image: torch.Tensor | None, state: torch.Tensor) -> ActionDistribution:
-        """What to do. image: (B, C, H, W) colours in 0..1 and depth in metres, or None where there
-        are no image channels; state: (B, S), both as observed: normalising is done in here."""
+        """The policy. image: (B, C, H, W), colours in 0..1 and depth in metres, or None without
+        image channels. state: (B, S). Both as observed: the network normalises them."""
         channels = self.model_args["image_channels"]
         if image is not None and image.shape[1] != channels:
             raise ValueError(f"image: got {image.shape[1]} channels, the network has {channels}")
@@ -170,61 +173,60 @@ class GraspPolicyNetwork(nn.Module):
     def value(
         self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
     ) -> torch.Tensor:
-        """(B,) the expected return; privileged: (B, P), P may be 0."""
+        """(B,) the critic's estimate of the return. privileged: (B, P), P may be 0."""
         return self._value(self.features(image, state), privileged)
 
     def policy_and_value(
         self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
     ) -> tuple[ActionDistribution, torch.Tensor]:
-        """Both at the price of one image encoding."""
-        return self.judged(self.features(image, state), privileged)
+        """Policy and value from one encoding of the image."""
+        return self.policy_and_value_of(self.features(image, state), privileged)
 
-    def judged(
+    def policy_and_value_of(
         self, features: torch.Tensor, privileged: torch.Tensor
     ) -> tuple[ActionDistribution, torch.Tensor]:
         """Policy and value for features (B, F) of `features`."""
         return self._distribution(features), self._value(features, privileged)
 
     def features(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
-        """(B, F) what policy and critic go by: the encoded image, or estimates in its place that
-        pass no gradient on, and the normalised state."""
+        """(B, F) the input of policy and critic: the encoded image, or in its place the estimates
+        (without a gradient), and the normalised state."""
         if self.estimator is None:
-            return self._seen(image, state)
+            return self._encoded(image, state)
         with torch.no_grad():
             return torch.cat([self.estimate(image, state), self._normalised_state(state)], -1)
 
     def estimate(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
-        """(B, E) estimates of the first privileged numbers, in the scale of `truth`."""
-        return self.estimator(self._seen(image, state))
+        """(B, E) estimates of the first privileged numbers, scaled as `truth` scales them."""
+        return self.estimator(self._encoded(image, state))
 
     def estimate_loss(
         self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
     ) -> torch.Tensor:
-        """Scalar: how far the estimates are from the truth, which is among the privileged numbers
-        (B, P)."""
+        """Scalar: the Huber loss of the estimates against the privileged numbers (B, P)."""
         truth = self.truth(privileged)
         return F.smooth_l1_loss(self.estimate(image, state), truth, beta=ESTIMATE_BETA)
 
     def truth(self, privileged: torch.Tensor) -> torch.Tensor:
-        """(B, E) what `estimate` should say where the privileged numbers are (B, P)."""
+        """(B, E) the target of `estimate` for privileged numbers (B, P)."""
         scaled = self.privileged_norm(privileged) if self.normalise else privileged
         return scaled[:, : self.estimated_dim]
 
-    def eyes(self) -> list[nn.Parameter]:
-        """The weights that only `estimate` depends on; none where nothing is estimated."""
+    def estimator_parameters(self) -> list[nn.Parameter]:
+        """The weights of the state estimator; none where nothing is estimated."""
         parts = [self.encoder, self.estimator] if self.estimator is not None else []
         return [p for part in parts if part is not None for p in part.parameters()]
 
     def action(self, latent: torch.Tensor) -> torch.Tensor:
-        """(B, A) what the robot is told for latents: squashed and stretched to the bounds of the
-        action space, or clipped to them."""
+        """(B, A) actions of latents: squashed and stretched to the bounds of the action space, or
+        clipped to them."""
         if self.squash:
             half = (self.action_high - self.action_low) / 2
             return self.action_low + half * (latent.tanh() + 1)
         return torch.minimum(torch.maximum(latent, self.action_low), self.action_high)
 
-    def observe(self, observations: Observations, team) -> None:
-        """Take a rollout's observations into the statistics by which they are normalised."""
+    def observe(self, observations: Observations, team: Team) -> None:
+        """Add a rollout's observations to the statistics that normalise them."""
         if not self.normalise:
             return
         if self.encoder is not None:
@@ -239,7 +241,7 @@ class GraspPolicyNetwork(nn.Module):
     def _normalised_state(self, state: torch.Tensor) -> torch.Tensor:
         return self.state_norm(state) if self.normalise else state
 
-    def _seen(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
+    def _encoded(self, image: torch.Tensor | None, state: torch.Tensor) -> torch.Tensor:
         state = self._normalised_state(state)
         if self.encoder is None:
             return state
@@ -261,8 +263,8 @@ class GraspPolicyNetwork(nn.Module):
 
 
 def relief_of(depth: torch.Tensor) -> torch.Tensor:
-    """(B, 1, H, W) how far each pixel is nearer than the image's median depth, scaled and limited,
-    from depths (B, 1, H, W) in metres."""
+    """(B, 1, H, W) how much nearer each pixel is than the image's median depth, scaled and limited;
+    depth: (B, 1, H, W) in metres."""
     some = depth[:, :, ::PIXEL_STEP, ::PIXEL_STEP].flatten(1)
     rise = some.median(1).values[:, None, None, None] - depth
     return (rise / RELIEF_SCALE).clamp(-RELIEF_LIMIT, RELIEF_LIMIT)
@@ -338,9 +340,30 @@ def policy_for(
     return network
 
 
+def make_ppo(
+    observation_space: spaces.Space, action_space: spaces.Space, config: Config, team: Team = ALONE
+) -> GraspPPO:
+    """A policy in training for the spaces of an environment, with the config's section `rl`: new,
+    or with the weights of rl.initial. config.seed determines new weights. Raises UserError."""
+    settings = config.rl
+    privileged = (
+        *(settings.estimated_observations or ()),  # first: the network estimates the first ones
+        *(settings.privileged_observations or ()),
+    )
+    layout = ObservationLayout.of(observation_space, settings.policy_observations, privileged)
+    torch.manual_seed(config.seed)
+    network = policy_for(layout, action_space, settings)
+    if settings.initial is not None:
+        load_weights(network, load_checkpoint(settings.initial, KIND), settings.initial)
+    return GraspPPO(network, layout, settings, team)
+
+
 class SavedPolicy(NamedTuple):
-    """network: in evaluation mode. layout: what it sees of an environment's observations. extra:
-    anything else plain that was saved. config: that of its training, as plain data."""
+    """A policy from a checkpoint, which is called like a function.
+
+    network: in evaluation mode. layout: the observations that it sees. extra: the checkpoint's
+    other plain entries. config: the training's config, as plain data.
+    """
 
     network: GraspPolicyNetwork
     layout: ObservationLayout
@@ -356,7 +379,7 @@ class SavedPolicy(NamedTuple):
 
 
 def load_policy(path: Path | str) -> SavedPolicy:
-    """The policy of a checkpoint of `GraspPPO.save`, on the CPU. Raises UserError."""
+    """The policy of a checkpoint that `GraspPPO.save` wrote, on the CPU. Raises UserError."""
     checkpoint = load_checkpoint(path, KIND)
     network = GraspPolicyNetwork(**checkpoint["model_args"])
     load_weights(network, checkpoint, path)
@@ -377,7 +400,7 @@ def _current_config(stored: dict) -> dict:
 
 
 def save_policy(path: Path | str, policy: SavedPolicy) -> None:
-    """Write what `load_policy` reads, without what a training needs to go on."""
+    """Write what `load_policy` reads, without what only a resumed training needs."""
     save_checkpoint(
         path,
         kind=KIND,

@@ -1,8 +1,15 @@
 """GraspPPO: proximal policy optimisation of a GraspPolicyNetwork, from rollouts.
 
-The algorithm is Schulman et al., "Proximal policy optimization algorithms" (2017, below "PPO"),
-with the advantages of Schulman et al., "High-dimensional continuous control using generalized
-advantage estimation" (ICLR 2016, below "GAE"). This module never sees an environment.
+Read `GraspPPO.update` first: it prepares a batch (values, then advantages by `compute_gae`), takes
+optimiser steps on `losses`, and trains the state estimator. The sources, cited by these names:
+
+- PPO: Schulman et al., "Proximal policy optimization algorithms" (2017).
+- GAE: Schulman et al., "High-dimensional continuous control using generalized advantage
+  estimation" (ICLR 2016).
+- Details: Huang et al., "The 37 implementation details of proximal policy optimization" (2022).
+- KL: Schulman, "Approximating KL divergence" (2020).
+
+This module never sees an environment.
 """
 
 from __future__ import annotations
@@ -18,21 +25,25 @@ import torch.nn.functional as F
 from torch import nn
 
 from models.ppo_observations import ObservationLayout, Observations, RewardScaler
-from models.ppo_rollouts import NotFinite, Rollout, StepMemory, joined
+from models.ppo_rollouts import NotFinite, Rollout, StepMemory, act, joined
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.config_schema import Config, RLConfig
-from utils.distributed import ALONE
+from utils.distributed import ALONE, Team
 from utils.errors import UserError
 
 KIND = "grasp_policy"
-ADAM_EPSILON = 1e-5  # Huang et al., "The 37 implementation details of PPO" (2022), detail 3
+ADAM_EPSILON = 1e-5  # Details, number 3
 SMALLEST_DEVIATION = 1e-8  # of advantages, so that equal ones do not divide by zero
 KL_SLACK = 1.5  # an update stops beyond this many times the target, as in OpenAI's baselines
 
 
 class Batch(NamedTuple):
-    """B steps to learn from; everything but observations, latents and features is (B,). features:
-    (B, F) of the network where they are given, as its eyes do not learn from this loss."""
+    """B steps to learn from; all but observations, latents and features are (B,).
+
+    latents: (B, A), see `models.grasp_policy.ActionDistribution`. log_probs: of the latents under
+    the policy that drew them. features: (B, F) of the network where it has a state estimator, whose
+    weights this loss does not train; None where the loss trains the encoder too.
+    """
 
     observations: Observations
     latents: torch.Tensor
@@ -50,7 +61,7 @@ Rows = TypeVar("Rows", Batch, Observations)
 
 
 class Losses(NamedTuple):
-    """Parts of a minibatch's loss, and what is watched beside them; scalars."""
+    """A minibatch's loss, its parts, and two measures of how far the policy moved; scalars."""
 
     loss: torch.Tensor
     policy_loss: torch.Tensor
@@ -63,17 +74,28 @@ class Losses(NamedTuple):
 class GraspPPO:
     """A policy in training.
 
-    network: what is trained; it sees observations by `layout`. settings: the config's section `rl`.
-    seed: of everything random in here, which is the order of minibatches and what `generator` is
-    used for by others. In a team every process brings its own rollouts, and gradients are averaged,
-    so that together they take the step of the joint minibatch.
+    network: the GraspPolicyNetwork that is trained; it sees observations by `layout`. settings: the
+    config's section `rl`. seed: names this object's randomness, which is the order of minibatches
+    and what callers draw from `generator`. In a team every process brings its own rollouts, and
+    gradients are averaged, so that together the processes take the step of the joint minibatch.
+
+    `models.grasp_policy.make_ppo(observation_space, action_space, config)` makes both from an
+    environment's spaces.
     """
 
-    def __init__(self, network, layout: ObservationLayout, settings: RLConfig, team=ALONE, seed=0):
-        if not isinstance(network, nn.Module):
+    def __init__(
+        self,
+        network: nn.Module,
+        layout: ObservationLayout | None = None,
+        settings: RLConfig | None = None,
+        team: Team = ALONE,
+        seed: int = 0,
+    ):
+        if not isinstance(network, nn.Module) or layout is None or settings is None:
             raise TypeError(
-                f"GraspPPO: got {network!r} for a network; make it from the environment's spaces by "
-                "models.grasp_policy.policy_for, and call GraspPPO(network, layout, settings)"
+                f"GraspPPO: got {network!r} for a network; make one with its training by "
+                "models.grasp_policy.make_ppo(env.observation_space, env.action_space, config), or "
+                "a network alone by GraspPolicyNetwork(512, 14, 7)"
             )
         if settings.batch_size % team.ranks or settings.envs % team.ranks:
             raise UserError(
@@ -85,37 +107,26 @@ class GraspPPO:
         self.rewards = RewardScaler(settings.gamma).to(team.device)
         self.updates = 0
         self.generator = torch.Generator()
-        # Not in a checkpoint: cleared at every one, so that going on from it is as going on.
+        # Not in a checkpoint: it is cleared at every one, so that a resumed run equals a whole one.
         self.memory = StepMemory(settings.estimate_memory)
         team.share_weights(network)
-        eyes = self.network.eyes()
-        theirs = {id(p) for p in eyes}
-        self.weights = in_one_vector([p for p in self.network.parameters() if id(p) not in theirs])
+        of_estimator = self.network.estimator_parameters()
+        ids = {id(p) for p in of_estimator}
+        self.weights = in_one_vector([p for p in self.network.parameters() if id(p) not in ids])
         self.optimizer = torch.optim.Adam([self.weights], settings.lr, eps=ADAM_EPSILON, fused=True)
-        self.eyes = self.eyes_optimizer = None
-        if eyes:
-            self.eyes = in_one_vector(eyes)
-            self.eyes_optimizer = torch.optim.Adam([self.eyes], settings.estimate_lr, fused=True)
+        self.estimator_weights = self.estimator_optimizer = None
+        if of_estimator:
+            self.estimator_weights = in_one_vector(of_estimator)
+            self.estimator_optimizer = torch.optim.Adam(
+                [self.estimator_weights], settings.estimate_lr, fused=True
+            )
 
-    @staticmethod
-    def compute_gae(
-        rewards: np.ndarray, values: np.ndarray, next_values: np.ndarray,
-        terminated: np.ndarray, ended: np.ndarray, gamma: float, lamda: float,
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Advantages and returns, (T, N) each; GAE equations 11 to 16.
+    def action(self, observation: Any) -> np.ndarray:
+        """(A,) the deterministic action for one observation of one environment."""
+        latent = act(self.network, self.layout.read_one(observation), None, self.team.device)
+        return self.network.action(latent.to(self.team.device))[0].cpu().numpy()
 
-        values: V(s_t); next_values: V of the observation after the step, which is the *final* one
-        where an episode ended. terminated: nothing comes after, so that V counts as 0; ended:
-        terminated or truncated, the sum over future errors ends there either way. All (T, N).
-        """
-        advantages = np.empty_like(values)
-        errors = rewards + gamma * next_values * ~terminated - values
-        carried = gamma * lamda * ~ended
-        advantage = np.zeros_like(values[0])
-        for t in reversed(range(len(values))):
-            advantage = errors[t] + carried[t] * advantage
-            advantages[t] = advantage
-        return advantages, advantages + values
+    # --- An update ------------------------------------------------------------------------------
 
     def update(self, rollout: Rollout, progress: float = 0.0) -> dict[str, float]:
         """Learn from a rollout: several passes over it in shuffled minibatches.
@@ -130,7 +141,7 @@ class GraspPPO:
         lr = self.settings.lr * left
         for group in self.optimizer.param_groups:
             group["lr"] = lr
-        watched: list[torch.Tensor] = []
+        parts: list[torch.Tensor] = []
         norms: list[float] = []
         for minibatch in self._minibatches(batch, len(batch.latents), self.settings.epochs):
             losses = self.losses(minibatch)
@@ -140,60 +151,103 @@ class GraspPPO:
                     f"a gradient is not finite at update {self.updates} (loss "
                     f"{losses.loss.item():.3g}, of the value {losses.value_loss.item():.3g})"
                 )
-            watched.append(torch.stack([part.detach() for part in losses]))
+            parts.append(torch.stack([part.detach() for part in losses]))
             norms.append(norm)
             if self._too_far(losses.approx_kl):
                 break
             self.optimizer.step()
-        seeing = {}
-        if self.eyes is not None:
+        estimates = {}
+        if self.estimator_weights is not None:
             rate = self.settings.estimate_lr * left
-            seeing["estimate_loss"] = self.learn_to_see(self._flat(rollout), rate)
-        # Only now, so that all of the rollout and its update saw the same normalised numbers.
+            estimates["estimate_loss"] = self.update_estimator(self._flat(rollout), rate)
+        # Only now, so that the rollout and its update use the same statistics for normalising.
         self.network.observe(self._flat(rollout), self.team)
         self.updates += 1
-        means = self.team.gather(torch.stack(watched).mean(0)).mean(0).tolist()
+        means = self.team.gather(torch.stack(parts).mean(0)).mean(0).tolist()
         return dict(zip(Losses._fields, means)) | {
             "gradient_norm": float(np.mean(norms)),
             "explained_variance": explained_variance,
             "std": self.network.log_std.detach().exp().mean().item(),
             "learning_rate": lr,
-            "minibatches": float(len(watched)),
-            **seeing,
+            "minibatches": float(len(parts)),
+            **estimates,
         }
 
-    def learn_to_see(self, new: Observations, rate: float) -> float:
-        """Bring the network's estimates closer to the truth for observations (B, ...) and some that
-        are remembered; the mean loss. rate: of learning."""
-        for group in self.eyes_optimizer.param_groups:
-            group["lr"] = rate
-        watched = []
-        for seen in self._new_and_remembered(new):
-            loss = self.network.estimate_loss(seen.image(), seen.state, seen.privileged)
-            norm = self.gradient(loss, self.eyes)
-            if not math.isfinite(norm):
-                raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
-            self.eyes_optimizer.step()
-            watched.append(loss.detach())
-        self.memory.add(new)
-        return self.team.gather(torch.stack(watched).mean()).mean().item()
+    def _prepare(self, rollout: Rollout) -> tuple[Batch, float]:
+        """The batch that an update learns from, and the share of the returns' variance that the
+        critic explains."""
+        steps, envs = rollout.rewards.shape
+        device = self.team.device
+        observations = self._flat(rollout)
+        latents = rollout.latents.flatten(0, 1).to(device)
+        log_probs, values, features = self._evaluate(observations, latents)
+        values = values.cpu().numpy().reshape(steps, envs)
+        # V of the observation after each step: the next one's, the last one's, or the final one's
+        # of an episode that was truncated.
+        after = joined([rollout.cut_final, rollout.last]).map(lambda part: part.to(device))
+        _, after_values, _ = self._evaluate(after)
+        after_values = after_values.cpu().numpy()
+        next_values = np.concatenate([values[1:], after_values[None, -envs:]])
+        for (t, env), value in zip(rollout.cut, after_values):
+            next_values[t, env] = value
+        ended = rollout.terminated | rollout.truncated
+        rewards = rollout.rewards
+        if self.settings.normalise_rewards:
+            rewards = self.rewards.scale(rewards, ended, self.team)
+        advantages, returns = self.compute_gae(
+            rewards.astype(np.float32), values, next_values, rollout.terminated, ended,
+            self.settings.gamma, self.settings.gae_lambda,
+        )  # fmt: skip
+        if self.estimator_weights is None:
+            features = None
+        else:
+            observations = observations._replace(images=())
+        batch = Batch(
+            observations, latents, log_probs,
+            *(torch.from_numpy(x.ravel()).to(device) for x in (advantages, returns)), features,
+        )  # fmt: skip
+        spread = float(returns.var())
+        return batch, 1 - float((returns - values).var()) / spread if spread else 0.0
 
-    @torch.no_grad()
-    def estimate_loss(self, seen: Observations) -> float:
-        """What the estimates for observations (B, ...) are worth now."""
-        size, losses = self.settings.batch_size, []
-        for start in range(0, len(seen.state), size):
-            part = seen.rows(slice(start, start + size))
-            losses.append(self.network.estimate_loss(part.image(), part.state, part.privileged))
-        return self.team.gather(torch.stack(losses).mean()).mean().item()
+    @staticmethod
+    def compute_gae(
+        rewards: np.ndarray, values: np.ndarray, next_values: np.ndarray,
+        terminated: np.ndarray, ended: np.ndarray, gamma: float, lamda: float,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Advantages and returns, (T, N) each; GAE, equations 11 to 16.
 
-    def _new_and_remembered(self, new: Observations) -> Iterator[Observations]:
-        """Minibatches of steps (B, ...), each with `estimate_recall` times as many from
-        rollouts before it, as soon as there are some."""
-        settings = self.settings
-        for seen in self._minibatches(new, len(new.state), settings.estimate_epochs):
-            count = settings.estimate_recall * len(seen.state)
-            yield joined([seen, self.memory.draw(count, self.generator)]) if self.memory else seen
+        values: V(s_t); next_values: V of the observation after the step, which is the *final* one
+        where an episode ended. terminated: nothing comes after the step, so that V counts as 0.
+        ended: terminated or truncated; the sum over future errors ends there. All (T, N).
+        """
+        advantages = np.empty_like(values)
+        errors = rewards + gamma * next_values * ~terminated - values
+        carried = gamma * lamda * ~ended
+        advantage = np.zeros_like(values[0])
+        for t in reversed(range(len(values))):
+            advantage = errors[t] + carried[t] * advantage
+            advantages[t] = advantage
+        return advantages, advantages + values
+
+    def losses(self, batch: Batch) -> Losses:
+        """The loss of a minibatch: PPO, equation 9 with the clipped objective of equation 7, signs
+        turned for minimising."""
+        settings, advantages = self.settings, self._normalised(batch.advantages)
+        seen, features = batch.observations, batch.features
+        if features is None:
+            features = self.network.features(seen.image(), seen.state)
+        distribution, values = self.network.policy_and_value_of(features, seen.privileged)
+        log_ratio = distribution.log_prob(batch.latents) - batch.log_probs
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1 - settings.clip_epsilon, 1 + settings.clip_epsilon)
+        policy_loss = -torch.minimum(ratio * advantages, clipped * advantages).mean()
+        value_loss = F.mse_loss(values, batch.returns)
+        entropy = distribution.entropy(self._entropy_noise(batch.latents)).mean()
+        loss = policy_loss + settings.value_coef * value_loss - settings.entropy_coef * entropy
+        with torch.no_grad():
+            approx_kl = (ratio - 1 - log_ratio).mean()  # KL: k3, unbiased and of low variance
+            clip_fraction = (ratio != clipped).float().mean()
+        return Losses(loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
 
     def gradient(self, loss: torch.Tensor, weights: nn.Parameter | None = None) -> float:
         """Put the gradient of a loss, averaged over the team, in `grad` of the weights (None: those
@@ -207,82 +261,24 @@ class GraspPPO:
             gradient.mul_(self.settings.max_gradient_norm / norm)
         return norm
 
-    def losses(self, batch: Batch) -> Losses:
-        """The loss of a minibatch: PPO equation 9 with the clipped objective of equation 7, signs
-        turned for minimising."""
-        settings, advantages = self.settings, self._normalised(batch.advantages)
-        seen, features = batch.observations, batch.features
-        if features is None:
-            features = self.network.features(seen.image(), seen.state)
-        distribution, values = self.network.judged(features, seen.privileged)
-        log_ratio = distribution.log_prob(batch.latents) - batch.log_probs
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1 - settings.clip_epsilon, 1 + settings.clip_epsilon)
-        policy_loss = -torch.minimum(ratio * advantages, clipped * advantages).mean()
-        value_loss = F.mse_loss(values, batch.returns)
-        entropy = distribution.entropy(self._entropy_noise(batch.latents)).mean()
-        loss = policy_loss + settings.value_coef * value_loss - settings.entropy_coef * entropy
-        with torch.no_grad():
-            # The estimator of KL(old, new) with the least variance (Schulman's note on it, 2020).
-            approx_kl = (ratio - 1 - log_ratio).mean()
-            clip_fraction = (ratio != clipped).float().mean()
-        return Losses(loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
-
-    def _prepare(self, rollout: Rollout) -> tuple[Batch, float]:
-        """What an update learns from, and the share of the returns' variance that the critic had
-        foreseen."""
-        steps, envs = rollout.rewards.shape
-        device = self.team.device
-        observations = self._flat(rollout)
-        latents = rollout.latents.flatten(0, 1).to(device)
-        log_probs, values, features = self._judge(observations, latents)
-        after = Observations(
-            *(
-                (tuple(map(torch.cat, zip(a, b))) if isinstance(a, tuple) else torch.cat([a, b]))
-                for a, b in zip(rollout.cut_final, rollout.last)
-            )
-        ).map(lambda part: part.to(device))
-        _, after_values, _ = self._judge(after)
-        after_values = after_values.cpu().numpy()
-        values = values.cpu().numpy().reshape(steps, envs)
-        next_values = np.concatenate([values[1:], after_values[None, -envs:]])
-        for (t, env), value in zip(rollout.cut, after_values):
-            next_values[t, env] = value
-        ended = rollout.terminated | rollout.truncated
-        rewards = rollout.rewards
-        if self.settings.normalise_rewards:
-            rewards = self.rewards.scale(rewards, ended, self.team)
-        advantages, returns = self.compute_gae(
-            rewards.astype(np.float32), values, next_values, rollout.terminated, ended,
-            self.settings.gamma, self.settings.gae_lambda,
-        )  # fmt: skip
-        if self.eyes is None:
-            features = None
-        else:
-            observations = observations._replace(images=())
-        batch = Batch(
-            observations, latents, log_probs,
-            *(torch.from_numpy(x.ravel()).to(device) for x in (advantages, returns)), features,
-        )  # fmt: skip
-        spread = float(returns.var())
-        return batch, 1 - float((returns - values).var()) / spread if spread else 0.0
+    # --- Parts of an update ---------------------------------------------------------------------
 
     def _flat(self, rollout: Rollout) -> Observations:
         """The observations of a rollout's steps, (T * N, ...), on the device."""
         return rollout.observations.map(lambda part: part.flatten(0, 1).to(self.team.device))
 
     @torch.no_grad()
-    def _judge(
+    def _evaluate(
         self, observations: Observations, latents: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """(B,) log-probabilities of latents, values, and (B, F) features; a part at a time to bound
-        the memory."""
+        """(B,) log-probabilities of latents, values, and (B, F) features; computed a part at a time
+        to bound the memory."""
         size = self.settings.batch_size
         log_probs, values, features = [], [], []
         for start in range(0, len(observations.state), size):
             part = observations.map(lambda whole: whole[start : start + size])  # noqa: B023
             features.append(self.network.features(part.image(), part.state))
-            distribution, value = self.network.judged(features[-1], part.privileged)
+            distribution, value = self.network.policy_and_value_of(features[-1], part.privileged)
             values.append(value)
             if latents is not None:
                 log_probs.append(distribution.log_prob(latents[start : start + size]))
@@ -299,28 +295,68 @@ class GraspPPO:
                 yield shuffled.rows(slice(start, start + size))
 
     def _normalised(self, advantages: torch.Tensor) -> torch.Tensor:
-        """Advantages with zero mean and unit deviation over the joint minibatch."""
+        """Advantages with zero mean and unit deviation over the joint minibatch (Details, number
+        7)."""
         joint = self.team.gather(advantages)
         if joint.numel() == 1:
             return advantages
         return (advantages - joint.mean()) / (joint.std() + SMALLEST_DEVIATION)
 
     def _entropy_noise(self, latents: torch.Tensor) -> torch.Tensor | None:
-        """What the entropy of a squashed policy is estimated by."""
+        """Standard normal noise, from which a squashed policy's entropy is estimated."""
         if not self.network.squash:
             return None
         return torch.randn(latents.shape, generator=self.generator).to(latents.device)
 
     def _too_far(self, approx_kl: torch.Tensor) -> bool:
+        """Whether the update has moved the policy so far that it has to stop."""
         target = self.settings.target_kl
         if target is None:
             return False
         return float(self.team.gather(approx_kl.detach()).mean()) > KL_SLACK * target
 
+    # --- The state estimator --------------------------------------------------------------------
+
+    def update_estimator(self, new: Observations, rate: float) -> float:
+        """Train the estimates on new observations (B, ...) and remembered ones; returns the mean
+        loss. rate: learning rate."""
+        for group in self.estimator_optimizer.param_groups:
+            group["lr"] = rate
+        losses = []
+        for seen in self._new_and_remembered(new):
+            loss = self.network.estimate_loss(seen.image(), seen.state, seen.privileged)
+            norm = self.gradient(loss, self.estimator_weights)
+            if not math.isfinite(norm):
+                raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
+            self.estimator_optimizer.step()
+            losses.append(loss.detach())
+        self.memory.add(new)
+        return self.team.gather(torch.stack(losses).mean()).mean().item()
+
+    @torch.no_grad()
+    def estimate_loss(self, seen: Observations) -> float:
+        """The loss of the estimates for observations (B, ...), without learning from them."""
+        size, losses = self.settings.batch_size, []
+        for start in range(0, len(seen.state), size):
+            part = seen.rows(slice(start, start + size))
+            losses.append(self.network.estimate_loss(part.image(), part.state, part.privileged))
+        return self.team.gather(torch.stack(losses).mean()).mean().item()
+
+    def _new_and_remembered(self, new: Observations) -> Iterator[Observations]:
+        """Minibatches of new steps, each with `estimate_recall` times as many from earlier
+        rollouts, as soon as there are some."""
+        settings = self.settings
+        for seen in self._minibatches(new, len(new.state), settings.estimate_epochs):
+            count = settings.estimate_recall * len(seen.state)
+            yield joined([seen, self.memory.draw(count, self.generator)]) if self.memory else seen
+
     # --- Checkpoints ----------------------------------------------------------------------------
 
     def save(self, path: Path, config: Config | None = None, **extra: Any) -> None:
-        """Everything that `load` needs to go on, and `load_policy` to act."""
+        """Write everything that `load` needs to continue, and `load_policy` to act."""
+        state = {"layout": self.layout.to_plain(), "rewards": self.rewards.state_dict()}
+        if self.estimator_optimizer is not None:
+            state["estimator"] = self.estimator_optimizer.state_dict()
         save_checkpoint(
             path,
             kind=KIND,
@@ -329,17 +365,12 @@ class GraspPPO:
             optimizer=self.optimizer,
             step=self.updates,
             config=None if config is None else config.model_dump(mode="json"),
-            extra={
-                "layout": self.layout.to_plain(),
-                "rewards": self.rewards.state_dict(),
-                **({} if self.eyes is None else {"eyes": self.eyes_optimizer.state_dict()}),
-                **extra,
-            },
+            extra={**state, **extra},
         )
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Go on from a checkpoint of `save`; returns its extra entries. UserError if it does not
-        fit."""
+        """Continue from a checkpoint of `save`; returns its extra entries. Raises UserError if the
+        checkpoint does not fit."""
         checkpoint = load_checkpoint(
             path, KIND, model_args=self.network.model_args, map_location=self.team.device
         )
@@ -351,8 +382,8 @@ class GraspPPO:
         load_weights(self.network, checkpoint, path)
         self.rewards.load_state_dict(extra["rewards"])
         self.optimizer.load_state_dict(checkpoint["optimizer"])
-        if self.eyes is not None:
-            self.eyes_optimizer.load_state_dict(extra["eyes"])
+        if self.estimator_optimizer is not None:
+            self.estimator_optimizer.load_state_dict(extra["estimator"])
         self.updates = checkpoint["step"]
         return extra
 
@@ -361,8 +392,8 @@ def in_one_vector(parameters: list[nn.Parameter]) -> nn.Parameter:
     """Lay weights and their gradients side by side: the parameters become views of the vector
     returned, their gradients views of its `grad`.
 
-    So that a norm, a step of the optimiser or a message between processes is one operation, which
-    counts for small networks; that the gradient is clipped as a whole needs no care either.
+    A norm, a step of the optimiser or a message between processes is then one operation, which
+    counts for small networks, and the gradient is clipped as a whole.
     """
     whole = nn.Parameter(torch.cat([p.detach().flatten() for p in parameters]))
     whole.grad = torch.zeros_like(whole)

@@ -1,12 +1,10 @@
-"""Which parts of an environment's observations the networks see, and as what.
+"""Observations as networks see them: their layout, and running statistics that normalise them.
 
-Observations arrive as batched NumPy arrays, one of them or a dict, and are kept as they are (images
-as bytes) until a network needs them. This module knows Gymnasium's spaces, no environment.
-
-Running statistics that bring observations and rewards to a scale that networks like.
-
-They are modules whose buffers travel with the weights, so no checkpoint can lose them. Statistics
-change between rollouts only: within one, and in the update from it, a number always means the same.
+Observations arrive as batched NumPy arrays, one array or a dict, and keep their types (images stay
+bytes) until a network needs them. The statistics of `ObservationNormaliser` and `RewardScaler` are
+buffers of modules, so that they are saved with the weights; they change between rollouts only, so
+that within a rollout and its update a number always has the same meaning. This module knows
+Gymnasium's spaces, no environment.
 """
 
 from __future__ import annotations
@@ -29,21 +27,22 @@ RENAMED_OBSERVATIONS = {"squeeze": "opening_error"}
 
 
 class Observations(NamedTuple):
-    """A batch. images: each (B, H, W, C), uint8 or float32. state: (B, S) float32, what the policy
-    sees besides. privileged: (B, P) float32, what only the critic sees."""
+    """A batch. images: each (B, H, W, C), uint8 or float32. state: (B, S) float32, all else that
+    the policy sees. privileged: (B, P) float32, what only the critic sees."""
 
     images: tuple[torch.Tensor, ...]
     state: torch.Tensor
     privileged: torch.Tensor
 
     def image(self) -> torch.Tensor | None:
-        """(B, C, H, W) float32 all images behind one another, bytes as 0..1; None without any."""
+        """(B, C, H, W) float32, the channels of all images in order, bytes as 0..1; None without
+        images."""
         if not self.images:
             return None
         sizes = [image.shape[-1] for image in self.images]
         whole = self.state.new_empty(*self.images[0].shape[:-1], sum(sizes))
         for image, channels in zip(self.images, whole.split(sizes, -1)):
-            channels.copy_(image)  # into place at once: memory is what images cost
+            channels.copy_(image)  # without a copy in between: images need much memory
             if image.dtype == torch.uint8:
                 channels.div_(255)
         return whole.movedim(-1, 1)
@@ -91,7 +90,7 @@ class ObservationLayout:
         for key, box in boxes.items():
             if not isinstance(box, spaces.Box):
                 raise UserError(
-                    f"observation {key!r} is {box}; only a Box, or a Dict of Boxes, can be seen"
+                    f"observation {key!r} is {box}; expected a Box, or a Dict of Boxes"
                 )
         privileged_keys = privileged_keys or ()
         if policy_keys is None:
@@ -187,7 +186,7 @@ class ObservationLayout:
         return None
 
     def to_plain(self) -> dict[str, Any]:
-        """For a checkpoint; `from_plain` reads it."""
+        """Plain data for a checkpoint, which `from_plain` reads."""
         return {
             name: [[part.key, list(part.shape), part.dtype] for part in getattr(self, name)]
             for name in ("images", "state", "privileged")

@@ -1,8 +1,8 @@
-"""StepMemory: the latest steps that were observed, to learn to see from more than once.
+"""Stepping many environments with a policy: rollouts to learn from, and deterministic evaluation.
 
-Stepping many environments with a policy: rollouts to learn from, and deterministic evaluation.
-
-`VectorEnvs` says what is expected of the environments; who they are is not known here.
+`VectorEnvs` is the interface of the environments; this module makes none. `RolloutCollector`
+collects rollouts, `evaluate_policy` plays whole episodes, `StepMemory` keeps past steps for the
+state estimator.
 """
 
 from __future__ import annotations
@@ -18,43 +18,9 @@ from models.ppo_observations import ObservationLayout, Observations
 from utils.errors import UserError
 from utils.runs import Stopwatch
 
-
-class StepMemory:
-    """Holds the last `size` steps; the oldest make room for new ones."""
-
-    def __init__(self, size: int):
-        self.size = size
-        self.clear()
-
-    def __len__(self) -> int:
-        return self._held
-
-    def clear(self) -> None:
-        self._room: Observations | None = None
-        self._held = self._next = 0
-
-    def add(self, steps: Observations) -> None:
-        """Remember steps (B, ...); of more than `size` the last ones."""
-        count = min(len(steps.state), self.size)
-        if count == 0:
-            return
-        steps = steps.rows(slice(len(steps.state) - count, None))
-        if self._room is None:
-            self._room = steps.map(lambda part: part.new_empty(self.size, *part.shape[1:]))
-        places = (torch.arange(count, device=steps.state.device) + self._next) % self.size
-        for rooms, parts in ((self._room.images, steps.images), (self._room[1:], steps[1:])):
-            for room, part in zip(rooms, parts):
-                room[places] = part
-        self._next = (self._next + count) % self.size
-        self._held = min(self._held + count, self.size)
-
-    def draw(self, count: int, generator: torch.Generator) -> Observations:
-        """Steps (count, ...) drawn with repetition from those held, of which there must be some."""
-        index = torch.randint(self._held, (count,), generator=generator)
-        return self._room.map(lambda part: part[index.to(part.device)])
-
-
-SIMULATION, NETWORK = "simulation", "network"  # what the stopwatch tells apart
+SIMULATION, NETWORK = "simulation", "network"  # parts of the time that the stopwatch separates
+# Purposes of seeds (`derived_seeds`), no two of which share a seed: FRESH scores a trained policy.
+TRAINING, EVALUATION, LEARNING, FRESH, PRETRAINING = range(5)
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
 
 
@@ -76,7 +42,7 @@ class VectorEnvs(Protocol):
 
 
 class NotFinite(UserError):
-    """A number from an environment or of the learning is no number; no weight has taken it in."""
+    """An environment or an update produced NaN or infinity; no weight has been changed by it."""
 
 
 class Episode(NamedTuple):
@@ -108,7 +74,8 @@ class Rollout:
 
 
 class RolloutCollector:
-    """Collects rollouts of `steps` steps, each going on where the one before stopped."""
+    """Collects rollouts of `steps` steps of each environment; each rollout continues the one before
+    it."""
 
     def __init__(
         self, envs: VectorEnvs, layout: ObservationLayout, steps: int, device: torch.device,
@@ -189,23 +156,8 @@ def act(
         return latent.cpu()
 
 
-def collect_looks(
-    envs: VectorEnvs, layout: ObservationLayout, count: int, seeds: Sequence[int | None]
-) -> Observations:
-    """(count * N, ...) what N environments show at the beginning of `count` episodes each; the
-    first ones have these seeds. Raises NotFinite."""
-    looks = layout.empty(count, envs.num_envs)
-    for number in range(count):
-        observation = envs.restart(seeds if number == 0 else [None] * envs.num_envs)
-        bad = layout.bad_number(observation)
-        if bad is not None:
-            raise NotFinite(f"the observation {bad[0]!r} of environment {bad[1]} is not finite")
-        layout.write(observation, looks.map(lambda part: part[number]))  # noqa: B023
-    return looks.map(lambda part: part.flatten(0, 1))
-
-
 def joined(parts: Sequence[Observations]) -> Observations:
-    """Batches behind one another."""
+    """Batches (B, ...) as one."""
     return Observations(
         tuple(torch.cat(images) for images in zip(*(part.images for part in parts))),
         torch.cat([part.state for part in parts]),
@@ -244,10 +196,10 @@ def evaluate_policy(
     device: torch.device, watch: Stopwatch,
 ) -> list[Episode]:  # fmt: skip
     """Deterministic episodes, one from each seed and in that order, whatever the number of
-    environments. Whatever they were doing is dropped: restart them all before going on."""
+    environments. Episodes under way are dropped: restart all environments afterwards."""
     count = envs.num_envs
     episodes: list[Episode | None] = [None] * len(seeds)
-    at = np.arange(count)  # which seed each environment is on; beyond the last one it idles
+    at = np.arange(count)  # index of each environment's seed; beyond the last seed it idles
     tally, room = Tally(count), layout.empty(count)
 
     def seed(env: int) -> int:
@@ -282,6 +234,42 @@ def evaluate_policy(
 
 
 def derived_seeds(count: int, *place: int) -> list[int]:
-    """`count` seeds for a place such as (run's seed, purpose, rank, update); other places get
-    unrelated ones."""
+    """`count` seeds for a place such as (run's seed, purpose, rank, update), unrelated to those of
+    any other place."""
     return np.random.SeedSequence(place).generate_state(count).tolist()
+
+
+class StepMemory:
+    """The last `size` steps that were observed; new steps replace the oldest."""
+
+    def __init__(self, size: int):
+        self.size = size
+        self.clear()
+
+    def __len__(self) -> int:
+        return self._held
+
+    def clear(self) -> None:
+        """Forget all steps."""
+        self._room: Observations | None = None
+        self._held = self._next = 0
+
+    def add(self, steps: Observations) -> None:
+        """Remember steps (B, ...); of more than `size` the last ones."""
+        count = min(len(steps.state), self.size)
+        if count == 0:
+            return
+        steps = steps.rows(slice(len(steps.state) - count, None))
+        if self._room is None:
+            self._room = steps.map(lambda part: part.new_empty(self.size, *part.shape[1:]))
+        places = (torch.arange(count, device=steps.state.device) + self._next) % self.size
+        for rooms, parts in ((self._room.images, steps.images), (self._room[1:], steps[1:])):
+            for room, part in zip(rooms, parts):
+                room[places] = part
+        self._next = (self._next + count) % self.size
+        self._held = min(self._held + count, self.size)
+
+    def draw(self, count: int, generator: torch.Generator) -> Observations:
+        """Steps (count, ...) drawn with repetition from those held, of which there must be some."""
+        index = torch.randint(self._held, (count,), generator=generator)
+        return self._room.map(lambda part: part[index.to(part.device)])

@@ -15,7 +15,7 @@ from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
 from envs.rounds import run_round
 from envs.simulators import make_cell
-from envs.vector_env import vector_envs
+from envs.vector_env import training_envs
 from utils.config import load_config
 from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
@@ -538,7 +538,7 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
         ["rl.env_id=RandomizedGrasping-v0", "rl.parallel=false", "env.observations=state",
          "env.max_steps=1", "env.substeps=1", "sim.renderer=tiny"],
     )  # fmt: skip
-    with vector_envs(config, 2) as several:
+    with training_envs(config, 2) as several:
         several.keep_episodes(tmp_path / "episodes", first=2)
         several.restart([1, 2])
         still = np.zeros((2, *several.action_space.shape), np.float32)

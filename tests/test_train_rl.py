@@ -18,10 +18,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import train_rl
 from envs.studio import film_episode
-from envs.vector_env import WorkerError, make_env, vector_envs
-from models.grasp_policy import GraspPPO, load_policy
+from envs.vector_env import WorkerError, make_env, training_envs
+from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo import KIND
-from models.ppo_rollouts import evaluate_policy
+from models.ppo_rollouts import EVALUATION, derived_seeds, evaluate_policy
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
 from tests.helpers.ppo_step import SIZE, take_step
@@ -69,13 +69,13 @@ def test_a_training_leaves_all_its_files(finished):
     assert last["config"]["rl"]["hidden_dim"] == 8
 
 
-def test_the_metrics_of_tensorboard_keep_their_names(finished):
+def test_curves_name_their_units_and_whether_episodes_were_training(finished):
     events = EventAccumulator(str(finished / "tensorboard")).Reload()
     assert set(events.Tags()["scalars"]) == {
-        "evaluation/return", "evaluation/length", "evaluation/success",
-        "rollout/return", "rollout/length", "rollout/success",
-        "update/loss", "update/policy_loss", "update/value_loss", "update/entropy",
-        "update/approx_kl", "update/clip_fraction", "update/gradient_norm",
+        "evaluation/return", "evaluation/length_steps", "evaluation/success_share",
+        "training/return", "training/length_steps", "training/success_share",
+        "update/loss", "update/policy_loss", "update/value_loss", "update/entropy_nats",
+        "update/approx_kl_nats", "update/clip_fraction", "update/gradient_norm",
         "update/explained_variance", "update/std", "update/learning_rate", "update/minibatches",
         "time/steps_per_second",
     }  # fmt: skip
@@ -89,7 +89,7 @@ def test_the_evaluation_of_the_best_policy_can_be_repeated(finished):
     policy = load_policy(finished / "best.pt")
     env = make_env(load_config(None, POINT))
     totals = []
-    for seed in train_rl.derived_seeds(3, 0, train_rl.EVALUATION):
+    for seed in derived_seeds(3, 0, EVALUATION):
         observation, _ = env.reset(seed=seed)
         total, done = 0.0, False
         while not done:
@@ -116,7 +116,7 @@ def test_evaluations_are_at_full_difficulty():
     seen = "rl.policy_observations=[state,end_effector_position]"
     settings = ["rl.parallel=false", "env.near_share=1", "env.observations=[state]", seen]
     config = load_config(None, settings)
-    with vector_envs(config, 2) as envs:
+    with training_envs(config, 2) as envs:
         training = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
         with envs.at_full_difficulty():
             evaluated = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
@@ -129,20 +129,21 @@ def test_evaluations_are_at_full_difficulty():
 ESTIMATED = [
     "rl.env_kwargs=images=true", "rl.policy_observations=[rgb,depth,state]",
     "rl.estimated_observations=goal", "rl.normalise_observations=false",
+    "rl.conv_channels=[8,16]", "rl.image_feature_dim=32",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("memory, looks", [(0, 0), (48, 0), (48, 128)])
-def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory, looks):
+@pytest.mark.parametrize("memory, images", [(0, 0), (48, 0), (48, 128)])
+def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory, images):
     monkeypatch.chdir(tmp_path)
     whole = [*POINT, *ESTIMATED, "rl.total_steps=128", f"rl.estimate_memory={memory}",
-             f"rl.pretraining_images={looks}"]  # fmt: skip
+             f"rl.pretraining_images={images}"]  # fmt: skip
     assert train_rl.main([*whole, "rl.name=whole"]) == 0
     (run,) = Path("runs/train_rl").glob("*-whole")
     expected = load_checkpoint(run / "last.pt", KIND)["model"]
 
     stopped_at = train_rl.reached
-    monkeypatch.setattr(train_rl, "reached", lambda config, row: row["step"] == 64)
+    monkeypatch.setattr(train_rl, "reached", lambda settings, row: row["step"] == 64)
     assert train_rl.main([*whole, "rl.name=halves"]) == 0
     monkeypatch.setattr(train_rl, "reached", stopped_at)
     (half,) = Path("runs/train_rl").glob("*-halves")
@@ -153,7 +154,7 @@ def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory,
         assert torch.equal(found[name], value), name
 
 
-def test_the_eyes_learn_where_the_goal_is(tmp_path, monkeypatch):
+def test_the_estimator_learns_where_the_goal_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     longer = [*POINT, *ESTIMATED, "rl.total_steps=4096", "rl.rollout_steps=128", "rl.lr=1e-4",
               "rl.batch_size=64", "rl.estimate_epochs=8", "rl.anneal_lr=false"]  # fmt: skip
@@ -164,21 +165,21 @@ def test_the_eyes_learn_where_the_goal_is(tmp_path, monkeypatch):
     assert losses[-1] < losses[0] / 3
 
 
-def test_looks_teach_the_eyes_before_anything_is_done(tmp_path, monkeypatch):
+def test_pretraining_teaches_the_estimator_before_anything_is_done(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.pretraining_images=2000", "rl.estimate_memory=500",
                 "rl.estimate_epochs=8"]  # fmt: skip
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
     events = EventAccumulator(str(run / "tensorboard")).Reload()
-    looks = events.Scalars("pretraining/loss")
-    assert [event.step for event in looks] == list(range(-1984, 1, 64)), "whole turns of 2 x 32"
-    assert looks[-1].value < looks[0].value / 2, "of images not learned from yet"
+    losses = events.Scalars("pretraining/estimate_loss")
+    assert [event.step for event in losses] == list(range(-1984, 1, 64)), "whole turns of 2 x 32"
+    assert losses[-1].value < losses[0].value / 2, "of images not learned from yet"
     first = events.Scalars("update/estimate_loss")[0].value
-    assert first < looks[0].value / 2, "what was learned is not lost"
+    assert first < losses[0].value / 2, "what was learned is not lost"
 
 
-def test_looks_without_anything_to_estimate_are_refused():
+def test_pretraining_without_anything_to_estimate_is_refused():
     with pytest.raises(UserError, match="pretraining_images .* estimated_observations"):
         load_config(None, ["rl.pretraining_images=64"])
 
@@ -193,8 +194,8 @@ def test_evaluation_does_not_depend_on_how_many_environments_there_are():
     ppo, episodes = None, []
     for count in (1, 3, 8):
         config = load_config(None, [*POINT, f"rl.envs={count}", "rl.batch_size=8"])
-        with vector_envs(config, count) as envs:
-            ppo = ppo or train_rl.make_ppo(config, envs, ALONE)
+        with training_envs(config, count) as envs:
+            ppo = ppo or make_ppo(envs.observation_space, envs.action_space, config)
             episodes.append(
                 evaluate_policy(ppo.network, envs, ppo.layout, range(7), ALONE.device, Stopwatch())
             )
@@ -299,8 +300,8 @@ def test_env_kwargs_and_info_reach_the_environment():
     config = load_config(None, [*POINT, "rl.env_kwargs=images=true",
                                 "rl.policy_observations=rgb,state",
                                 "rl.privileged_observations=goal"])  # fmt: skip
-    with vector_envs(config, 2) as envs:
-        layout = train_rl.make_ppo(config, envs, ALONE).layout
+    with training_envs(config, 2) as envs:
+        layout = make_ppo(envs.observation_space, envs.action_space, config).layout
         observation = envs.restart([3, 4])
     assert [part.key for part in (*layout.images, *layout.state)] == ["rgb", "state"]
     assert [(part.key, part.shape) for part in layout.privileged] == [("goal", (2,))]

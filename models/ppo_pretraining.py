@@ -1,0 +1,74 @@
+"""Pretraining of the state estimator, before PPO begins.
+
+The environments show the beginnings of episodes that no policy plays. From each image the network
+learns to estimate the observations of `rl.estimated_observations`, which only a simulator knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from models.ppo_observations import ObservationLayout, Observations
+from models.ppo_rollouts import (
+    NETWORK,
+    PRETRAINING,
+    SIMULATION,
+    NotFinite,
+    VectorEnvs,
+    derived_seeds,
+)
+from utils.runs import Stopwatch
+
+if TYPE_CHECKING:
+    from models.ppo import GraspPPO
+    from models.ppo_progress import Curves
+
+IMAGES = 32  # that each environment shows before the estimator learns from them: two scenes
+
+
+def pretrain_estimator(
+    ppo: GraspPPO, envs: VectorEnvs, images: int, seed: int, watch: Stopwatch, curves: Curves
+) -> None:
+    """Teach the estimator from at least `images` images of the environments of all processes.
+
+    The curve is the loss on images that the estimator has not learned from yet. The learning rate
+    falls in a line from rl.pretraining_lr to 0.
+    """
+    team, settings = ppo.team, ppo.settings
+    per_chunk = settings.envs * IMAGES
+    chunks = -(-images // per_chunk)
+    seeds: Sequence[int | None] = derived_seeds(envs.num_envs, seed, PRETRAINING, team.rank)
+    ppo.generator.manual_seed(derived_seeds(1, seed, PRETRAINING, team.rank)[0])
+    with tqdm(total=chunks * per_chunk, unit="image", disable=not team.is_main) as bar:
+        for chunk in range(chunks):
+            with watch(SIMULATION):
+                shown = collect_images(envs, ppo.layout, IMAGES, seeds)
+                shown = shown.map(lambda part: part.to(team.device))
+            with watch(NETWORK):
+                ppo.network.observe(shown, team)
+                loss = ppo.estimate_loss(shown)
+                ppo.update_estimator(shown, settings.pretraining_lr * (1 - chunk / chunks))
+            seeds = [None] * envs.num_envs
+            bar.update(per_chunk)
+            bar.set_postfix(loss=f"{loss:.3g}")
+            # Steps below 0, so that a resumed run keeps the curve.
+            curves.add("pretraining", (chunk + 1 - chunks) * per_chunk, {"estimate_loss": loss})
+    ppo.memory.clear()
+
+
+def collect_images(
+    envs: VectorEnvs, layout: ObservationLayout, count: int, seeds: Sequence[int | None]
+) -> Observations:
+    """(count * N, ...) the first observations of `count` episodes of each of N environments; the
+    first episodes begin from `seeds`. Raises NotFinite."""
+    shown = layout.empty(count, envs.num_envs)
+    for number in range(count):
+        observation = envs.restart(seeds if number == 0 else [None] * envs.num_envs)
+        bad = layout.bad_number(observation)
+        if bad is not None:
+            raise NotFinite(f"the observation {bad[0]!r} of environment {bad[1]} is not finite")
+        layout.write(observation, shown.map(lambda part: part[number]))  # noqa: B023
+    return shown.map(lambda part: part.flatten(0, 1))
