@@ -76,7 +76,7 @@ def test_the_policy_and_the_adaptation_network_are_made_as_printed():
             ),
             r"\(4, 4\)",
         ),
-        (lambda: GraspPPO(512, 14, 7), "policy_for"),
+        (lambda: GraspPPO(512, 14, 7), "make_ppo"),
         (
             lambda: GraspPolicyNetwork(512, 14, 7)(torch.rand(1, 3, 32, 32), torch.rand(1, 14)),
             "3 channels, the network has 4",
