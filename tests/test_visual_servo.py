@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from tests.helpers.servo_cases import LAWS
 from utils.errors import UserError
@@ -51,3 +55,18 @@ def test_the_three_doors_lead_to_the_same_laws():
 def test_every_servo_error_is_a_user_error():
     assert all(issubclass(e, ServoError) for e in (DepthError, PointError, CollinearPointsError))
     assert issubclass(ServoError, UserError)
+
+
+def test_the_example_of_the_docs_runs_as_printed(tmp_path, monkeypatch, capsys):
+    """docs/servo.md compares gains; its table holds what the example prints."""
+    page = (Path(__file__).resolve().parents[1] / "docs" / "servo.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), {})
+    assert (tmp_path / "gains.png").stat().st_size > 20_000
+    lines = capsys.readouterr().out.splitlines()
+    printed = [re.search(r"after (\d+) iterations (\S+) mm off", line).groups() for line in lines]
+    rows = re.findall(r"^\| [^|]+ \| (\d+) \| ([\d.]+) \| ([\d.]+) mm \|$", page, re.MULTILINE)
+    assert [(images, off) for images, _, off in rows] == printed and len(rows) == 4
+    assert [float(seconds) for _, seconds, _ in rows] == [
+        pytest.approx(int(images) * 0.04, abs=0.05) for images, _, _ in rows
+    ]
