@@ -39,3 +39,16 @@ def tiny_data(tmp_path_factory):
     ]  # fmt: skip
     generate(load_config(None, overrides))
     return folder, overrides
+
+
+@pytest.fixture(scope="module", params=["pybullet", "mujoco"])
+def taught_cell(request, config: Config):
+    """The cell of each simulator, whose wrist camera has been shown the board."""
+    if request.param == "mujoco":
+        pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
+    from envs.camera_calibration import teach
+    from envs.simulators import SIMULATORS
+
+    with SIMULATORS[request.param](config) as cell:
+        teach(cell)  # empties the cell, the first time
+        yield cell

@@ -1,24 +1,21 @@
-"""Find an object again that was seen once: its height map, registered in every new depth image.
+"""Track an object on a table: find it again in depth images, and filter its motion in the plane.
 
-What stands on a table moves in the plane: x, y and a turn about the table's normal. So the object
-is kept as a patch of heights above the table (the template, frame O: origin on the table below the
-grasp, z up, x along the closing line), and each image is turned into such a patch where the object
-is expected. The two are aligned by the inverse compositional algorithm (Baker and Matthews,
-"Lucas-Kanade 20 years on", IJCV 56(3), 2004) with Huber's weights. The table is fitted in every
-image, so that what is measured, T_CO, owes nothing to where the camera is believed to be.
+An object on a table moves in the plane: x, y and a turn about the table's normal. `make_template`
+keeps it as a patch of heights above the table, from the frame on which its grasp was planned;
+`TemplateMatcher` turns each depth image into such a patch where the object is expected and aligns
+the two by the inverse compositional algorithm (Baker and Matthews, "Lucas-Kanade 20 years on", IJCV
+56(3), 2004) with Huber's weights. It fits the table in every image, so the measured T_CO does not
+depend on the camera's calibration.
 
-Knows no simulator, no robot and no control law. Frames: C camera, O object, W world, P the table as
-the camera sees it (origin below the camera, z up).
+`PlanarMotion` is an extended Kalman filter with the model of constant speed and turning rate
+(Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+chapter 11): the velocity turns with the body, as on a belt round a bend. A single sighting that the
+model cannot explain is a false match and changes nothing; a second one after it, near the first,
+means that the object was pushed, and the filter forgets its velocities.
 
-Where a thing that slides over a table is now, from sightings of where it was.
-
-An extended Kalman filter with the model of constant speed and turning rate (Bar-Shalom, Li and
-Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, chapter 11): the
-velocity turns as the body turns, as on a belt that goes round a corner. One sighting that the model
-cannot explain is a false match and moves nothing; a second one after it, near the first, tells that
-the thing was pushed, and makes the filter forget its velocities.
-
-State: x, y (m), turn (rad) and their rates vx, vy (m/s), omega (rad/s). Knows no camera.
+Frames: C camera, W world, P the table as the camera sees it (origin below the camera, z up), O
+object: origin on the table below the grasp, z up, x along the closing line. Knows no simulator, no
+robot and no control law.
 """
 
 from __future__ import annotations
@@ -34,22 +31,22 @@ from utils.table_plane import fit_table_plane, table_frame
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part, transform_points
 
 CELL = 0.002  # m, side of a template's cell
-LOWEST = 0.004  # m over the table from which a point counts as an object's
-HIGHEST = 0.30  # m over the table, nothing that can be grasped is higher
+LOWEST = 0.004  # m over the table above which a point belongs to an object
+HIGHEST = 0.30  # m over the table, above everything that the hand can grasp
 MARGIN = 0.016  # m of table around the object that belong to the template
 _LARGEST = 0.12  # m, half the side of the largest template
 _BLURS = (2.5, 1.0)  # cells, coarse to fine
-_TURNS = 10  # of the alignment at each blur, at most
+_ITERATIONS = 10  # of the alignment at each blur, at most
 _HUBER = 0.008  # m of height beyond which a difference counts less
 _ALIGNED = 0.80  # least correlation of template and image
-_RIDGE = 0.02  # of the Hessian's turn: what is round keeps the turn that was expected
-_STIFF = 1e3  # of the Hessian's turn: what is round does not turn at all
-_YAWS = 24  # directions that are tried where the object is not where it was expected
-_PER_METRE, _PER_RADIAN = 0.5, 0.1  # of correlation that a place or turn off the expected one costs
+_RIDGE = 0.02  # of the Hessian's turn: a nearly round object keeps its expected turn
+_STIFF = 1e3  # of the Hessian's turn: a round object does not turn at all
+_YAWS = 24  # directions of the search for an object that is not where it was expected
+_PER_METRE, _PER_RADIAN = 0.5, 0.1  # cost in correlation of a metre or radian off the expected pose
 _RECTANGLE = (0.015, 0.03)  # m, smallest and largest half side of a template's rectangle of points
-_SEEN = 0.6  # share of the object that has to be in the image
+_SEEN = 0.6  # least share of the object in the image
 _NOISE = 0.001  # m, standard deviation of a measured place
-_TURN_NOISE = 0.02  # rad, what sides that are seen now and were not then do to a measured turn
+_TURN_NOISE = 0.02  # rad, error of a measured turn from sides that the template has not seen
 
 
 class Found(NamedTuple):
@@ -63,12 +60,12 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectTemplate:
-    """What the object looked like when its grasp was planned.
+    """The object's height map at the time when its grasp was planned.
 
     height: (N, N) float32 metres over the table in O; the middle of cell [row, col] is at
     x = CELL (col - (N - 1) / 2) and y likewise from the row. seen: (N, N) bool, where the camera
     saw anything: the rest lay in the object's shadow. points: (8, 3) in O, metres: a rectangle
-    that sticks to the object, see `_rectangle`.
+    fixed to the object, see `_rectangle`.
     """
 
     height: np.ndarray
@@ -89,7 +86,7 @@ def grasp_frame(grasp: Grasp, table: float = 0.0) -> np.ndarray:
 
 
 def make_template(frame: RGBDFrame, grasp: Grasp, table: float = 0.0) -> ObjectTemplate:
-    """Cut the object that a grasp is meant for out of the frame in which it was planned.
+    """Cut the object of a grasp out of the frame on which the grasp was planned.
 
     Raises TargetLostError where nothing stands on the table at the grasp.
     """
@@ -104,7 +101,9 @@ def make_template(frame: RGBDFrame, grasp: Grasp, table: float = 0.0) -> ObjectT
         raise TargetLostError("target lost: nothing stands on the table where it was to be grasped")
     nearest = np.argmin((rows - reach) ** 2 + (cols - reach) ** 2)
     mine = label == label[rows[nearest], cols[nearest]]
-    seen = (whole >= 0) & (mine | ~(above > 0))  # what belongs to a neighbour is not known
+    seen = (whole >= 0) & (
+        mine | ~(above > 0)
+    )  # the object's heights below a neighbour are unknown
     whole = np.where(mine, whole, 0).astype(np.float32)
     rows, cols = np.nonzero(mine)
     half = max(abs(rows - reach).max(), abs(cols - reach).max()) + round(MARGIN / CELL)
@@ -126,10 +125,9 @@ def _rectangle(rows, cols, height, reach) -> np.ndarray:
 
 
 def _patch(depth: np.ndarray, K: np.ndarray, T_OC: np.ndarray, side: int) -> np.ndarray:
-    """(side, side) float32 heights over z = 0 in O of what a depth image shows; 0 is the table, -1
-    is what it does not show.
+    """(side, side) float32 heights over z = 0 in O from a depth image; 0: the table, -1: not seen.
 
-    A pixel stands for as many points of its square as it takes to leave no cell between two empty.
+    Each pixel is split into as many points as are needed to leave no cell between pixels empty.
     """
     half = (side - 1) / 2
     box, near = _window(depth, K, T_OC, half * CELL)
@@ -157,7 +155,8 @@ def _patch(depth: np.ndarray, K: np.ndarray, T_OC: np.ndarray, side: int) -> np.
 
 
 def _window(depth, K, T_OC, reach: float) -> tuple[tuple[slice, slice] | None, float]:
-    """The part of an image that can show a square of +-reach metres about O, and its depth."""
+    """The window of an image that can show a square of +-reach metres about O, and its largest
+    depth; None where nothing of it is in the image."""
     corners = reach * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)], float)
     corners[:, 2] = np.where(corners[:, 2] > 0, 0.12, 0.0)
     seen = transform_points(inverse_pose(T_OC), corners)
@@ -189,8 +188,8 @@ class TemplateMatcher:
     def find(self, depth: np.ndarray, T_CO: np.ndarray, T_CW: np.ndarray, table=0.0) -> Found:
         """The object in a depth image (H, W), metres.
 
-        T_CO: (4, 4) where it is expected. T_CW: (4, 4) the world in the camera, as it is believed,
-        for a first idea of the table. Raises TargetLostError.
+        T_CO: (4, 4) expected pose. T_CW: (4, 4) the world in the camera by the calibration, from
+        which the fit of the table starts. Raises TargetLostError.
         """
         T_PC = table_frame(*fit_table_plane(depth, self.K, T_CW, table))
         x, y, turn = planar_part(T_PC @ T_CO)
@@ -235,9 +234,9 @@ class TemplateMatcher:
         return T_PO, level.correlation(image, motion), level.covariance()
 
     def _search(self, depth, T_PC, expected) -> tuple[np.ndarray, float, np.ndarray] | None:
-        """The best of many places and turns: each thing on the table, in each direction. What is
-        not as expected has to look better for it, as images follow each other closely: nearly
-        round things would else seem to turn with every search."""
+        """The best of many poses: each thing on the table, in each direction. A pose off the
+        expected one needs a better correlation, because images follow each other closely: nearly
+        round objects would otherwise turn with every search."""
         best = None
         middle = (expected @ planar(*self._centre, 0.0))[:2, 3]
         for place in self._things(depth, T_PC):
@@ -253,7 +252,7 @@ class TemplateMatcher:
         return None if best is None else self._align(depth, T_PC, best[1])
 
     def _things(self, depth: np.ndarray, T_PC: np.ndarray) -> list[np.ndarray]:
-        """(2,) middles in P of what stands on the table, about as large as the template."""
+        """(2,) middles in P of the things on the table that are about as large as the template."""
         v, u = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
         K = self.K
         points = np.stack(
@@ -272,8 +271,8 @@ class TemplateMatcher:
 
 
 def _smooth(height: np.ndarray, seen: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Heights blurred by a Gaussian over what is seen only (normalised convolution, Knutsson and
-    Westin 1993), and the weight of each cell: 0 where nothing is seen."""
+    """Heights blurred by a Gaussian over the seen cells only (normalised convolution, Knutsson and
+    Westin 1993), and the weight of each cell: 0 where it is not seen."""
     known = seen.astype(np.float32)
     share = cv2.GaussianBlur(known, (0, 0), blur)
     total = cv2.GaussianBlur(np.where(seen, height, 0).astype(np.float32), (0, 0), blur)
@@ -301,8 +300,8 @@ class _Level:
         self.ridge += 1e-9 * np.trace(hessian) * np.eye(3)
         whole = np.linalg.inv(hessian + self.ridge)
         self.scale = _NOISE**2 / max(whole[0, 0], whole[1, 1])
-        # What a turn about the object's own middle changes, wherever on it the grasp is: that part
-        # of the turn which no shift can undo.
+        # The information on a turn about the object's own middle, wherever the grasp is: the part
+        # of the turn that no shift can undo.
         shifts, coupling = hessian[:2, :2] + self.ridge[:2, :2], hessian[:2, 2]
         turning = hessian[2, 2] - coupling @ np.linalg.solve(shifts, coupling)
         self.round = bool(turning < 4 * self.ridge[2, 2])
@@ -311,8 +310,8 @@ class _Level:
         self._hessian = hessian
 
     def covariance(self) -> np.ndarray:
-        """(3, 3) of the last alignment: a side of the object that was not seen leaves its place
-        along that side open. The turn of what is round is as good as unknown."""
+        """(3, 3) of the last alignment: an unseen side leaves the place along it uncertain, and the
+        turn of a round object is practically unknown."""
         covariance = self.scale * np.linalg.inv(self._hessian + self.ridge)
         covariance += np.diag([0.25 * _NOISE**2, 0.25 * _NOISE**2, _TURN_NOISE**2])
         if self.round:
@@ -328,7 +327,7 @@ class _Level:
     def align(self, image: np.ndarray, motion: np.ndarray) -> np.ndarray:
         """(3, 3) motion in the plane that takes the template's cells to the image's."""
         smooth, known = _smooth(image, image >= 0, self.blur)
-        for _ in range(_TURNS):
+        for _ in range(_ITERATIONS):
             difference = self._warped(smooth, motion) - self.target
             weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(difference), 1e-9))
             weighted = self.J * (weight * (self._warped(known, motion) > 0.99))[:, None]
@@ -340,8 +339,8 @@ class _Level:
         return motion
 
     def correlation(self, image: np.ndarray, motion: np.ndarray) -> float:
-        """Normalised product of image and template, both heights over the table, where both saw
-        anything; 0 where that is less than half of the template."""
+        """Normalised product of image and template, both heights over the table, over the cells
+        that both have seen; 0 where these are less than half of the template."""
         smooth, known = _smooth(image, image >= 0, self.blur)
         seen, both = self._warped(smooth, motion), self._warped(known, motion) > 0.5
         target = self.target * both
@@ -352,9 +351,13 @@ class _Level:
         return float(seen @ target / norms)
 
 
-_ACCELERATION = 0.03  # m/s^2 by root hertz: how fast velocities wander unless something pushes
+_ACCELERATION = 0.03  # m/s^2 by root hertz: random change of the velocities without a push
 _ANGULAR_ACCELERATION = 0.06  # rad/s^2 by root hertz
-_FIRST_RATES = (0.15, 0.15, 0.5)  # m/s, m/s, rad/s: what a first sighting leaves open
+_FIRST_RATES = (
+    0.15,
+    0.15,
+    0.5,
+)  # m/s, m/s, rad/s: standard deviations of the rates after a first sighting
 _SURPRISE = 16.0  # squared Mahalanobis distance of 3 numbers; chance gives more once in 900 times
 # Two surprises in a row are one push where they are no farther apart than this: 8 cm and 45 degrees
 # within 0.4 s, smoothly, are up to 0.4 m/s and 3.7 rad/s.
@@ -362,26 +365,31 @@ _PUSH_SPEED, _PUSH_TURN = 0.8, 8.0  # m/s, rad/s
 
 
 class PlanarMotion:
-    """The filter. Times are seconds of one clock; sightings come in their order."""
+    """The filter. Its state: x, y (m), turn (rad) and their rates vx, vy (m/s), omega (rad/s).
+
+    Times are seconds of one clock; sightings arrive in their order.
+    """
 
     def __init__(self, pose: tuple[float, float, float], seconds: float, turns: bool = True):
-        """pose: x, y, turn at the first sighting. turns: False for what is round, whose turning
-        cannot be seen; it is taken to go straight on."""
+        """pose: x, y, turn at the first sighting. turns: False for a round object, whose turning
+        cannot be seen; the filter takes it to go straight on."""
         self.state = np.array([*pose, 0.0, 0.0, 0.0])
         self._turns = 1.0 if turns else 1e-3
         self._rates = np.array(_FIRST_RATES) * [1, 1, self._turns]
         rates = self._rates
         self.covariance = np.diag(np.concatenate([[0.003, 0.003, 0.05], rates]) ** 2)
         self.seconds = seconds
-        self._surprise: tuple[np.ndarray, float] | None = None  # the last sighting, if it was one
+        self._surprise: tuple[np.ndarray, float] | None = (
+            None  # the last sighting, if the model could not explain it
+        )
 
     @property
     def velocity(self) -> np.ndarray:
-        """(3,) m/s, m/s, rad/s, now as at the last sighting."""
+        """(3,) m/s, m/s, rad/s, at the last sighting."""
         return self.state[3:].copy()
 
     def at(self, seconds: float) -> np.ndarray:
-        """(6,) the state expected at a time; nothing is changed."""
+        """(6,) the state predicted for a time; does not change the filter."""
         return _advance(self.state, seconds - self.seconds)
 
     def motion(self, start: float, end: float) -> np.ndarray:
@@ -390,8 +398,8 @@ class PlanarMotion:
         return planar(x1, y1, a1) @ np.linalg.inv(planar(x0, y0, a0))
 
     def see(self, pose: tuple[float, float, float], covariance: np.ndarray, seconds: float) -> bool:
-        """Take in a sighting of x, y and turn with a covariance (3, 3) in W's axes; False where it
-        is not believed, and the thing is taken to have gone on as before."""
+        """Update with a sighting of x, y and turn, with a covariance (3, 3) in W's axes. False where
+        the filter rejects it and predicts on as if there had been no sighting."""
         dt = seconds - self.seconds
         F = _transition(self.state, dt)
         self.state = _advance(self.state, dt)
@@ -422,7 +430,7 @@ def _difference(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _near(first: tuple[np.ndarray, float], second: tuple[np.ndarray, float]) -> bool:
-    """Whether a push can have taken a thing from one sighting, pose and seconds, to the next."""
+    """Whether a push can explain the motion between two sightings, each a pose and seconds."""
     x, y, turn = _difference(second[0], first[0])
     dt = second[1] - first[1]
     return bool(np.hypot(x, y) < _PUSH_SPEED * dt and abs(turn) < _PUSH_TURN * dt)
@@ -455,7 +463,7 @@ def _transition(state: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _noise(dt: float, turns: float) -> np.ndarray:
-    """(6, 6) of white accelerations; turns: factor on that of the turn."""
+    """(6, 6) process noise of white accelerations; turns: factor on the angular one."""
     Q = np.zeros((6, 6))
     strength = np.array([_ACCELERATION, _ACCELERATION, turns * _ANGULAR_ACCELERATION]) ** 2
     dt = max(dt, 0.0)

@@ -1,0 +1,66 @@
+"""The wrist camera's images, and the object that is found in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from envs.camera_calibration import teach, true_calibration
+from envs.cell_scenes import make_scene
+from envs.closed_loop import ClosedLoop, GuidedApproach
+from envs.closed_loop_tracker import WristCamera
+from envs.servo_arm import ServoArm
+from tests.helpers.box_rounds import grasp_of_box
+from utils.config import load_config
+from utils.transforms import planar_part
+
+
+@pytest.fixture(scope="module")
+def scene(config, box_set):
+    return make_scene("isolated", box_set, 0, config)
+
+
+@pytest.fixture
+def cell(taught_cell, scene):
+    """The cell of either simulator with the scene of one box, loaded."""
+    taught_cell.load(scene)
+    return taught_cell
+
+
+def loop(cell, controller, latency=0.0, camera=None):
+    calibration = true_calibration(cell)
+    return ClosedLoop(cell, controller, cell.frame(), calibration, teach(cell), latency, camera)
+
+
+def test_images_arrive_late(cell):
+    camera, seen = WristCamera(cell, latency=0.1), []
+    for _ in range(6):
+        sight = camera()
+        seen.append(None if sight is None else round(cell.seconds - sight.seconds, 6))
+        cell.step(8)
+    assert seen == [None, None, None, 0.1, 0.1, 0.1]
+
+
+def test_the_object_is_found_by_the_real_camera(cell):
+    descent = GuidedApproach(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
+    x, y, turn = np.subtract(
+        planar_part(descent.target.T_WO),
+        [*cell.object_pose(0)[:2, 3], grasp_of_box(cell).angle],
+    )
+    assert np.hypot(x, y) < 3e-3, "from home, where a pixel covers 5 mm of the table"
+    assert abs(np.degrees((turn + np.pi / 2) % np.pi - np.pi / 2)) < 4
+
+
+def test_the_wrist_cameras_noise_is_the_configs_and_of_the_scene(cell, monkeypatch):
+    clean = WristCamera(cell)().depth
+    noisy = load_config(None, ["sim.renderer=tiny", "camera.depth_noise=kinect"])
+    monkeypatch.setattr(cell, "config", noisy)
+    first, again = WristCamera(cell)().depth, WristCamera(cell)().depth
+    np.testing.assert_array_equal(first, again)
+    camera = WristCamera(cell)
+    assert (camera().depth != camera().depth).any(), "each image has noise of its own"
+    known = (first > 0) & (clean > 0)
+    error = np.abs(first - clean)[known]
+    # From 0.5 m: 0.5^2 m^2 / (480 px x 0.075 m) x 1/8 px is 0.9 mm a step of disparity.
+    assert 1e-4 < np.median(error) < 1.5e-3
+    assert 0.5 < known.mean() < 1.0, "with holes, at the edges of things"

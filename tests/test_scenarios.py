@@ -1,0 +1,115 @@
+"""Motions of the objects beside closed forms, in both simulators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from envs.cell_layout import GRAVITY
+from envs.cell_scenes import make_scene
+from envs.mujoco_cell import MujocoCell
+from envs.robot_kinematics import inverse_kinematics
+from envs.scenarios import SCENARIOS, Conveyor, Displacement, crossing, disturbed
+from utils.transforms import top_down_pose
+
+
+@pytest.fixture(scope="module")
+def scene(config, box_set):
+    return make_scene("isolated", box_set, 0, config)
+
+
+@pytest.fixture
+def cell(taught_cell, scene):
+    """The cell of either simulator with the scene of one box, loaded."""
+    taught_cell.load(scene)
+    return taught_cell
+
+
+def test_a_displacement_ends_where_it_says(cell):
+    before = cell.object_pose(0)
+    with disturbed(cell, Displacement(np.array([0.04, -0.03]), 0.5, start=0.1)):
+        cell.step(24)
+        np.testing.assert_allclose(cell.object_pose(0)[:3, 3], before[:3, 3], atol=2e-4)
+        cell.step(240)
+    after = cell.object_pose(0)
+    np.testing.assert_allclose(after[:3, 3] - before[:3, 3], [0.04, -0.03, 0], atol=5e-4)
+    R = after[:3, :3] @ before[:3, :3].T
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(0.5, abs=0.01)
+    assert cell.before_step is None
+
+
+PLACES = [(0.6, 0.1), (0.4, -0.1), (0.5, 0.14), (0.36, 0.02)]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_crossing_goes_through_the_middle(place):
+    for seed in range(20):
+        path = crossing(np.random.default_rng(seed), np.array(place), np.array([0.5, 0.0]), 0.05)
+        way = np.subtract(path(10.0)[:2], path(0.2)[:2])
+        towards = np.subtract((0.5, 0.0), place)
+        assert np.linalg.norm(way) == pytest.approx(0.49)
+        cosine = way @ towards / np.linalg.norm(way) / np.linalg.norm(towards)
+        assert np.degrees(np.arccos(cosine)) <= 30 + 1e-6
+
+
+@pytest.mark.parametrize("turn_rate", [0.0, 0.4])
+def test_a_conveyor_moves_at_its_speed(cell, turn_rate):
+    before = cell.object_pose(0)
+    with disturbed(cell, Conveyor(0.05, np.pi / 2, turn_rate)):
+        cell.step(48)  # up to speed, after half the way that the full speed would have made
+        middle = cell.object_pose(0)
+        assert middle[1, 3] - before[1, 3] == pytest.approx(0.005, abs=5e-4)
+        cell.step(240)
+        after = cell.object_pose(0)
+        assert cell.speed(0) == pytest.approx(0.05, rel=0.5), "the table brakes within a step"
+    chord = 0.05 if turn_rate == 0 else 2 * 0.05 / turn_rate * np.sin(turn_rate / 2)
+    travelled = np.linalg.norm(after[:2, 3] - middle[:2, 3])
+    assert travelled == pytest.approx(chord, abs=5e-4)
+    R = after[:3, :3] @ middle[:3, :3].T
+    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(turn_rate, abs=5e-3)
+    assert after[2, 3] == pytest.approx(before[2, 3], abs=5e-4)
+
+
+@pytest.mark.parametrize("scenario", ["moved", "moving_10cm", "turning_5cm", "crossing_5cm"])
+def test_a_scenario_moves_the_object_along_its_path(cell, scenario):
+    before, motion = cell.object_pose(0), SCENARIOS[scenario].motion(cell, 0)
+    with disturbed(cell, motion):
+        cell.step(360)
+    after = cell.object_pose(0)
+    way, R = after[:3, 3] - before[:3, 3], after[:3, :3] @ before[:3, :3].T
+    expected = motion(360 * cell.dt)
+    np.testing.assert_allclose([*way[:2], np.arctan2(R[1, 0], R[0, 0])], expected, atol=3e-3)
+    assert np.linalg.norm(way) > 0.03
+
+
+def test_the_robots_touch_ends_a_disturbance(cell):
+    start = cell.object_position(0)
+    # The fingers wait 7 cm ahead of the middle of the box, whose half diagonal is 4.2 cm.
+    in_the_way = top_down_pose(start + [0.07, 0.0, 0.0], 0.0)
+    cell.robot.place(inverse_kinematics(in_the_way, cell.home), opening=0.0)
+    assert not cell.robot.touches_body(cell.bodies[0])
+    with disturbed(cell, Conveyor(0.05, 0.0)):
+        cell.step(480)
+        assert cell.before_step.over
+    assert cell.before_step is None
+    assert 0.005 < cell.object_position(0)[0] - start[0] < 0.05, "2 s would have made 9.5 cm"
+    assert cell.speed(0) < 1e-3, "friction has stopped it"
+
+
+def test_what_is_carried_flies_on_as_it_was_sent(cell):
+    """A tilted cube let go in the air: p + v t - g t^2 / 2, and a turn about W's vertical, which a
+    cube keeps, whichever way its own axes point."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", [0.5, -0.3, 1.0]).as_matrix()
+    T[:3, 3] = [0.55, 0.05, 0.3]
+    if not isinstance(cell, MujocoCell):
+        pytest.skip("PyBullet's damping slows a free flight")
+    cell.carry(0, T, np.array([0.3, -0.2, 0.1]), 2.0)
+    np.testing.assert_allclose(cell.object_pose(0), T, atol=1e-12)
+    cell.step(24)
+    time, after = 24 * cell.dt, cell.object_pose(0)
+    fallen = np.array([0.03, -0.02, 0.1 * time - GRAVITY * time**2 / 2])
+    np.testing.assert_allclose(after[:3, 3] - T[:3, 3], fallen, atol=1e-3)
+    expected = Rotation.from_euler("z", 2.0 * time).as_matrix() @ T[:3, :3]
+    np.testing.assert_allclose(after[:3, :3], expected, atol=1e-3)
