@@ -398,8 +398,8 @@ class PlanarMotion:
         return planar(x1, y1, a1) @ np.linalg.inv(planar(x0, y0, a0))
 
     def see(self, pose: tuple[float, float, float], covariance: np.ndarray, seconds: float) -> bool:
-        """Update with a sighting of x, y and turn, with a covariance (3, 3) in W's axes. False where
-        the filter rejects it and predicts on as if there had been no sighting."""
+        """Update with a sighting of x, y and turn, with a covariance (3, 3) in W's axes. False
+        where the filter rejects it and predicts on as if there had been no sighting."""
         dt = seconds - self.seconds
         F = _transition(self.state, dt)
         self.state = _advance(self.state, dt)
