@@ -80,7 +80,7 @@ class ArmGate:
         self._dt = dt
         self.restart(robot.home)
 
-    def restart(self, q: Sequence[float]) -> None:
+    def restart(self, q: Sequence[float] | np.ndarray) -> None:
         """Take joint positions q (7,), rad, as the reference sent last, wherever they are."""
         self._q = [float(angle) for angle in q]
         self._tip = tip_position(self._q)

@@ -156,7 +156,7 @@ def explain(error: ValidationError, layers: Sequence[Layer]) -> str:
         known = ".".join(location)
         items = [] if first["type"] == "missing" else first["loc"]  # there is no such item
         index = "".join(f"[{part}]" for part in items if isinstance(part, int))
-        schema = schema_at(known)
+        schema = schema_at(known) or {}
         if isinstance(first["input"], dict | Section) and first["type"] == "value_error":
             message = f"{known}: {first['ctx']['error']} ({source})"  # a rule between keys
         else:
@@ -344,7 +344,7 @@ def changed_keys(config: Config) -> list[str]:
 class _Loader(yaml.SafeLoader):
     """yaml.safe_load's loader, which also reads 3e-4 as a number and refuses repeated keys."""
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen: set[str] = set()
         for key, _ in node.value:
             if key.value in seen:
@@ -405,9 +405,10 @@ def _parse_override(text: str) -> dict[str, Any]:
         ) from error
     if "string" in types and not isinstance(value, str | list | dict | None):
         value = raw.strip()  # evaluate.name=007 is text
+    nested: Any = value
     for part in reversed(key.split(".")):
-        value = {part: value}
-    return value
+        nested = {part: nested}
+    return nested
 
 
 def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

@@ -138,7 +138,7 @@ class GripperGeometry:
         """Height of the hand's lowest point above the fingertips, metres."""
         return self.palm_outline[0][1]
 
-    def finger_underside(self, outward) -> np.ndarray:
+    def finger_underside(self, outward: np.ndarray) -> np.ndarray:
         """Height of a finger's underside above the tip at distances outward from its pad's face.
 
         Infinite where there is no finger. An object under it is hit on a straight descent exactly
@@ -147,7 +147,7 @@ class GripperGeometry:
         distance, height = np.array(self.finger_outline).T
         return np.interp(outward, distance, height, left=np.inf, right=np.inf)
 
-    def palm_underside(self, across) -> np.ndarray:
+    def palm_underside(self, across: np.ndarray) -> np.ndarray:
         """Height of the hand's underside above the tips at distances across the closing line."""
         distance, height = np.array(self.palm_outline).T
         return np.interp(np.abs(across), distance, height, right=np.inf)

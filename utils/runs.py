@@ -208,7 +208,7 @@ class Stopwatch:
 
     OVERHEAD = "overhead"
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.start()
 
     def start(self) -> None:

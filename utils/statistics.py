@@ -91,12 +91,12 @@ def pearson_correlation(a: ArrayLike, b: ArrayLike) -> float | None:
     None where it is undefined: fewer than two numbers, or a list that never changes. Raises
     ValueError on lists that do not pair up.
     """
-    a, b = _paired("pearson_correlation", a, b)
-    if len(a) < 2:
+    first, second = _paired("pearson_correlation", a, b)
+    if len(first) < 2:
         return None
-    a, b = a - a.mean(), b - b.mean()
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(np.clip(a @ b / size, -1.0, 1.0)) if size > 1e-12 else None
+    first, second = first - first.mean(), second - second.mean()
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(np.clip(first @ second / size, -1.0, 1.0)) if size > 1e-12 else None
 
 
 def mean_maximum_rank_violation(real: ArrayLike, simulated: ArrayLike) -> float | None:

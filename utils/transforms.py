@@ -16,10 +16,12 @@ This module knows no simulator and no network.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import atan2, cos, sin, sqrt
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 
@@ -99,7 +101,7 @@ class RGBDFrame:
     K: np.ndarray
     T_WC: np.ndarray
     segmentation: np.ndarray | None = None
-    truth: SceneGeometry | None = None  # noqa: F821  (utils.geometry, not needed at run time)
+    truth: SceneGeometry | None = None  # type: ignore[name-defined]  # noqa: F821 - utils.geometry
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
@@ -124,13 +126,13 @@ def wrap_to_pi_range(angle: float) -> float:
     return 0.0 if wrapped >= np.pi else wrapped
 
 
-def angle_difference(a, b):
+def angle_difference(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """Smallest difference of two undirected lines' angles, in [0, pi/2]. Accepts arrays."""
     difference = np.mod(np.asarray(a) - np.asarray(b), np.pi)
     return np.minimum(difference, np.pi - difference)
 
 
-def pose_matrix(position, quaternion) -> np.ndarray:
+def pose_matrix(position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
     """(4, 4) transform from a position (3,) and a quaternion (x, y, z, w)."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
@@ -156,7 +158,7 @@ def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def top_down_pose(position, angle: float) -> np.ndarray:
+def top_down_pose(position: ArrayLike, angle: float) -> np.ndarray:
     """(4, 4) T_WE of a gripper pointing straight down whose fingers close along `angle`."""
     c, s = np.cos(angle), np.sin(angle)
     T = np.eye(4)
@@ -165,7 +167,9 @@ def top_down_pose(position, angle: float) -> np.ndarray:
     return T
 
 
-def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(
+    eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)
+) -> np.ndarray:
     """(4, 4) T_WC of a camera at `eye` whose optical axis passes through `target`.
 
     `up` is the world direction that points up in the image; it may not be parallel to the view.
@@ -177,7 +181,7 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
         raise ValueError("look_at: eye and target are the same point")
     forward = forward / distance
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(up), 1e-12):
+    if np.linalg.norm(right) < 1e-6 * max(float(np.linalg.norm(up)), 1e-12):
         raise ValueError("look_at: `up` is parallel to the line of sight")
     right /= np.linalg.norm(right)
     T = np.eye(4)
@@ -186,7 +190,7 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
     return T
 
 
-def deproject(pixels, depth, K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
+def deproject(pixels: ArrayLike, depth: ArrayLike, K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
     """Points in W (..., 3) of pixels (..., 2) at depths (...) along the optical axis."""
     pixels, depth = np.asarray(pixels, dtype=float), np.asarray(depth, dtype=float)
     x = (pixels[..., 0] - K[0, 2]) / K[0, 0] * depth
@@ -194,7 +198,7 @@ def deproject(pixels, depth, K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
     return transform_points(T_WC, np.stack([x, y, depth], axis=-1))
 
 
-def project(points, K: np.ndarray, T_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project(points: ArrayLike, K: np.ndarray, T_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (..., 2) and depths (...) of points in W (..., 3); NaN pixels behind the camera."""
     in_camera = transform_points(inverse_pose(T_WC), np.asarray(points, dtype=float))
     depth = in_camera[..., 2]
@@ -250,13 +254,13 @@ def planar_part(T: np.ndarray) -> tuple[float, float, float]:
 SMALL_ANGLE = 1e-4  # below it the series to second order are exact to the last digit
 
 
-def skew(vector) -> np.ndarray:
+def skew(vector: np.ndarray) -> np.ndarray:
     """(3, 3) matrix [a]x such that [a]x b = a x b."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def rotation_exp(rotation_vector) -> np.ndarray:
+def rotation_exp(rotation_vector: Iterable[float]) -> np.ndarray:
     """(3, 3) rotation of the axis-angle vector theta u (3,), radians (Rodrigues)."""
     return _exp(0.0, 0.0, 0.0, *map(float, rotation_vector))[:3, :3].copy()
 
@@ -287,7 +291,7 @@ def rotation_log(R: np.ndarray) -> np.ndarray:
     return np.array([x * scale, y * scale, z * scale])
 
 
-def pose_exp(twist) -> np.ndarray:
+def pose_exp(twist: Iterable[float]) -> np.ndarray:
     """(4, 4) displacement of a body that moves with a constant twist (6,) for one unit of time.
 
     A frame A that moves with v_A (expressed in A) for dt has T_WA <- T_WA @ pose_exp(v_A * dt).
