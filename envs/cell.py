@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class Cell(ABC):
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
-        self.on_build: Callable[[Any], None] | None = None
+        self.on_build: Callable[[Any], object] | None = None
         self.before_step: Callable[[Any], None] | None = None
         self.on_step: Callable[[Any], None] | None = None
         self.view: RandomView | None = None
@@ -251,6 +251,8 @@ class Cell(ABC):
 
     def truth(self) -> SceneGeometry:
         """The true geometry of the objects still in the round."""
+        if self.scene is None:
+            raise ValueError("There is no scene; build or load one first")
         solids = []
         for index in sorted(self.remaining):
             model, T = self.scene.placements[index].model, self.object_pose(index)
@@ -283,6 +285,10 @@ class Cell(ABC):
         focal = float(frame.K[0, 0])
         noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
         if noise is not None:
+            if self.scene is None:
+                raise ValueError(
+                    "Depth noise follows the scene's seed; build or load a scene first"
+                )
             rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
             frame = replace(frame, depth=noise(frame.depth, rng))
         self.frames += 1
@@ -328,10 +334,10 @@ class Cell(ABC):
         number_of[self.bodies] = range(len(self.bodies))
         return number_of[image.bodies]  # -1, no body, is the extra last one
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 

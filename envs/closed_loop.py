@@ -124,7 +124,7 @@ class ClosedLoop:
         controller: str,
         frame: RGBDFrame,
         calibration: CameraCalibration,
-        taught_T_CE: np.ndarray,
+        taught_T_CE: np.ndarray | None,
         latency: float = 0.0,
         camera=None,
     ):

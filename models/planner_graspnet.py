@@ -160,7 +160,7 @@ class GraspNetPlanner(SearchPlanner):
 
 
 def quality_between(
-    maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor], start: np.ndarray, end: np.ndarray
+    maps: tuple[torch.Tensor, ...], start: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
     """(N,) quality of closing along the lines from `start` to `end` (N, 2), in the maps' pixels.
 

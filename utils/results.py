@@ -211,8 +211,10 @@ def _compared(
 def _difference(
     a: Sequence[RoundRecord], b: Sequence[RoundRecord], top: str, bottom: str, seed: int
 ) -> Difference | None:
-    counts = [[(getattr(r, top), getattr(r, bottom)) for r in side] or [(0, 0)] for side in (a, b)]
-    return paired_difference_interval(*counts, seed=seed)
+    first, second = (
+        [(getattr(r, top), getattr(r, bottom)) for r in side] or [(0, 0)] for side in (a, b)
+    )
+    return paired_difference_interval(first, second, seed=seed)
 
 
 # --- Two runs -----------------------------------------------------------------------------------

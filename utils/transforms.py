@@ -167,9 +167,7 @@ def top_down_pose(position: ArrayLike, angle: float) -> np.ndarray:
     return T
 
 
-def look_at(
-    eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)
-) -> np.ndarray:
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
     """(4, 4) T_WC of a camera at `eye` whose optical axis passes through `target`.
 
     `up` is the world direction that points up in the image; it may not be parallel to the view.
