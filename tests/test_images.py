@@ -1,4 +1,4 @@
-"""Files of a user's image, and images at another pixel size, against closed forms."""
+"""Files of a user's image, images at another pixel size and from above, against closed forms."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models.photographs import WORKSPACE
+from tests.helpers.photographs import BOX, GREY, RED, photographed
 from utils.errors import UserError
 from utils.images import (
     PixelScaling,
     intrinsics_matrix,
+    overhead_view,
     read_depth,
     read_intrinsics,
     read_pose,
@@ -127,3 +130,28 @@ def test_an_intrinsics_file_that_does_not_fit_is_refused(tmp_path, text, message
         (tmp_path / "k.json").write_text(text)
     with pytest.raises(UserError, match=message):
         read_intrinsics([str(tmp_path / "k.json")], 320, 240)
+
+
+# --- From above ------------------------------------------------------------------------------
+
+
+def test_the_view_from_above_shows_the_top_of_a_box_where_it_is():
+    _, frame = photographed()
+    view = overhead_view(frame, WORKSPACE, 0.0018)
+    assert view.depth.shape == (120, 120)  # 0.22 m
+    high = view.depth < 0.8 - BOX[2] + 1e-3
+    v, u = np.nonzero(high)
+    corners, _ = project(np.array([[-0.03, 0.08, 0.08], [0.03, -0.08, 0.08]]), view.K, view.T_WC)
+    assert (u.min(), v.min()) == pytest.approx(corners[0], abs=1.5)
+    assert (u.max(), v.max()) == pytest.approx(corners[1], abs=1.5)
+    assert high.sum() == pytest.approx(np.prod(corners[1] - corners[0]), rel=0.05)
+    assert (view.rgb[high] == RED).all()
+
+
+def test_what_the_box_hides_is_bare_table():
+    _, frame = photographed()
+    view = overhead_view(frame, WORKSPACE, 0.0018)
+    (hidden,), _ = project(np.array([[0.0, 0.1, 0.0]]), view.K, view.T_WC)  # 2 cm behind
+    u, v = np.rint(hidden).astype(int)
+    assert view.depth[v, u] == pytest.approx(0.8, abs=1e-3)
+    assert tuple(view.rgb[v, u]) == GREY
