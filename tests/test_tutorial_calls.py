@@ -13,7 +13,7 @@ from envs.grasping_env import RobotGraspingEnv
 from models.grasp_policy import GraspPolicyNetwork, GraspPPO
 from models.graspnet import GraspLoss, create_model
 from utils.adaptation import DomainAdaptationNetwork, train_domain_adaptation
-from utils.domain_randomization import TextureRandomizer
+from utils.domain_randomization import DomainRandomizer, TextureRandomizer
 from utils.visual_servo import (
     HybridVisualServo,
     ImageBasedVisualServo,
@@ -88,6 +88,7 @@ def test_the_policy_and_the_adaptation_network_are_made_as_printed():
             ),
             r"\(images, labels\)",
         ),
+        (lambda: DomainRandomizer(0), "expected a cell"),
     ],
 )
 def test_a_call_that_cannot_be_accepted_ends_with_one_sentence(call, message):
