@@ -4,6 +4,7 @@ import numpy as np
 import pybullet
 import pytest
 
+from envs import cell_scenes
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
@@ -46,7 +47,8 @@ def test_packed_objects_stand_apart(primitives, config, cell):
             assert not pybullet.getContactPoints(a, b, physicsClientId=cell.client)
 
 
-def test_impossible_scene_is_refused(box_set, config):
+def test_impossible_scene_is_refused(box_set, config, monkeypatch):
+    monkeypatch.setattr(cell_scenes, "_TRIES", 2)
     crowded = with_settings(config, "scene", {"count": 50})
     with pytest.raises(SceneError, match="scene.count"):
         make_scene("packed", box_set, 0, crowded)
