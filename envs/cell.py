@@ -52,7 +52,6 @@ class Cell(ABC):
     each action of a policy that moves the hand step by step; None leaves it as it is.
     """
 
-    client: int | None = None  # PyBullet's number of the cell's simulation
     robot: Robot
     camera: Camera
     bodies: list[int]
