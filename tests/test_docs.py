@@ -21,7 +21,7 @@ READMES = (ROOT / "README.md", ROOT / "README.zh-CN.md")
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 # Files that a reader brings or a run leaves.
 READERS_OWN = re.compile(
-    r"^(runs/|data/|path/to/|my|color\.png|depth\.png|scene\.png|results\.|report\.html|~|\$|"
+    r"^(runs/|data/|top_object|path/to/|my|color\.png|depth\.png|scene\.png|results\.|report\.html|~|\$|"
     r".*(NAME|FILE|[<*{]))"
 )
 
