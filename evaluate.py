@@ -38,6 +38,7 @@ from envs.transfer_scenes import (
 )
 from models.photographs import photographs
 from utils.config import Config, load_config, parse_args, run_script
+from utils.errors import UserError
 from utils.evaluation import (
     FREE_TO_CHANGE,
     check_controllers,
@@ -60,7 +61,14 @@ from utils.result_formats import (
 )
 from utils.result_records import differing_rounds, policy_name, read_sample
 from utils.results import Comparison, compare, compare_runs, stop_reasons, summarise
-from utils.runs import check_resume, check_writable, new_run_folder, save_results, write_atomic
+from utils.runs import (
+    check_resume,
+    check_writable,
+    environment,
+    new_run_folder,
+    save_results,
+    write_atomic,
+)
 from utils.transfer import (
     TransferLine,
     draw_transfer,
@@ -170,6 +178,11 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
     config = load_config(None, [*sample.overrides, *overrides])
     check_names(config)
     print(f"{len(sample.rounds)} rounds of commit {sample.commit}, played again", flush=True)
+    facts = environment()
+    ours = {"python": facts["python"], **facts["packages"]}
+    for name, version in sample.versions.items():
+        if version != ours.get(name):
+            print(f"{name} is {ours.get(name)} here, the rounds were played with {version}")
     different = differing_rounds(sample.rounds, replay(sample, config, work, set_up))
     for record in different:
         print(f"different: {record.policy}, {record.scenario}, scene {record.seed}")
@@ -183,6 +196,8 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
 def report_transfer(config: Config, options: argparse.Namespace) -> int:
     """Score each row on the same scenes in every column, and report how the columns agree."""
     rows, columns = config.transfer.policies, config.transfer.columns
+    if options.csv is not None or options.latex is not None:
+        raise UserError("--csv, --latex: the transfer report has no paired differences; omit them")
     check_open_loop(config)
     evaluations = evaluations_of(config)
     for evaluation in evaluations:

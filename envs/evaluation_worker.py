@@ -85,7 +85,9 @@ def work(task: Task) -> TaskResult:
         if is_learned(name):
             approach = learned_approach(name, _cell)
         else:
-            planner = _planners[name] = _planners.get(name) or new_planner(name, _config)
+            if name not in _planners:
+                _planners[name] = new_planner(name, _config)
+            planner = _planners[name]
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
             if task.keep_pictures or not outcome.success:

@@ -128,10 +128,14 @@ def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, caps
     origin, heuristic, random = (tmp_path / "sample.jsonl").read_text().splitlines()
     changed = json.loads(heuristic)
     changed["attempts"][0]["sim_seconds"] += 0.1
-    (tmp_path / "sample.jsonl").write_text("\n".join([origin, json.dumps(changed), random]))
+    origin = json.loads(origin)
+    origin["versions"]["numpy"] = "1.0"
+    lines = map(json.dumps, (origin, changed))
+    (tmp_path / "sample.jsonl").write_text("\n".join([*lines, random]))
     monkeypatch.chdir(tmp_path)
     assert evaluate.main(["--replay", "sample.jsonl", "evaluate.workers=1"]) == 1
     told = capsys.readouterr().out
+    assert "the rounds were played with 1.0" in told and "python is" not in told
     assert "different: heuristic, isolated, scene 0" in told
     assert "1 of 2 rounds are the same" in told
 

@@ -45,8 +45,8 @@ def test_policies_lift_what_they_have_never_seen(objects):
     config = config_of(path, ["sim.renderer=tiny", "objects.split=test"])
     assert config.env.objects == objects
     policy = load_policy(path)
-    told = {part.key for part in (*policy.layout.images, *policy.layout.state)}
-    assert told == {"rgb", "depth", "end_effector_position", "gripper", "opening_error"}
+    seen = {part.key for part in (*policy.layout.images, *policy.layout.state)}
+    assert seen == {"rgb", "depth", "end_effector_position", "gripper", "opening_error"}
     ends = run_episodes(policy, config, 10)
     assert sum(reason == "success" for reason, _ in ends) >= 6
 
@@ -67,7 +67,7 @@ def test_fresh_episodes_are_at_full_difficulty(box, monkeypatch):
     assert starts[-4:] == [({"start": "home"}, "home")] * 4
 
 
-def test_it_is_not_told_where_the_box_is(box):
+def test_the_policy_does_not_observe_the_box_s_pose(box):
     policy = load_policy(box)
     assert {part.key for part in policy.layout.images} == {"rgb", "depth"}
     assert {part.key for part in policy.layout.state} == {"end_effector_position", "gripper"}
@@ -124,14 +124,14 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
 
 def recorded(decoder: ActionDecoder) -> list[np.ndarray]:
     """The actions that reach the decoder from now on."""
-    told, command = [], decoder.command
-    decoder.command = lambda action, state: (told.append(action.copy()), command(action, state))
-    return told
+    sent, command = [], decoder.command
+    decoder.command = lambda action, state: (sent.append(action.copy()), command(action, state))
+    return sent
 
 
 def driven(cell, actions, seed=0):
-    """The arm's motion, and the actions that reach the hand, when a policy that does not look plays
-    these in a scene."""
+    """The actions that reach the hand when a policy plays `actions` whatever it observes, and the
+    joint positions at the end."""
     objects = load_object_set("box", cache_dir=cell.config.cache_folder)
     trained = {
         "env": cell.config.env.model_dump() | {"control": "ee_planar", "observations": ("state",)},
@@ -140,14 +140,14 @@ def driven(cell, actions, seed=0):
     trained["env"]["max_steps"] = len(actions)
     left = iter(actions)
     approach = PolicyApproach(cell, lambda observation: next(left), trained)
-    told = recorded(approach.env._actions)
+    sent = recorded(approach.env._actions)
     cell.load(make_scene("isolated", objects, seed, cell.config))
     execute_grasp(cell, placeholder(None)[0], approach)
-    return np.array(told), cell.robot.q
+    return np.array(sent), cell.robot.q
 
 
 def randomised(*changes):
-    """A cell of evaluate.py in which nothing but the action is changed, and that as told."""
+    """A cell of evaluate.py in which `changes` alone are randomised."""
     still = [
         f"randomization.physics.{name}={'1,1' if spec.operation == 'scale' else '0,0'},uniform,"
         f"{'scale' if spec.operation == 'scale' else 'add'},episode"
@@ -168,28 +168,28 @@ def test_an_evaluated_policy_s_actions_get_the_bias_and_noise_of_the_sample():
     with randomised(
         BIAS + "0.1,0.1,uniform,set,episode", NOISE + "0.05,0.05,uniform,set,episode"
     ) as cell:
-        told, q = driven(cell, ACTIONS)
+        sent, q = driven(cell, ACTIONS)
         noise = [np.random.default_rng([0, 3, turn]).standard_normal(5) for turn in range(12)]
-        np.testing.assert_allclose(told, ACTIONS + 0.1 + 0.05 * np.array(noise), atol=1e-12)
+        np.testing.assert_allclose(sent, ACTIONS + 0.1 + 0.05 * np.array(noise), atol=1e-12)
         again, q_again = driven(cell, ACTIONS)
         other, _ = driven(cell, ACTIONS, seed=1)
-    assert told.tolist() == again.tolist() and q.tolist() == q_again.tolist(), "bit for bit"
-    assert not np.allclose(told, other), "another scene, another noise"
+    assert sent.tolist() == again.tolist() and q.tolist() == q_again.tolist(), "bit for bit"
+    assert not np.allclose(sent, other), "another scene, another noise"
 
 
 def test_without_noise_an_evaluated_policy_s_actions_are_its_own(config):
     with randomised() as cell, PybulletCell(config) as plain:
-        told, q = driven(cell, ACTIONS)
+        sent, q = driven(cell, ACTIONS)
         assert cell.on_action is not None and plain.on_action is None
         expected, q_plain = driven(plain, ACTIONS)
-    assert told.tolist() == expected.tolist() == ACTIONS.tolist() and q.tolist() == q_plain.tolist()
+    assert sent.tolist() == expected.tolist() == ACTIONS.tolist() and q.tolist() == q_plain.tolist()
 
 
 def test_randomised_actions_are_those_of_the_environment():
     """What evaluate.py does to a policy's actions is what training did to them."""
     changes = [NOISE + "0.05,0.05,uniform,set,episode", "env.max_steps=12"]
     with randomised(*changes) as cell:
-        told, _ = driven(cell, ACTIONS)
+        sent, _ = driven(cell, ACTIONS)
         config = cell.config
     settings = {"config": config, "control": "ee_planar", "observations": ("state",)}
     env = gymnasium.make("RandomizedGrasping-v0", **settings).unwrapped
@@ -203,4 +203,4 @@ def test_randomised_actions_are_those_of_the_environment():
     for action in ACTIONS:
         env.step(action)
     env.close()
-    assert np.array(reached).tolist() == told.tolist()
+    assert np.array(reached).tolist() == sent.tolist()

@@ -40,8 +40,8 @@ def test_report_is_self_contained(tmp_path):
 
 
 def test_report_of_an_interrupted_run(tmp_path):
-    told = report(tmp_path, ROUNDS[:3], interruption="interrupted: 3 of 4 rounds")
-    assert "interrupted: 3 of 4 rounds" in told
+    page = report(tmp_path, ROUNDS[:3], interruption="interrupted: 3 of 4 rounds")
+    assert "interrupted: 3 of 4 rounds" in page
     assert "nothing to show yet" in report(tmp_path, [])
 
 

@@ -130,7 +130,7 @@ def test_physics_that_blows_up_ends_the_round(cell, box_set):
 
 
 class Planner:
-    """A planner that keeps the seeds of its resets and fails where it is told to."""
+    """A planner that keeps the seeds of its resets and raises an exception after one of them."""
 
     def __init__(self, failing_seed=None):
         self.failing_seed, self.seeds = failing_seed, []

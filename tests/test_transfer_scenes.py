@@ -70,8 +70,8 @@ def test_rows_on_the_same_scenes_are_one_evaluation():
          "evaluate.object_sets=box", "transfer.columns=[outside,mujoco,cornell]"],
     )  # fmt: skip
     played = evaluations_of(config)
-    told = [(one.column, str(one.scenes), [who.policy for who in one.rows]) for one in played]
-    assert told == [
+    found = [(one.column, str(one.scenes), [row.policy for row in one.rows]) for one in played]
+    assert found == [
         ("outside", "pile of box", ["a", "b", "d"]), ("mujoco", "pile of box", ["a", "b", "d"]),
         ("outside", "isolated of box", ["c"]), ("mujoco", "isolated of box", ["c"]),
     ]  # fmt: skip
@@ -93,6 +93,11 @@ def test_rows_that_cannot_see_photographs_have_no_score_there(tmp_path):
                             ("heuristic", ("pile", "box"))):  # fmt: skip
         row = TransferPolicy("a", "-", planner, scenes, None)
         assert score_photographs(row, [], config, tmp_path) == {}
+
+
+def test_the_report_has_no_paired_differences(tmp_path):
+    with pytest.raises(UserError, match="the transfer report has no paired differences"):
+        evaluate.main(["--config", str(REPORT), "--csv", str(tmp_path / "pairs.csv")])
 
 
 def test_outside_is_outside():

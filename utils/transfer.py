@@ -153,13 +153,13 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
                 "planner": line.row.planner,
                 "trained": line.trained,
                 "worlds": {
-                    world: {
+                    column: {
                         "successes": score.successes,
                         "trials": score.trials,
                         "success_rate": score.rate,
                         "success_ci95": list(score.ci95),
                     }
-                    for world, score in line.scores.items()
+                    for column, score in line.scores.items()
                 },
             }
             for line in lines
