@@ -27,8 +27,22 @@ from tests.helpers.hand_made import (
     hand_made_backbone,
 )
 from utils.errors import UserError
-from utils.image_overlay import is_prediction_panel
+from utils.image_overlay import is_prediction_panel, prediction_panel
 from utils.transforms import RGBDFrame, look_at, transform_points
+
+PICTURE = predict.picture
+
+
+@pytest.fixture(scope="module")
+def panel() -> bytes:
+    maps = np.zeros((3, 32, 32), np.float32)
+    return prediction_panel(np.zeros((32, 32, 3), np.uint8), np.eye(3), [], *maps, 0.08)
+
+
+@pytest.fixture(autouse=True)
+def quick_picture(monkeypatch, panel):
+    """One picture for all: drawing takes longer than predicting."""
+    monkeypatch.setattr(predict, "picture", lambda *_: panel)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -96,8 +110,10 @@ def by_row(grasps: list[dict]) -> list[dict]:
 # --- The command ----------------------------------------------------------------------------
 
 
-def test_frames_of_the_output_agree(files, capsys):
+def test_frames_of_the_output_agree(files, capsys, monkeypatch, panel):
+    monkeypatch.setattr(predict, "picture", PICTURE)
     found = files.run(capsys)
+    assert (files.folder / "out" / "grasps.png").read_bytes() != panel
     assert found["format"] == predict.FORMAT and len(found["grasps"]) == len(CUBES)
     assert found["table"]["estimated"] and abs(found["table"]["height_world"]) < 0.002
     qualities = [grasp["quality"] for grasp in found["grasps"]]
