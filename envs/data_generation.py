@@ -1,7 +1,7 @@
-"""Simulated grasp data: seeded scenes in the cell, photographed, labelled, and partly executed.
+"""Simulated grasp data: images of seeded scenes with dense labels, some of them executed.
 
-Every shard is a pure function of the config, the split and its number; worker processes write
-them one by one, so an interrupted generation goes on with the shards that are missing.
+Every shard is a pure function of the config, the split and its number. Worker processes write the
+shards one by one, so that an interrupted generation continues with those that are missing.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from tqdm import tqdm
 
 from envs.camera import camera_intrinsics
 from envs.cell import PhysicsError
+from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
-from envs.pybullet_appearance import Appearance, draw_camera
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config, dump_config, with_settings
 from utils.errors import UserError
@@ -92,7 +92,7 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     missing = missing_shards(config, folder, rank, ranks)
     if not missing:
         return folder
-    object_sets(config)  # what is wrong with them is told here, not by a worker that dies of it
+    object_sets(config)  # an unusable set raises here, not in a worker
     if config.data.executed_share:
         check_bin(config)
     workers = config.data.workers or max(1, (os.cpu_count() or 1) // ranks)

@@ -1,7 +1,7 @@
-"""URDF and mesh files: which of a folder are objects, and what one of them says.
+"""URDF and mesh files: which files of a folder are objects, and their meshes, colour and friction.
 
-What is read stays in the file's own units and axes. This module knows neither mass nor physics
-client, and no object set.
+Everything stays in the file's own units and axes. This module knows no mass, no simulator and no
+object set.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Triangle meshes: reading, cutting into few convex parts, mass properties, OBJ files.
 
 Bullet collides convex shapes only, and its cost grows with their number and their vertices. So
-every mesh becomes a handful of small hulls, once; the result is kept in a cache under a name made
-from the mesh itself. This module knows no simulator and no object set.
+`decompose` turns every mesh into a few small hulls, once; a cache keeps them under a hash of the
+mesh. This module calls no simulator and knows no object set.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_VERTICES = 32
 VERTEX_TOLERANCE = 0.004  # a hull may cut its own corners by this much: 0.3 mm on an 8 cm object
 MERGE_TOLERANCE = 0.03  # two parts become one if that adds less than this part of the volume
 CONVEX_RATIO = 0.95  # volume / hull volume from which a mesh counts as convex
-MAX_PAIRWISE = 24  # above this many pieces only the smallest looks for a partner: n instead of n^2
+MAX_PAIRWISE = 24  # beyond, only the smallest piece is paired with the others: n pairs, not n^2
 # Chosen for time: 4 to 10 s for a scanned object on one core. Without its remeshing ("off", and
 # "auto" when the mesh is clean) or with a shallower search, whose many cuts have to be merged again
 # (50 s for a ring), CoACD takes up to minutes; its own decimation shrinks hulls by up to a sixth.

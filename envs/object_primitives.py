@@ -1,7 +1,7 @@
 """Procedural solids: eleven families, each object determined by its index alone.
 
-Every one of them can be taken by a hand that opens 0.08 m, however it comes to lie: across the
-whole, across a bar, or across a wall with one finger inside. This module knows no simulator.
+A hand that opens 0.08 m can grasp every one of them in every resting pose: across the whole, across
+a bar, or across a wall with one finger inside. This module knows no simulator.
 """
 
 from __future__ import annotations

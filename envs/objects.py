@@ -1,8 +1,8 @@
-"""The things to be grasped: object sets.
+"""Object sets: the objects to be grasped, by name, from a folder of files, or from a plug-in.
 
-A set is named (`box`, `primitives`, `random_urdfs`) or is any folder of URDF and mesh files. Every
-object is one rigid body whose frame has its origin at the centre of mass and the axes of its
-source. This module knows neither robot nor scene, and not what URDF and mesh files look like.
+`OBJECT_SETS` lists the named sets; `load_object_set` also takes a folder of URDF and mesh files or
+an import path. Every object is one rigid body whose frame has its origin at the centre of mass and
+the axes of its source. This module knows neither robot nor scene, and no file format.
 """
 
 from __future__ import annotations
@@ -302,8 +302,8 @@ class FileSet(ObjectSet):
             sides = " x ".join(f"{side:.3g}" for side in model.extents)
             warnings.warn(
                 f"object {path} measures {sides} m, too large for a hand that opens "
-                f"{self.max_opening} m (and so may others be); set objects.fit, for example to 0.06, "
-                "or objects.scale",
+                f"{self.max_opening} m (and so may others be); set objects.fit, for example to "
+                "0.06, or objects.scale",
                 stacklevel=3,
             )
         return model

@@ -1,7 +1,7 @@
-"""`RandomizedGraspingEnv`: the grasping task in a world that changes with every episode.
+"""`RandomizedGraspingEnv`: the grasping task in a cell that changes with every episode.
 
-Registered as `RandomizedGrasping-v0`. What changes is drawn in `utils.domain_randomization` from
-the config's section `randomization`.
+Registered as `RandomizedGrasping-v0`. `utils.domain_randomization` draws the changes from the
+config's section `randomization`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from utils.domain_randomization import DomainRandomizer
 
 
 class RandomizedGraspingEnv(RobotGraspingEnv):
-    """`RobotGraspingEnv` whose every episode has physics and looks of its own.
+    """`RobotGraspingEnv` whose every episode has physics and an appearance of its own.
 
     info at reset has the episode's sample as `randomization`.
     `reset(options={"randomization": sample})` replays it; together with the scene's seed, the
     `start` and the same actions that gives the same episode bit for bit.
 
-    journal: file to which every episode that ends adds a line of JSON, None for none: `is_success`,
-    and the options that repeat it, `scene_seed`, `start` and `randomization`.
+    journal: file to which every finished episode appends a line of JSON, None for none. A line
+    holds `is_success` and the options that repeat the episode: `scene_seed`, `start` and
+    `randomization`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -33,10 +34,10 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         self.randomizer = DomainRandomizer(self.cell, self.config.randomization)
         self._recorded: Mapping[str, Any] | None = None
         self.journal: Path | None = None
-        self.cell.on_build = self._change_world
+        self.cell.on_build = self._randomize
         self.cell.on_action = self.randomizer.act
 
-    def _change_world(self, cell: Any) -> None:
+    def _randomize(self, cell: Any) -> None:
         if self._recorded is None:
             self.randomizer.randomize(int(self.np_random.integers(2**31)))
         else:
@@ -55,10 +56,10 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         if (terminated or truncated) and self.journal is not None:
-            self._write_down(info)
+            self._append_to_journal(info)
         return observation, reward, terminated, truncated, info
 
-    def _write_down(self, info: Mapping[str, Any]) -> None:
+    def _append_to_journal(self, info: Mapping[str, Any]) -> None:
         line = {name: info[name] for name in ("is_success", "scene_seed")}
         line |= {"start": self.start, "randomization": self.randomizer.sample}
         with self.journal.open("a", encoding="utf-8") as journal:

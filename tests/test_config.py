@@ -130,7 +130,7 @@ def test_override_values(text, expected):
         ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),
         ("evaluate.scenarios=[]", ["evaluate.scenarios", "got []"]),
         ("evaluate.scenarios=pile,pile", ["repeated"]),
-        ("env.observations=dept", ["observations[0]", "rgb, depth, state", "mean depth?"]),
+        ("randomization.parts=physic", ["parts[0]", "one of physics, vision", "mean physics?"]),
         ("objects.scale=-1", ["got -1", "a number > 0, or null"]),
         ("evaluate.rounds", ["KEY=VALUE", "did you mean evaluate.rounds?"]),
         ("=5", ["KEY=VALUE"]),

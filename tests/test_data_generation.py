@@ -17,6 +17,7 @@ import torch
 from envs import data_generation
 from envs.camera import Intrinsics, camera_intrinsics
 from envs.cell import PhysicsError
+from envs.cell_appearance import Appearance, Texture, draw_camera
 from envs.cell_scenes import SceneError
 from envs.data_generation import (
     SPLITS,
@@ -30,7 +31,6 @@ from envs.data_generation import (
     with_other_physics,
 )
 from envs.objects import ObjectError
-from envs.pybullet_appearance import Appearance, Texture, draw_camera
 from envs.pybullet_cell import PybulletCell
 from utils.config import load_config
 from utils.errors import UserError

@@ -1,9 +1,10 @@
 """The schema of the configuration: types and ranges of every key, as frozen typed objects.
 
-`configs/default.yaml` holds defaults, units and meanings; a new section is a new `Section` class
-here, a field of `Config` and its keys in that file. What sections are made of is in
-`utils.config_types`, the section of randomisation in `utils.config_types`. This module knows
-neither files nor command line, and not how a mistake is told.
+`configs/default.yaml` holds defaults, units and meanings. A new key is a field of a section here
+and a line there; a new section is a `Section` here, a field of `Config`, and its keys there. Types
+that several sections share and the section of randomisation are in `utils.config_types`. Keys that
+name an entry of a registry of `envs` or `models` are plain names here; `envs.registries` checks
+them. This module reads no files and writes no error messages (`utils.config` does).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""What the sections of the configuration are made of: their base, and types that several share.
+"""Building blocks of the configuration: the base of sections, shared types, randomised ranges.
 
-The schema of the section `randomization`: what differs from episode to episode, and how much.
-
-`utils.config_schema` has the other sections, `utils.domain_randomization` draws from the ranges.
+`utils.config_schema` has the sections that are made of them, apart from `randomization`, which
+stands here. `utils.domain_randomization` draws from its ranges.
 """
 
 from __future__ import annotations
@@ -51,7 +50,8 @@ class Section(BaseModel):
 
 
 class Range(NamedTuple):
-    """A parameter's range, see `utils.domain_randomization`."""
+    """A parameter's range, how a value is drawn from it, what the value does to the nominal one
+    (scale, add or set), and how often it is drawn (episode or step)."""
 
     low: float
     high: float

@@ -1,14 +1,10 @@
-"""Colours and solid textures, drawn from a generator.
+"""Changes of what a camera sees: light, camera error, textures, colours and depth noise.
 
-Textures are functions of a point on the object ("solid textures", Peachey 1985): they stick to
-it, need no texture coordinates and are laid over the rendered image, so every renderer shows the
-same, and nothing is loaded into the simulator, which never frees textures (bullet3 #3285). They are
-made up, or taken from a folder of pictures. Knows neither simulator nor scene.
-
-What a camera sees, changed: light, camera error, textures, colours and depth noise.
-
-Light, pose and field of view are for the renderer; the rest is laid over its image. Needs no
-renderer and knows no distribution.
+The renderer applies light, pose and field of view; `RandomView` applies the rest to its image.
+Textures are functions of a point on the object ("solid textures", Peachey 1985), generated or taken
+from a folder of pictures. They stick to the object, need no texture coordinates, are the same in
+every renderer, and load nothing into PyBullet, which never frees textures (bullet3 #3285). This
+module needs no renderer and knows neither simulator nor distribution.
 """
 
 from __future__ import annotations
@@ -37,8 +33,7 @@ _LATTICE = 16  # points of a grain's lattice along each axis, which then repeats
 
 class SolidTexture(Protocol):
     def factor(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) what the colours at points (N, 3), in the object's frame in metres, are
-        multiplied by."""
+        """(N, 3) factors of the colours at points (N, 3), in the object's frame in metres."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ class Texture:
         )
 
     def factor(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) what the colours at points (N, 3) are multiplied by."""
+        """(N, 3) factors of the colours at points (N, 3) in metres."""
         wave = np.sin(points @ self.waves.T + self.phases).mean(axis=1)
         wave = np.sign(wave) if self.hard else wave
         return 1 + wave[:, None] * self.strength
@@ -219,11 +214,11 @@ LIGHTS = {
 
 
 class RandomView:
-    """A change of everything a cell's camera sees; the same changes and frames give the same.
+    """Changes the images of a cell's camera; the same changes and frames give the same images.
 
     changes: for frame k of the episode, by parameter; names are the keys of the config's section
-    randomization.vision. shadow: 0 or 1. noisy_depth: measure depth as `KinectNoise` does.
-    textures: by PyBullet's body number. pose: (4, 4) of a body in W, for its texture.
+    randomization.vision. shadow: 0 or 1. noisy_depth: whether the depth gets a `KinectNoise`.
+    textures: by the simulator's body number. pose: (4, 4) of a body in W, for its texture.
     seed: of the noise, together with the frame's number.
     T_CC: (4, 4), the pose of the true camera in the calibrated one's frame. fov_scale: factor on
     the field of view. Both are those of the frame begun last.
@@ -243,7 +238,7 @@ class RandomView:
         self.frames = 0
 
     def begin_frame(self) -> None:
-        """Go on to the next frame, before anything is asked about it."""
+        """Begin the next frame; call this before anything else of the frame."""
         self._now = self._changes(self.frames)
         self._rng = np.random.default_rng([self._seed, _NOISE_STREAM, self.frames])
         self.frames += 1
@@ -254,7 +249,7 @@ class RandomView:
         self.fov_scale = self._value("camera_fov", 1.0)
 
     def lit(self, light: Mapping[str, Any]) -> dict[str, Any]:
-        """Light settings of `getCameraImage`, changed from nominal ones."""
+        """Light settings as in `envs.camera.DEFAULT_LIGHT`, changed from nominal ones."""
         lit = {name: self._value(key, light[name]) for key, name in LIGHTS.items()}
         x, y, z = light["lightDirection"]
         tilt = np.radians(
@@ -276,7 +271,7 @@ class RandomView:
     ) -> tuple[np.ndarray, np.ndarray]:
         """rgb (H, W, 3) uint8 and depth (H, W) float32 metres of a rendered image, changed.
 
-        bodies: (H, W) body numbers. K, T_WC: the camera that really took it.
+        bodies: (H, W) body numbers. K, T_WC: of the camera that rendered it, errors included.
         """
         image = rgb.astype(np.float32)
         known = known_depth(depth)

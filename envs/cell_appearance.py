@@ -1,7 +1,7 @@
-"""How a scene looks: colours, solid textures, light and camera poses, drawn from a generator.
+"""The appearance of training images: colours, textures, light and camera poses from a generator.
 
-Textures are laid over the rendered image, see `utils.random_view`. Physics never changes here, and
-depth only with the camera's pose.
+`utils.random_view` draws textures over the rendered image. Nothing here changes physics, and only
+the camera's pose changes depth.
 """
 
 from __future__ import annotations
@@ -9,25 +9,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pybullet
 
 from envs.camera import Intrinsics, camera_intrinsics
-from envs.cell import TABLE_OR_BACKGROUND
-from envs.pybullet_cell import PybulletCell
+from envs.cell import TABLE_OR_BACKGROUND, Cell
 from utils.config import CameraConfig
 from utils.random_view import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at
 
-_PLAIN_SHARE = 0.15  # of the scenes look as the cell does when nothing is randomised
-_ONE_COLOUR_SHARE = 0.2  # of the others: all objects in one colour, now and then the table's
+_PLAIN_SHARE = 0.15  # of the scenes keep the cell's own appearance
+_ONE_COLOUR_SHARE = 0.2  # of the others have all objects in one colour, a quarter in the table's
 _OBLIQUE_SHARE = 0.2  # of the camera poses are far from the configured one
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """table, objects: RGBA (1, 4) and (N, 4) in 0..1, None for the cell's own. textures: for the
-    table and then each object, None for none. light: changed entries of
-    `envs.camera.DEFAULT_LIGHT`.
+    """Colours, textures and light of one scene.
+
+    table, objects: RGBA (4,) and (N, 4) in 0..1, None for the cell's own. textures: of the table
+    and then each object, None for none. light: changed entries of `envs.camera.DEFAULT_LIGHT`.
     noise: standard deviation of the colour noise, 0..255.
     """
 
@@ -39,7 +38,7 @@ class Appearance:
 
     @staticmethod
     def draw(rng: np.random.Generator, count: int) -> Appearance:
-        """A random look for a scene of `count` objects."""
+        """A random appearance for a scene of `count` objects."""
         if rng.random() < _PLAIN_SHARE:
             return Appearance()
         grey = np.full(3, rng.uniform(0.15, 0.95))
@@ -50,25 +49,21 @@ class Appearance:
         textures = tuple(Texture.draw(rng) if rng.random() < 0.4 else None for _ in range(count))
         wood = Texture.draw(rng) if rng.random() < 0.5 else None
         return Appearance(
-            np.append(table, 1.0)[None],
+            np.append(table, 1.0),
             np.column_stack([objects, np.ones(count)]),
             (wood, *textures),
             _light(rng),
             rng.uniform(0, 6),
         )
 
-    def paint(self, cell: PybulletCell) -> None:
+    def paint(self, cell: Cell) -> None:
         """Colour the loaded scene's table and objects."""
         if self.table is None:
             return
-        colours = [(cell.table, self.table[0]), *zip(cell.bodies, self.objects)]
-        for body, colour in colours:
-            pybullet.changeVisualShape(
-                body, -1, rgbaColor=list(colour), physicsClientId=cell.client
-            )
+        cell.randomizable().paint([self.table, *self.objects])
 
     def photograph(
-        self, cell: PybulletCell, intrinsics: Intrinsics, T_WC: np.ndarray, rng: np.random.Generator
+        self, cell: Cell, intrinsics: Intrinsics, T_WC: np.ndarray, rng: np.random.Generator
     ) -> RGBDFrame:
         """The painted scene in this light, with textures and colour noise, and with its truth."""
         frame = cell.look(intrinsics, T_WC, with_truth=True, light=self.light)
