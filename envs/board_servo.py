@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.board import Board
+from envs.board import Board, CarriedBoard
 from envs.camera import Intrinsics, wrist_mount
 from envs.cell import Cell
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
-from envs.servo_arm import Load, ServoArm, image_period
+from envs.servo_arm import ServoArm, image_period
 from utils.config import ServoConfig
 from utils.errors import ServoError, unknown_choice
 from utils.servo_control import joint_limit_avoidance
@@ -98,16 +98,16 @@ def servo_to_goal(
     servo: VisualServo,
     goal: ServoView,
     see: Callable[[], Sight | None],
-    load: Load | None = None,
+    carried: CarriedBoard | None = None,
 ) -> ServoHistory:
     """Move the arm until the camera sees the goal; the history of the run, image by image.
 
-    see() returns the last sight, or None where no new image has arrived. load: the board on the
-    hand, if it carries one. The run ends with the arm at rest: converged where the correction stays
+    see() returns the last sight, or None where no new image has arrived. carried: the board on the
+    hand, if there is one. The run ends with the arm at rest: converged where the correction stays
     small (`servo.settled_...`), else with the reason, such as the time, a lost target or the gate.
     Raises ServoError where that happens before the first sight.
     """
-    arm, settings = ServoArm(cell, load), cell.config.servo
+    arm, settings = ServoArm(cell, carried), cell.config.servo
     views: list[ServoView] = []
     steps: list[ServoCommand] = []
     desired, seen, settled = np.zeros(7), cell.seconds, 0

@@ -6,25 +6,15 @@ A loop sends desired joint velocities and the age of the image that they rest on
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
+from envs.board import CarriedBoard
 from envs.cell import Cell
 from envs.robot_safety import ArmStoppedError, SafetyGate
 from utils.config import SafetyConfig
 
 _MAX_LAG = 0.05  # rad by which the commanded joint positions may be ahead of the true ones
 _REST_SECONDS = 0.1  # for the arm to come to rest after the last command
-
-
-class Load(Protocol):
-    """An object fixed to the hand. corners_E: (n, 3) points in E that stay within the box, m."""
-
-    corners_E: np.ndarray
-
-    def contact_force(self) -> float:
-        """Sum of the normal forces on the object in newtons."""
 
 
 def image_period(cell: Cell) -> int:
@@ -35,13 +25,18 @@ def image_period(cell: Cell) -> int:
 class ServoArm:
     """Sends joint velocities to the cell's arm, one physics step at a time, through the gate."""
 
-    def __init__(self, cell: Cell, load: Load | None = None, safety: SafetyConfig | None = None):
-        """load: an object on the hand, which the gate guards too. safety: the gate's limits; None
+    def __init__(
+        self,
+        cell: Cell,
+        carried: CarriedBoard | None = None,
+        safety: SafetyConfig | None = None,
+    ):
+        """carried: a board on the hand, which the gate guards too. safety: the gate's limits; None
         takes those of the cell's config."""
-        self.cell, self.robot, self.load = cell, cell.robot, load
+        self.cell, self.robot, self.carried = cell, cell.robot, carried
         guarded = np.zeros((1, 3))
-        if load is not None:
-            guarded = np.vstack([guarded, load.corners_E])
+        if carried is not None:
+            guarded = np.vstack([guarded, carried.corners_E])
         safety = safety or cell.config.safety
         self.gate = SafetyGate(safety, cell.config.robot, cell.dt, guarded)
         self._reference, self._velocity = cell.robot.q, np.zeros(7)  # of the last command
@@ -55,8 +50,8 @@ class ServoArm:
         """
         q = self.robot.q
         force = self.robot.contact_force()
-        if self.load is not None:
-            force += self.load.contact_force()
+        if self.carried is not None:
+            force += self.carried.contact_force()
         verdict = self.gate.check(desired, q, force, perception_age, self._velocity)
         if verdict.reason is not None:
             self._hold()

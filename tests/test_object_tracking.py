@@ -92,7 +92,7 @@ def test_an_object_far_from_where_it_was_expected_is_found(block):
     assert np.hypot(x, y) < 0.015
 
 
-def test_what_is_measured_owes_nothing_to_the_believed_camera(block):
+def test_the_measured_pose_does_not_depend_on_the_calibration(block):
     T_WB, grasp, tracker = block
     eye = grasp.position + [-0.07, 0, 0.25]
     T_WC = look_at(eye, eye + [0, 0, -1.0], [1, 0, 0])
@@ -106,17 +106,17 @@ def test_what_is_measured_owes_nothing_to_the_believed_camera(block):
     np.testing.assert_allclose(other[:3, :3], right[:3, :3], atol=0.017)  # 1 degree of the 2
 
 
-def test_the_table_is_fitted_under_a_wrong_belief():
+def test_the_table_is_fitted_under_a_wrong_calibration():
     T_WC = look_at([0.45, 0.1, 0.5], [0.5, 0, 0], [1, 0, 0])
     depth = depth_of_block(WRIST, T_WC, planar(0.5, 0, 0))
-    believed = T_WC @ planar(0, 0, 0)
-    believed[2, 3] += 0.01
-    normal, offset = fit_table_plane(depth, WRIST.K, inverse_pose(believed))
+    assumed = T_WC @ planar(0, 0, 0)
+    assumed[2, 3] += 0.01
+    normal, offset = fit_table_plane(depth, WRIST.K, inverse_pose(assumed))
     np.testing.assert_allclose(normal, T_WC[2, :3], atol=2e-3)
     np.testing.assert_allclose(offset, 0.5, atol=5e-4)
 
 
-def test_an_empty_table_and_a_place_outside_the_image_are_told_apart(block):
+def test_an_empty_table_and_a_place_outside_the_image_are_distinguished(block):
     T_WB, grasp, tracker = block
     T_WC = look_at([0.5, 0, 0.4], [0.5, 0, 0], [1, 0, 0])
     empty = depth_of_block(WRIST, T_WC, planar(5, 5, 0))
@@ -148,7 +148,7 @@ def arc(t, speed=0.05, rate=0.3):
     return radius * np.sin(rate * t), radius * (1 - np.cos(rate * t)), rate * t
 
 
-def test_a_turning_path_is_foreseen():
+def test_a_turning_path_is_predicted():
     motion = PlanarMotion(arc(0), 0.0)
     covariance = np.diag([1e-3, 1e-3, 0.02]) ** 2
     for k in range(1, 61):
@@ -188,8 +188,8 @@ def test_one_false_match_does_not_move_the_target(false):
     motion = PlanarMotion((0.0, 0.0, 0.2), 0.0)
     for k in range(1, 91):
         pose = np.array([0.05 * k / 30, 0.0, 0.2])
-        believed = motion.see(pose + (false if k == 60 else 0.0), covariance, k / 30)
-        assert believed == (k != 60)
+        accepted = motion.see(pose + (false if k == 60 else 0.0), covariance, k / 30)
+        assert accepted == (k != 60)
         if k >= 60:
             np.testing.assert_allclose(motion.at(k / 30)[:3], pose, atol=5e-4)
             np.testing.assert_allclose(motion.velocity, [0.05, 0, 0], atol=5e-3)

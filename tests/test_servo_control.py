@@ -200,15 +200,15 @@ def test_secondary_task_leaves_the_camera_alone_and_the_limit_behind(panda):
     twist = np.array([0.05, -0.02, 0.03, 0.1, 0.2, -0.1])
     upper, lower = panda.q + 2.0, panda.q - 2.0
     lower[2], upper[2] = panda.q[2] - 3.9, panda.q[2] + 0.1  # joint 3 is near its upper limit
-    wish = joint_limit_avoidance(panda.q, lower, upper, gain=2.0)
+    away = joint_limit_avoidance(panda.q, lower, upper, gain=2.0)
     # 10 % of 4 rad is 0.4; 0.3 rad of it are used up.
-    np.testing.assert_allclose(wish, [0, 0, -0.6, 0, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(away, [0, 0, -0.6, 0, 0, 0, 0], atol=1e-12)
     plain = servo.compute_joint_velocities(T_WE, twist, J_W)
-    kind = servo.compute_joint_velocities(T_WE, twist, J_W, secondary=wish)
+    both = servo.compute_joint_velocities(T_WE, twist, J_W, secondary=away)
     J = camera_jacobian("eye_in_hand", T_WE, J_W, T_EC=T_EC)
     np.testing.assert_allclose(J @ plain, twist, atol=1e-10)
-    np.testing.assert_allclose(J @ kind, twist, atol=1e-10)
-    assert kind[2] < plain[2] - 0.01
+    np.testing.assert_allclose(J @ both, twist, atol=1e-10)
+    assert both[2] < plain[2] - 0.01
 
 
 def test_damped_joint_velocities_keep_the_secondary_task_out_of_the_task(panda):

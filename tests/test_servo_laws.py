@@ -187,8 +187,8 @@ def test_missing_depths_are_refused_and_never_assumed():
     with pytest.raises(DepthError, match="none"):
         ImageBasedVisualServo(CAMERA).compute_velocity(CORNERS, CORNERS + 5)
     assumed = ImageBasedVisualServo(CAMERA, depth=0.8).compute_velocity(CORNERS, CORNERS + 5)
-    told = ImageBasedVisualServo(CAMERA).compute_velocity(CORNERS, CORNERS + 5, Z=0.8)
-    np.testing.assert_array_equal(assumed, told)
+    direct = ImageBasedVisualServo(CAMERA).compute_velocity(CORNERS, CORNERS + 5, Z=0.8)
+    np.testing.assert_array_equal(assumed, direct)
 
 
 @pytest.mark.parametrize(

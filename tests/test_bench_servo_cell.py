@@ -1,0 +1,19 @@
+"""The benchmark of the laws in the cell."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import bench_servo_cell
+from benchmarks.bench_servo_cell import LAWS
+from utils.servo_features import MOUNTINGS
+
+
+@pytest.mark.slow
+def test_quick_benchmark_reports_each_mounting_and_law(capfd, tmp_path, monkeypatch):
+    """One law; `test_board_servo` has the others."""
+    monkeypatch.setattr(bench_servo_cell, "LAWS", {"position_based": LAWS["position_based"]})
+    bench_servo_cell.main(["--quick", "--json", str(tmp_path / "bench.json")])
+    lines = capfd.readouterr().out.splitlines()
+    assert len(lines) >= 1 + 4 * len(MOUNTINGS)
+    assert not any(line.endswith("NO") for line in lines)
