@@ -1,9 +1,9 @@
 """How well a moved object is found: python -m benchmarks.bench_tracking [--json FILE] [KEY=VALUE]
 
 One test object on the table, seen once from overhead, when its grasp is planned, and then by the
-wrist camera from places above the grasp, the object having been moved by an amount that the tracker does not
-know. Errors are those of the grasp's frame against the simulator's truth: place in the plane, and
-turn (of what has one: a round object shows none). `seed` chooses the scenes, and
+wrist camera from places above the grasp, after the object has moved by an amount that the tracker
+does not know. Errors are those of the grasp's frame against the simulator's truth: place in the
+plane, and turn (a round object shows none). `seed` chooses the scenes, and
 `camera.depth_noise=kinect` makes both cameras noisy.
 """
 
