@@ -24,8 +24,9 @@ from models.ppo import KIND
 from models.ppo_rollouts import EVALUATION, derived_seeds, evaluate_policy
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
+from tests.helpers.ppo_parts import batch_of, ppo_of
 from tests.helpers.ppo_step import SIZE, take_step
-from tests.test_ppo import batch_of, ppo_of
+from tests.helpers.quick_envs import POINT
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.distributed import ALONE
@@ -33,11 +34,6 @@ from utils.errors import UserError
 from utils.runs import Stopwatch
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-POINT = [
-    "rl.env_id=tests.helpers.quick_envs:QuickPoint-v0", "rl.envs=2", "rl.rollout_steps=16",
-    "rl.batch_size=16", "rl.total_steps=192", "rl.evaluate_every=2", "rl.evaluation_episodes=3",
-    "rl.hidden_dim=8", "rl.device=cpu", "rl.parallel=false", "rl.epochs=2",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -112,20 +108,6 @@ def test_the_best_policy_alone_acts_as_in_its_run(tmp_path, monkeypatch):
         train_rl.main([*POINT, "--weights", "nowhere/alone.pt"])
 
 
-def test_evaluations_are_at_full_difficulty():
-    seen = "rl.policy_observations=[state,end_effector_position]"
-    settings = ["rl.parallel=false", "env.near_share=1", "env.observations=[state]", seen]
-    config = load_config(None, settings)
-    with training_envs(config, 2) as envs:
-        training = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
-        with envs.at_full_difficulty():
-            evaluated = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
-            again = envs.restart([1, 2], np.array([True, True]))["end_effector_position"][:, 2]
-            assert again.tolist() == evaluated.tolist()
-        after = envs.restart([1, 2])["end_effector_position"][:, 2]
-    assert max(training) < 0.2 < 0.4 < min(evaluated) and after.tolist() == training.tolist()
-
-
 ESTIMATED = [
     "rl.env_kwargs=images=true", "rl.policy_observations=[rgb,depth,state]",
     "rl.estimated_observations=goal", "rl.normalise_observations=false",
@@ -176,7 +158,7 @@ def test_pretraining_teaches_the_estimator_before_anything_is_done(tmp_path, mon
     assert [event.step for event in losses] == list(range(-1984, 1, 64)), "whole turns of 2 x 32"
     assert losses[-1].value < losses[0].value / 2, "of images not learned from yet"
     first = events.Scalars("update/estimate_loss")[0].value
-    assert first < losses[0].value / 2, "what was learned is not lost"
+    assert first < 0.75 * losses[0].value, "what was learned is not lost"
 
 
 def test_pretraining_without_anything_to_estimate_is_refused():
@@ -289,24 +271,11 @@ def test_a_training_can_start_from_weights(finished, tmp_path, monkeypatch):
         (["rl.initial=nowhere.pt"], "nowhere.pt"),
     ],
 )
-def test_mistakes_are_told_before_a_run_folder_is_made(tmp_path, monkeypatch, changes, message):
+def test_mistakes_end_a_run_before_its_folder_is_made(tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=message):
         train_rl.main([*POINT, *changes])
     assert not (tmp_path / "runs").exists()
-
-
-def test_env_kwargs_and_info_reach_the_environment():
-    config = load_config(None, [*POINT, "rl.env_kwargs=images=true",
-                                "rl.policy_observations=rgb,state",
-                                "rl.privileged_observations=goal"])  # fmt: skip
-    with training_envs(config, 2) as envs:
-        layout = make_ppo(envs.observation_space, envs.action_space, config).layout
-        observation = envs.restart([3, 4])
-    assert [part.key for part in (*layout.images, *layout.state)] == ["rgb", "state"]
-    assert [(part.key, part.shape) for part in layout.privileged] == [("goal", (2,))]
-    rng = np.random.default_rng(3)  # Gymnasium seeds its environments' generators like this
-    np.testing.assert_allclose(observation["goal"][0], rng.uniform(-1, 1, 2), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -473,7 +442,7 @@ def test_shipped_configs_are_valid(name):
     hidden = {*(config.rl.privileged_observations or ()), *(config.rl.estimated_observations or ())}
     truth = {"object_position", "object_offset", "object_outline", "grasp_goal", "grasped"}
     if not name.endswith("_state"):
-        assert hidden and hidden < truth, "what only the critic is told"
+        assert hidden and hidden < truth, "only the critic sees them"
         assert not truth & set(config.rl.policy_observations)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from tests.test_ppo import batch_of, ppo_of
+from tests.helpers.ppo_parts import batch_of, ppo_of
 from utils.distributed import Team, team
 
 SIZE = 16

@@ -9,6 +9,13 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+# Settings of a short training on PointEnv.
+POINT = [
+    "rl.env_id=tests.helpers.quick_envs:QuickPoint-v0", "rl.envs=2", "rl.rollout_steps=16",
+    "rl.batch_size=16", "rl.total_steps=192", "rl.evaluate_every=2", "rl.evaluation_episodes=3",
+    "rl.hidden_dim=8", "rl.device=cpu", "rl.parallel=false", "rl.epochs=2",
+]  # fmt: skip
+
 
 class PointEnv(gymnasium.Env):
     """Move a point in the plane to a goal: an episode is ten steps long, or ends within 0.1 of it.

@@ -1,0 +1,207 @@
+"""GraspPolicyNetwork against PyTorch's distributions and hand computations; policies from files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+
+import tests.helpers.quick_envs  # noqa: F401, registers its environments
+from models.grasp_policy import (
+    ActionDistribution,
+    GraspPolicyNetwork,
+    load_policy,
+    policy_for,
+    relief_of,
+)
+from models.ppo import KIND
+from models.ppo_observations import (
+    ObservationLayout,
+)
+from tests.helpers.ppo_parts import (
+    ppo_of,
+    settings_of,
+)
+from utils.checkpoint import load_checkpoint
+from utils.distributed import ALONE
+from utils.errors import UserError
+
+
+def distribution(squashed: bool) -> ActionDistribution:
+    rng = torch.Generator().manual_seed(1)
+    return ActionDistribution(
+        torch.randn(5, 3, generator=rng), torch.tensor([-1.0, 0.2, 0.5]), squashed
+    )
+
+
+def test_log_probability_and_entropy_of_a_gaussian():
+    ours = distribution(False)
+    theirs = Independent(Normal(ours.mean, ours.log_std.exp()), 1)
+    latent = ours.sample(torch.randn(5, 3))
+    torch.testing.assert_close(ours.log_prob(latent), theirs.log_prob(latent))
+    torch.testing.assert_close(ours.entropy().expand(5), theirs.entropy())
+
+
+def test_log_probability_of_a_squashed_gaussian():
+    ours = distribution(True)
+    theirs = TransformedDistribution(
+        Independent(Normal(ours.mean.double(), ours.log_std.double().exp()), 1), TanhTransform()
+    )
+    latent = ours.sample(torch.randn(5, 3))
+    torch.testing.assert_close(
+        ours.log_prob(latent).double(),
+        theirs.log_prob(latent.double().tanh()),
+        rtol=1e-4,
+        atol=1e-4,
+    )
+    far = torch.full((5, 3), 40.0)  # tanh(40) is 1 to the last bit, its logarithm must not be inf
+    assert torch.isfinite(ours.log_prob(far)).all()
+
+
+def test_a_squashed_density_integrates_to_one_and_its_entropy_is_right():
+    one = ActionDistribution(torch.tensor([[0.7]]), torch.tensor([-0.3]), True)
+    edges = torch.linspace(-1 + 1e-6, 1 - 1e-6, 200_001, dtype=torch.float64)
+    log_density = one.log_prob(edges.atanh().float()[:, None]).double()
+    density = log_density.exp()
+    assert torch.trapezoid(density, edges).item() == pytest.approx(1, abs=1e-3)
+    entropy = -torch.trapezoid(density * log_density, edges).item()
+    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0))
+    estimates = one.entropy(noise)
+    assert estimates.shape == (200_000,)
+    error = estimates.std().item() / math.sqrt(len(estimates))
+    assert estimates.mean().item() == pytest.approx(entropy, abs=4 * error)
+
+
+def test_the_network_of_the_tutorial():
+    network = GraspPolicyNetwork(image_feature_dim=512, state_dim=14, action_dim=7, hidden_dim=256)
+    image, state = torch.rand(2, 4, 224, 224), torch.randn(2, 14)
+    policy = network(image, state)
+    assert policy.mean.shape == (2, 7) and policy.log_std.shape == (7,)
+    assert network.value(image, state, torch.empty(2, 0)).shape == (2,)
+    assert policy.mean.abs().max() < 0.5, "a new policy acts around 0"
+
+
+def test_weights_start_orthogonal():
+    network = GraspPolicyNetwork(state_dim=20, hidden_dim=20, image_channels=0, hidden_layers=1)
+    weight = network.actor[0].weight.detach()
+    torch.testing.assert_close(weight @ weight.T, 2 * torch.eye(20), atol=1e-5, rtol=0)
+    head = network.mean_head.weight.detach()
+    torch.testing.assert_close(head @ head.T, 1e-4 * torch.eye(7), atol=1e-8, rtol=0)
+    assert network.value_head.weight.norm().item() == pytest.approx(1, abs=1e-5)
+
+
+def test_only_the_critic_sees_what_is_privileged():
+    network = GraspPolicyNetwork(8, 3, 2, 16, privileged_dim=2, conv_channels=[4, 4])
+    image, state = torch.rand(1, 4, 16, 16), torch.randn(1, 3)
+    here, there = torch.zeros(1, 2), torch.ones(1, 2)
+    policy, value = network.policy_and_value(image, state, here)
+    other_policy, other_value = network.policy_and_value(image, state, there)
+    assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
+
+
+def estimating() -> GraspPolicyNetwork:
+    return GraspPolicyNetwork(8, 3, 2, 16, privileged_dim=3, conv_channels=[4, 4], estimated_dim=2)
+
+
+def test_the_policy_goes_by_estimates_and_never_by_the_truth():
+    network = estimating()
+    image, state = torch.rand(5, 4, 16, 16), torch.randn(5, 3)
+    network.privileged_norm.update(torch.randn(100, 3) * 4 + 7)
+    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
+    other_policy, other_value = network.policy_and_value(image, state, torch.ones(5, 3))
+    assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
+    features = network.features(image, state)
+    torch.testing.assert_close(features[:, :2], network.estimate(image, state))
+    assert features.shape == (5, 2 + 3) and not features.requires_grad
+    scaled = network.privileged_norm(torch.ones(5, 3))[:, :2]
+    torch.testing.assert_close(network.truth(torch.ones(5, 3)), scaled)
+
+
+def test_the_policy_s_loss_leaves_the_estimator_alone_and_its_loss_the_policy():
+    network = estimating()
+    image, state = torch.rand(5, 4, 16, 16), torch.randn(5, 3)
+    estimator = {id(p) for p in network.estimator_parameters()}
+    assert 0 < len(estimator) < len(list(network.parameters()))
+
+    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
+    (policy.log_prob(torch.zeros(5, 2)).sum() + value.sum()).backward()
+    assert all((p.grad is None) == (id(p) in estimator) for p in network.parameters())
+
+    network.zero_grad()
+    network.estimate(image, state).square().sum().backward()
+    assert all((p.grad is not None) == (id(p) in estimator) for p in network.parameters())
+
+
+@pytest.mark.parametrize("squash", [False, True])
+def test_actions_keep_to_the_bounds(squash):
+    space = spaces.Box(np.array([-1, 0], np.float32), np.array([3, 0.08], np.float32))
+    layout = ObservationLayout.of(spaces.Box(-1, 1, (3,)))
+    network = policy_for(layout, space, settings_of(f"rl.squash={squash}"))
+    far = network.action(torch.tensor([[50.0, 50.0], [-50.0, -50.0]])).detach().numpy()
+    np.testing.assert_allclose(far, [space.high, space.low], atol=1e-6)
+    middle = network.action(torch.zeros(1, 2)).detach().numpy()
+    np.testing.assert_allclose(middle, [[1, 0.04]] if squash else [[0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "message"),
+    [
+        ("QuickDiscrete-v0", [], "Discrete.*Box of floats"),
+        ("QuickUnbounded-v0", ["rl.squash=true"], "no bounds"),
+    ],
+)
+def test_actions_that_cannot_be_learned(name, overrides, message):
+    env = gymnasium.make(name).unwrapped
+    layout = ObservationLayout.of(env.observation_space)
+    with pytest.raises(UserError, match=message):
+        policy_for(layout, env.action_space, settings_of(*overrides))
+
+
+def test_relief_is_how_far_pixels_stand_out():
+    """3 cm over the table is 1, whatever the table's depth; more than 15 cm is cut off."""
+    depth = torch.full((2, 1, 16, 16), 0.5)
+    depth[1] = 0.2
+    depth[:, :, 4:8, 4:8] -= 0.03
+    depth[0, :, 12, 12] -= 0.4
+    relief = relief_of(depth)
+    torch.testing.assert_close(relief[:, :, 5, 5], torch.ones(2, 1))
+    assert relief[0, 0, 0, 0] == 0 and relief[0, 0, 12, 12] == 5
+
+
+def test_a_saved_policy_acts_the_same(tmp_path):
+    env = gymnasium.make("QuickPoint-v0", images=True, disable_env_checker=True)
+    layout = ObservationLayout.of(env.observation_space)
+    ppo = ppo_of(layout=layout, actions=2)
+    observation, _ = env.reset(seed=0)
+    batch = layout.read_one(observation)
+    ppo.network.observe(batch, ALONE)  # statistics have to come back too
+    ppo.save(tmp_path / "policy.pt")
+    policy = load_policy(tmp_path / "policy.pt")
+    expected = ppo.network.action(ppo.network(batch.image(), batch.state).mean).detach().numpy()
+    np.testing.assert_allclose(policy(observation), expected[0], rtol=1e-5)
+    assert policy.network.state_norm.count.item() == 1
+
+    with pytest.raises(UserError, match="needs 'depth', but the observation holds state"):
+        policy({"state": observation["state"]})
+    with pytest.raises(UserError, match=r"'state' has shape \(3,\), the policy needs \(2,\)"):
+        policy(observation | {"state": np.zeros(3, np.float32)})
+
+
+def test_a_checkpoint_of_an_older_version_speaks_today_s_names():
+    """The shipped policy of many objects names an observation `squeeze` and a section `world`."""
+    path = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_random_urdfs.pt"
+    stored = load_checkpoint(path, KIND)
+    assert (
+        "squeeze" in stored["config"]["rl"]["policy_observations"] and "world" in stored["config"]
+    )
+    policy = load_policy(path)
+    assert policy.layout.state[-1].key == "opening_error"
+    assert policy.config["rl"]["policy_observations"][-1] == "opening_error"
+    assert policy.config["rl"]["pretraining_images"] == stored["config"]["rl"]["looks"]
+    assert policy.config["simulator"] == stored["config"]["world"]

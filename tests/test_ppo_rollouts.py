@@ -1,0 +1,107 @@
+"""Rollouts, evaluations and the memory of steps, on an environment that counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from models.ppo_observations import (
+    Observations,
+)
+from models.ppo_rollouts import (
+    NotFinite,
+    RolloutCollector,
+    StepMemory,
+    derived_seeds,
+    evaluate_policy,
+)
+from tests.helpers.ppo_parts import (
+    COUNTED,
+    CPU,
+    Counting,
+    ppo_of,
+)
+from utils.runs import Stopwatch
+
+
+def test_a_rollout_keeps_final_observations():
+    ppo = ppo_of()
+    collector = RolloutCollector(Counting(), COUNTED, 5, CPU, Stopwatch())
+    collector.restart([0, 1])
+    rollout = collector.collect(ppo.network, ppo.generator)
+    assert rollout.observations.state[..., 0].T.tolist() == [[0, 1, 2, 0, 1], [0, 1, 2, 3, 0]]
+    assert rollout.last.state[:, 0].tolist() == [2, 1]
+    assert rollout.rewards.T.tolist() == [[1, 2, 3, 1, 2], [1, 2, 3, 4, 1]]
+    assert rollout.cut == [(2, 0)] and rollout.cut_final.state.tolist() == [[3]]
+    assert [tuple(episode[:3]) for episode in rollout.episodes] == [(6, 3, False), (10, 4, True)]
+    going_on = collector.collect(ppo.network, ppo.generator)
+    assert going_on.observations.state[0, :, 0].tolist() == [2, 1]
+    assert going_on.episodes[0].total == 6
+
+
+@pytest.mark.parametrize("bad", ["observation", "reward"])
+def test_numbers_that_are_not_finite_are_refused(bad):
+    class Broken(Counting):
+        def step(self, actions):
+            observation, rewards, *rest = super().step(actions)
+            if (observation[1] == 2).all():
+                (observation if bad == "observation" else rewards)[1] = np.nan
+            return observation, rewards, *rest
+
+    ppo = ppo_of()
+    collector = RolloutCollector(Broken(), COUNTED, 5, CPU, Stopwatch())
+    collector.restart([0, 1])
+    with pytest.raises(NotFinite, match=f"{bad}.*of environment 1 .*step 10[24]"):
+        collector.collect(ppo.network, ppo.generator, first_step=100)
+
+
+def test_evaluation_gives_each_seed_its_episode():
+    class Seeded(Counting):
+        """The reward is the seed, the length differs between environments."""
+
+        def restart(self, seeds, which=None):
+            which = np.ones(2, bool) if which is None else which
+            if not hasattr(self, "count"):
+                self.count, self.seed = np.zeros((2, 1), np.float32), np.zeros(2)
+            self.count[which] = 0
+            self.seed[which] = np.array(seeds)[which]
+            return self.count
+
+        def step(self, actions):
+            observation, _, *rest = super().step(actions)
+            return observation, self.seed, *rest
+
+    episodes = evaluate_policy(
+        ppo_of().network, Seeded(), COUNTED, [10, 20, 30, 40, 50], CPU, Stopwatch()
+    )
+    assert [e.total / e.length for e in episodes] == [10, 20, 30, 40, 50]
+
+
+def test_derived_seeds_are_unrelated_and_repeatable():
+    assert derived_seeds(3, 1, 2) == derived_seeds(3, 1, 2)
+    places = [(0, 0), (0, 1), (1, 0), (0, 0, 1)]
+    assert len({seed for place in places for seed in derived_seeds(50, *place)}) == 200
+
+
+def test_the_memory_holds_the_latest_steps():
+    memory, generator = StepMemory(5), torch.Generator().manual_seed(0)
+
+    def steps(*numbers: float) -> Observations:
+        column = torch.tensor(numbers)[:, None]
+        return Observations((column[:, None, None].byte(),), column, -column)
+
+    for part in (steps(0, 1, 2), steps(3, 4, 5, 6)):
+        memory.add(part)
+    drawn = memory.draw(200, generator)
+    assert len(memory) == 5 and set(drawn.state.flatten().tolist()) == {2, 3, 4, 5, 6}
+    assert torch.equal(drawn.images[0].flatten().float(), drawn.state.flatten())
+    assert torch.equal(drawn.privileged, -drawn.state)
+    memory.add(steps(*range(10, 20)))
+    assert set(memory.draw(200, generator).state.flatten().tolist()) == set(range(15, 20))
+    memory.clear()
+    memory.add(steps(7))
+    assert memory.draw(3, generator).state.flatten().tolist() == [7, 7, 7]
+    none = StepMemory(0)
+    none.add(steps(1, 2))
+    assert not none
