@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-import tests.helpers.quick_envs  # noqa: F401, registers its environments
 from models.grasp_policy import (
     GraspPPO,
     policy_for,
