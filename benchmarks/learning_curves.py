@@ -52,7 +52,9 @@ def training_success(run: Path) -> tuple[np.ndarray, np.ndarray]:
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
     if "training/success_share" not in events.Tags()["scalars"]:
-        raise UserError(f"{run}: no training/success_share in its TensorBoard events; give a run's folder")
+        raise UserError(
+            f"{run}: no training/success_share in its TensorBoard events; give a run's folder"
+        )
     points = events.Scalars("training/success_share")
     return np.array([p.step for p in points]), np.array([p.value for p in points])
 

@@ -48,7 +48,6 @@ PUBLISHED = (
 # The best of them beside our planners in the README: success and cleared on 5 and on 15 objects.
 PUBLISHED_BESIDE = (
     ("OrbitGrasp (published: floating hand, noisy side view)", ("97 %", "98 %"), ("-", "-")),
-    ("AnyGrasp (published: real bins of 300 objects)", ("-", "-"), ("93 %", "-")),
 )
 
 CHINESE = {
@@ -65,7 +64,9 @@ CHINESE = {
     "OrbitGrasp (published: floating hand, noisy side view)": (
         "OrbitGrasp(已发表:没有手臂的浮动手爪,带噪声的侧视图)"
     ),
-    "AnyGrasp (published: real bins of 300 objects)": "AnyGrasp(已发表:真实料箱,300 个物体)",
+    "In real bins of 300 objects AnyGrasp reaches 93 %.": (
+        "AnyGrasp 在 300 个物体的真实料箱中达到 93 %。"
+    ),
 }
 
 
@@ -161,12 +162,9 @@ def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
         lines.append([say(name), *five, *fifteen])
     ahead = points(_pair(clutter, "graspnet", "heuristic")["success"])
     sentence = say("On 15 objects GraspNet's success minus the heuristic's is {} points.")
-    return "\n\n".join(
-        [
-            table(list(map(say, header)), lines),
-            f"{sentence.format(ahead)} {_short(say, scoreboard)}",
-        ]
-    )
+    others = say("In real bins of 300 objects AnyGrasp reaches 93 %.")
+    below = f"{sentence.format(ahead)} {others} {_short(say, scoreboard)}"
+    return "\n\n".join([table(list(map(say, header)), lines), below])
 
 
 def published(say: Say) -> str:
