@@ -109,7 +109,7 @@ def test_a_frozen_camera_stops_the_arm(cell, images):
     assert "the watchdog allows 100 ms" in failure.value.detail
     # One period of 8 steps, and the watchdog's 24, after the last image; 24 to come to rest.
     assert images * 8 + 20 < cell.steps < images * 8 + 24 + 8 + 30
-    cell.step(4)
+    cell.step(12)
     assert np.abs(cell.robot.joint_state()[1]).max() < 1e-2, "the arm is at rest"
 
 
