@@ -143,15 +143,11 @@ def updates(config: Config) -> int:
     return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
 
 
-def train(
-    config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[Row]
-) -> bool:
+def train(config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[Row]) -> bool:
     """Train to the end, to a target, or until Ctrl-C (False); each evaluation adds a row to
     history."""
     processes, settings, watch = ppo.team, config.rl, Stopwatch()
-    collector = RolloutCollector(
-        envs, ppo.layout, settings.rollout_steps, processes.device, watch
-    )
+    collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, processes.device, watch)
     per_update, total = settings.envs * settings.rollout_steps, updates(config)
     step = ppo.updates * per_update
     curves = Curves(run / "tensorboard", step, processes.is_main)
@@ -220,18 +216,14 @@ def begin_episodes(
     ppo.memory.clear()
 
 
-def evaluate(
-    config: Config, envs: TrainingEnvs, ppo: GraspPPO, watch: Stopwatch, step: int
-) -> Row:
+def evaluate(config: Config, envs: TrainingEnvs, ppo: GraspPPO, watch: Stopwatch, step: int) -> Row:
     """Deterministic episodes on seeds that stay the same and that no training episode has."""
     processes = ppo.team
     seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
     own, episodes = seeds[processes.rank :: processes.ranks], []
     if own:
         with envs.at_full_difficulty():
-            episodes = evaluate_policy(
-                ppo.network, envs, ppo.layout, own, processes.device, watch
-            )
+            episodes = evaluate_policy(ppo.network, envs, ppo.layout, own, processes.device, watch)
     return {"update": ppo.updates, "step": step, **summary(processes.concatenate(episodes))}
 
 

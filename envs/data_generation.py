@@ -197,9 +197,7 @@ def _make_shard(folder: Path, split: str, number: int) -> int:
         for frame, more_trials in label_scene(_worker_config, scene, name, _worker_cell):
             frames.append(frame)
             trials += more_trials
-    write_shard(
-        shard_path(folder, split, number), frames, trials, _worker_cell.gripper.max_opening
-    )
+    write_shard(shard_path(folder, split, number), frames, trials, _worker_cell.gripper.max_opening)
     return len(frames)
 
 

@@ -67,9 +67,10 @@ class RobotGraspingEnv(gymnasium.Env):
     | `ee`        | 7    | dx, dy, dz, rotation vector (3)              | `position_step` m, `rotation_step` rad |
     | `ee_planar` | 5    | dx, dy, dz, dyaw                             | `position_step` m, `rotation_step` rad |
     | `joint`     | 8    | changes of the 7 joint angles                | `joint_step` rad             |
-    | all         |      | last entry: the gripper. `gripper="opening"`: the opening itself (-1 closed, 1 open); `gripper="change"`: a change of the commanded opening, which stays within 20 mm of the true one | `gripper_step` m |
+    | all         |      | last entry, `gripper="opening"`: -1 closed, 1 open | half of the opening    |
+    | all         |      | last entry, `gripper="change"`: of the opening | `gripper_step` m           |
 
-    Directions are those of W, or with `frame="hand"` those of the commanded E, whose z is the
+    The commanded opening stays within 20 mm of the true one. Directions are those of W, or with `frame="hand"` those of the commanded E, whose z is the
     approach. Changes add up on the *commanded* pose, stay within the workspace and the joint
     limits, and are scaled down as a whole where a joint would exceed its speed limit. The command
     stays where it is when the arm cannot reach the new one, when something holds the arm up, or
@@ -217,7 +218,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._sleeping = self.cell.enable_sleeping()  # until the robot touches something
 
     def take_over(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode in the cell as it is, the arm at rest; `hand_over` gives the arm back."""
+        """Begin an episode in the cell as it is, the arm at rest; `hand_over` ends it."""
         self._scene_seed, self._sleeping = self.cell.scene.seed, False
         self._seen.begin_scene()
         return self._begin(self.cell.robot.q)

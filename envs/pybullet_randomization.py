@@ -84,9 +84,7 @@ class PybulletRandomizable:
             pybullet.changeDynamics(*link, **quantities, physicsClientId=client)
         for i, joint in enumerate(ARM):
             damping = _changed(changes, "joint_damping", self._damping[joint], i)
-            pybullet.changeDynamics(
-                robot.body, joint, jointDamping=damping, physicsClientId=client
-            )
+            pybullet.changeDynamics(robot.body, joint, jointDamping=damping, physicsClientId=client)
         x, y, z = self._gravity
         pybullet.setGravity(x, y, _changed(changes, "gravity", z), physicsClientId=client)
         for name, attribute in _OF_MOTORS.items():

@@ -231,7 +231,7 @@ class Robot(ABC):
 
     @abstractmethod
     def touches(self) -> bool:
-        """Whether anything touches the robot, or is so near that the simulator looks for contact."""
+        """Whether anything touches the robot, or is so near that contact is looked for."""
 
     @abstractmethod
     def touches_body(self, body: int) -> bool:

@@ -48,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not options.gui:
             pictures.append(env.render())
     print(
-        f"step {step:3d}: ended by {info['reason']}, return {total:.3f}; {_state_in_words(env, info)}"
+        f"step {step:3d}: ended by {info['reason']}, return {total:.3f}; "
+        f"{_state_in_words(env, info)}"
     )
     if not options.gui:
         folder = new_run_folder("grasping_env", None, config)

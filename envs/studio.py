@@ -1,4 +1,4 @@
-"""Pictures and films for people: a scenic camera with shadows and, where there are any, fine meshes.
+"""Pictures and films for people: a scenic camera with shadows and fine meshes where they exist.
 
 To see a scene, and what the cell's camera sees of it:
 

@@ -303,7 +303,9 @@ class CheckedEnv(gymnasium.Wrapper):
             result = call()
         except UserError as error:
             raise UserError(f"environment {self._index}: {error}") from None
-        except Exception:  # a user's environment may raise anything; the message holds its traceback
+        except (
+            Exception
+        ):  # a user's environment may raise anything; the message holds its traceback
             raise WorkerError(
                 f"environment {self._index} raised an error:\n{traceback.format_exc()}"
             ) from None

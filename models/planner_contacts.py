@@ -27,8 +27,8 @@ def exact_quality(
 ) -> np.ndarray:
     """(N,) in [0, 1]: quality of the pads' contacts, at the nominal pose and at `PERTURBATIONS`.
 
-    The quality of a pose is 0 unless both pads first meet the same object with normals inside the friction
-    cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
+    The quality of a pose is 0 unless both pads first meet the same object with normals inside the
+    friction cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
     """
     N, P = len(candidates), len(PERTURBATIONS)
     along, across = candidates.axes()

@@ -96,7 +96,7 @@ class OraclePlanner(SearchPlanner):
         gripper: GripperGeometry,
         workspace: Workspace,
         seed: int = 0,
-        settings: SearchSettings = SearchSettings(shortlist=1500, finalists=500),
+        settings: SearchSettings = SearchSettings(shortlist=1500, finalists=500),  # noqa: B008 - frozen
         judged: int = 120,
     ):
         super().__init__(gripper, workspace, seed, settings)

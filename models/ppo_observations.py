@@ -89,9 +89,7 @@ class ObservationLayout:
         boxes = space.spaces if isinstance(space, spaces.Dict) else {ALL: space}
         for key, box in boxes.items():
             if not isinstance(box, spaces.Box):
-                raise UserError(
-                    f"observation {key!r} is {box}; expected a Box, or a Dict of Boxes"
-                )
+                raise UserError(f"observation {key!r} is {box}; expected a Box, or a Dict of Boxes")
         privileged_keys = privileged_keys or ()
         if policy_keys is None:
             policy_keys = [key for key in boxes if key not in privileged_keys]

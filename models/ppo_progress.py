@@ -1,4 +1,4 @@
-"""How far a training of PPO has come: summaries of episodes, the best evaluation, checkpoints, curves.
+"""How far a training of PPO has come: summaries of episodes, evaluations, checkpoints, curves.
 
 An evaluation is a row, a dict with `update`, `step` (environment steps), and the means over its
 episodes: `return`, `length` (steps) and, where the environment reports it, `success` (share). The

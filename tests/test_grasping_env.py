@@ -204,7 +204,7 @@ def test_depth_noise_reaches_the_environment(make, config):
         np.testing.assert_array_equal(observation["rgb"], without["rgb"])
         known = observation["depth"] > 0
         error = (observation["depth"] - without["depth"])[known]
-        assert 1e-3 < np.abs(error).max() and np.abs(error).mean() < 0.01 < known.mean()
+        assert np.abs(error).max() > 1e-3 and np.abs(error).mean() < 0.01 < known.mean()
 
 
 # --- Rendering --------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Height maps of known boxes; local maxima against a definition that looks at every pair of pixels."""
+"""Height maps of known boxes; local maxima against a definition over every pair of pixels."""
 
 from __future__ import annotations
 

@@ -27,9 +27,7 @@ SIDE = 0.09  # m, of a cube that the Panda's own hand cannot take
 def _cell(simulator: str, *overrides: str):
     if simulator == "mujoco":
         pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-    return make_cell(
-        load_config(None, [f"simulator={simulator}", "sim.renderer=tiny", *overrides])
-    )
+    return make_cell(load_config(None, [f"simulator={simulator}", "sim.renderer=tiny", *overrides]))
 
 
 @pytest.fixture(scope="module", params=SIMULATORS)

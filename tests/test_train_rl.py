@@ -149,8 +149,8 @@ def test_the_estimator_learns_where_the_goal_is(tmp_path, monkeypatch):
 
 def test_pretraining_teaches_the_estimator_before_anything_is_done(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.pretraining_images=2000", "rl.estimate_memory=500",
-                "rl.estimate_epochs=8"]  # fmt: skip
+    settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.pretraining_images=2000",
+                "rl.estimate_memory=500", "rl.estimate_epochs=8"]  # fmt: skip
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
     events = EventAccumulator(str(run / "tensorboard")).Reload()

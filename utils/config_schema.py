@@ -274,8 +274,6 @@ class AdaptationConfig(Section):
     held_out: Annotated[float, Field(gt=0, lt=1)]
 
 
-
-
 class EnvConfig(Section):
     observations: Names
     control: Literal["ee", "ee_planar", "joint"]

@@ -48,8 +48,9 @@ class KinectNoise:
     resolution.
     shift: standard deviation, pixels, of the offset at which each pixel reads the disparity.
     step: pixels, the unit in which disparities are counted. noise: standard deviation of a
-    disparity in steps. Barron and Malik's formula 35130 / round(35130 / z + N(0, 1/6) + 0.5), z in centimetres,
-    counts 35130 cm = 585.5 px x 7.5 cm x 8, hence eighths of a pixel: their 1/6 is 1/6 of a step.
+    disparity in steps. Barron and Malik's formula 35130 / round(35130 / z + N(0, 1/6) + 0.5), z in
+    centimetres, counts 35130 cm = 585.5 px x 7.5 cm x 8, hence eighths of a pixel: their 1/6 is 1/6
+    of a step.
     (Of a pixel, it would be 3 mm at 0.8 m, three times what Khoshelham and Elberink, Sensors 2012,
     measured.) Their 0.5 undoes a truncation that this code does not make.
     window: pixels, odd; side of the square in which dots are matched. tolerance: pixels, by which a
@@ -141,7 +142,7 @@ class KinectNoise:
         kernel = np.ones(size, np.uint8)
         spread = cv2.dilate(disparity, kernel) - cv2.erode(disparity, kernel)
         recognised = disparity[rows, cols] > 0
-        # Every dot agrees where nothing differs by the least tolerance; only the others need a test.
+        # Every dot agrees where nothing differs by the least tolerance; the others need a test.
         doubtful = np.flatnonzero(recognised & (spread[rows, cols] >= self.tolerance))
         centre = rows[doubtful], cols[doubtful]
         total, count = (

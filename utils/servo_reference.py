@@ -112,7 +112,9 @@ def rows() -> Iterator[Row]:
         history = from_start(ImageBasedVisualServo(CAMERA, interaction=interaction))
         yield Row(f"iterations, {interaction} L", history.iterations, reference, 0.01)
         if interaction == "current":
-            yield Row("final position (mm), current L", history.pose_errors()[0][-1] * 1e3, 0.011, 0.05)
+            yield Row(
+                "final position (mm), current L", history.pose_errors()[0][-1] * 1e3, 0.011, 0.05
+            )
         if interaction == "desired":
             turn = np.degrees(history.pose_errors()[1][-1])
             yield Row("final rotation (deg), desired L", turn, 0.0009, 0.06)

@@ -6,8 +6,8 @@ import torch
 
 
 class FixedMaps(torch.nn.Module):
-    """A network that returns the same maps for every image of a size: quality `best` in a disc around one
-    pixel and `elsewhere` otherwise."""
+    """A network that returns the same maps for every image of a size: quality `best` in a disc
+    around one pixel and `elsewhere` otherwise."""
 
     input_channels, num_angle_bins, centre_head = 4, 18, None
 

@@ -1,4 +1,6 @@
-"""Steps of a Trainer alone or, started by torchrun, of several: python -m tests.helpers.one_step FOLDER
+"""Steps of a Trainer alone or, started by torchrun, of several.
+
+    python -m tests.helpers.one_step FOLDER
 
 Every process leaves its gradients of the first step and its weights after three in FOLDER.
 """

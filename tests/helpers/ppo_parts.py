@@ -1,4 +1,4 @@
-"""Small trainings of PPO: settings, rollouts and minibatches of an environment that counts steps."""
+"""Small trainings of PPO: settings, rollouts and minibatches of one that counts steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Updates of a GraspPPO alone or, started by torchrun, of several: python -m tests.helpers.ppo_step FOLDER
+"""Updates of a GraspPPO alone or, started by torchrun, of several.
+
+    python -m tests.helpers.ppo_step FOLDER
 
 Every process leaves its gradient of the first minibatch and its weights after it in FOLDER.
 """

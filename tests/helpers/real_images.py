@@ -1,4 +1,4 @@
-"""Tiny real images of bars with their labels, also as folders in Cornell's and Jacquard's format."""
+"""Tiny real images of bars with their labels, also as folders of Cornell and Jacquard."""
 
 from __future__ import annotations
 
