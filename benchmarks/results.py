@@ -144,7 +144,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_parts(parts, options.scale)
         return 0
     if not options.write:
-        commit = options.commit or code_commit()
+        if options.commit is None:
+            commit = code_commit()
+        else:
+            commit = _git("rev-parse", "--verify", f"{options.commit}^{{commit}}")
         for part in parts:
             if options.commit is not None and not is_finished(part, commit, options.scale):
                 print(f"{part.name}: skipped, because {RUNS / commit} does not hold all of it")
