@@ -42,7 +42,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 FIGURES = Path("docs/results")  # what the tables are written from
 RUNS = Path("runs/results")
 # Files on which a figure depends: a commit that touches none of them changes no table.
-CODE = ("envs", "models", "utils", "configs", "checkpoints", "*.py", "benchmarks/bench_*.py",
+CODE = ("envs", "models", "utils", "configs", "checkpoints", ":(glob)*.py",
+        "benchmarks/bench_*.py",
         "benchmarks/metrics.py", "requirements.txt")  # fmt: skip
 
 
