@@ -37,7 +37,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.camera import camera_intrinsics
+from envs.cell import camera_intrinsics
 from envs.data_generation import generate
 from envs.registries import check_names
 from models.graspnet import GraspNet, create_model

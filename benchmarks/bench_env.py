@@ -21,7 +21,7 @@ import pybullet_data
 from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from envs.cell_scenes import Scene, make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set

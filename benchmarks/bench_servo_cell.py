@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.board import Board
 from envs.board_servo import BoardCamera, servo_settings, servo_to_goal, view_of
-from envs.camera import wrist_mount
+from envs.cell import wrist_mount
 from envs.cell_scenes import Scene
 from envs.pybullet_bodies import PybulletCarriedBoard, add_board
 from envs.pybullet_cell import PybulletCell

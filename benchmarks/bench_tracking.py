@@ -21,8 +21,7 @@ from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
-from envs.robot_kinematics import UnreachableError, moved
-from envs.robot_postures import choose_posture
+from envs.robot_kinematics import UnreachableError, choose_posture, moved
 from models.planners import make_planner
 from utils.config import load_config, run_script
 from utils.errors import TargetLostError

@@ -15,14 +15,13 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from envs.camera_calibration import teach
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop
 from envs.closed_loop_tracker import WristImage
 from envs.execution import execute_grasp
 from envs.objects import load_object_set
 from envs.robot_kinematics import forward_kinematics
-from envs.scenarios import SCENARIOS, disturbed
+from envs.scenarios import SCENARIOS, disturbed, teach
 from envs.simulators import make_cell
 from envs.studio import Studio
 from models.planners import make_planner

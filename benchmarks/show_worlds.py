@@ -14,8 +14,7 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from envs.camera import Intrinsics
-from envs.cell import Cell
+from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from envs.board import Board, CarriedBoard
-from envs.camera import Intrinsics, wrist_mount
-from envs.cell import Cell
+from envs.cell import Cell, Intrinsics, wrist_mount
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, geometric_jacobian
 from envs.servo_arm import ServoArm, image_period
 from utils.config import ServoConfig

@@ -1,32 +1,105 @@
-"""The abstract robot cell: robot, camera, objects and their truth, whatever simulates them.
+"""The abstract robot cell and its cameras, whatever simulates them.
 
-`envs.pybullet_cell` and `envs.mujoco_cell` implement it. Execution, closed loops, scenarios, rounds
-and planners know a cell only as far as it is described here.
+`envs.pybullet_cell` and `envs.mujoco_cell` implement `Cell`, `envs.pybullet_camera` and
+`envs.mujoco_camera` implement `Camera`; the abstract robot is in `envs.robot`. Execution, closed
+loops, scenarios, rounds and planners know a cell only as far as it is described here.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 
 from envs.board import Board, CarriedBoard
-from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics, camera_intrinsics, wrist_mount
 from envs.cell_layout import on_table
 from envs.cell_scenes import EMPTY, Scene
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.robot_safety import ArmGate
-from utils.config import Config
+from utils.config import CameraConfig, Config
 from utils.depth import make_depth_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at
+
+# The light of every picture that names no other. The keys are those of PyBullet's getCameraImage:
+# lightDirection points towards the light, lightDistance is in metres, shadow is 0 or 1.
+DEFAULT_LIGHT = {
+    "lightDirection": (0.3, -0.4, 1.0),
+    "lightColor": (1.0, 1.0, 1.0),
+    "lightDistance": 2.0,
+    "lightAmbientCoeff": 0.55,
+    "lightDiffuseCoeff": 0.45,
+    "lightSpecularCoeff": 0.05,
+    "shadow": 0,
+}
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion. width, height in pixels; fov_deg is vertical;
+    near and far bound the depths that are seen, in metres."""
+
+    width: int
+    height: int
+    fov_deg: float
+    near: float = 0.1
+    far: float = 2.0
+
+    @property
+    def K(self) -> np.ndarray:
+        """(3, 3) pinhole matrix; square pixels; integer coordinates at pixel centres."""
+        focal = self.height / 2 / np.tan(np.radians(self.fov_deg) / 2)
+        return np.array(
+            [
+                [focal, 0.0, (self.width - 1) / 2],
+                [0.0, focal, (self.height - 1) / 2],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class Image:
+    """rgb (H, W, 3) uint8; depth (H, W) float32 metres along the optical axis, 0 where nothing is
+    nearer than the far plane; bodies (H, W) int32 the simulator's body numbers, -1 for none."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    bodies: np.ndarray
+
+
+class Camera(ABC):
+    """Renders one simulated cell from any pose."""
+
+    @abstractmethod
+    def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
+        """The image of a camera at T_WC (4, 4); `light` changes entries of DEFAULT_LIGHT."""
+
+    def close(self) -> None:  # noqa: B027 - not every renderer holds resources
+        """Free what the renderer holds; may be called again."""
+
+
+def camera_intrinsics(camera: CameraConfig) -> Intrinsics:
+    """The configured camera's intrinsics; the wrist camera has a field of view of its own."""
+    fov = camera.fov_deg if camera.mount == "overhead" else camera.wrist_fov_deg
+    return Intrinsics(camera.width, camera.height, fov, camera.near, camera.far)
+
+
+def wrist_mount(camera: CameraConfig) -> np.ndarray:
+    """(4, 4) T_EC: the wrist camera beside the hand, its optical axis along the approach."""
+    T = np.eye(4)
+    # Image right is E's +y, the closing line; at home image up points away from the robot.
+    T[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    T[:3, 3] = camera.wrist_position
+    return T
+
 
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the round.
@@ -43,7 +116,7 @@ class Cell(ABC):
     """A simulated robot cell. Close it, or use it in a `with` block.
 
     dt: s, a physics step. home: (7,) rad. gripper: the robot's hand. robot, camera: see
-    `envs.robot.Robot` and `envs.camera.Camera`. bodies: the simulator's numbers of the objects.
+    `envs.robot.Robot` and `envs.cell.Camera`. bodies: the simulator's numbers of the objects.
     remaining: numbers of the objects still in the round. steps, frames: taken since the scene was
     built. Callbacks, each called with the cell: on_build when a scene has been built and nothing
     has moved yet, before_step before every physics step (to disturb the objects), on_step after it
@@ -301,7 +374,7 @@ class Cell(ABC):
         light: dict | None = None,
     ) -> RGBDFrame:
         """The frame of a camera at T_WC (4, 4), without noise; `light` changes entries of
-        `envs.camera.DEFAULT_LIGHT`."""
+        `envs.cell.DEFAULT_LIGHT`."""
         image = self.image(intrinsics, T_WC, light)
         truth = self.truth() if with_truth else None
         return RGBDFrame(

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from envs.camera import Intrinsics, camera_intrinsics
-from envs.cell import TABLE_OR_BACKGROUND, Cell
+from envs.cell import TABLE_OR_BACKGROUND, Cell, Intrinsics, camera_intrinsics
 from utils.config import CameraConfig
 from utils.random_view import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at
@@ -26,7 +25,7 @@ class Appearance:
     """Colours, textures and light of one scene.
 
     table, objects: RGBA (4,) and (N, 4) in 0..1, None for the cell's own. textures: of the table
-    and then each object, None for none. light: changed entries of `envs.camera.DEFAULT_LIGHT`.
+    and then each object, None for none. light: changed entries of `envs.cell.DEFAULT_LIGHT`.
     noise: standard deviation of the colour noise, 0..255.
     """
 

@@ -3,7 +3,7 @@
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. The last two follow VGN (Breyer et al.,
 "Volumetric Grasping Network", CoRL 2020). This module knows no robot, camera, task or simulator:
-`envs.pybullet_scenes` simulates how objects come to rest.
+`envs.pybullet_bodies` simulates how objects come to rest.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.cell_layout import square_walls
 from envs.objects import ObjectModel, ObjectSet
-from envs.pybullet_scenes import LayoutTable
+from envs.pybullet_bodies import LayoutTable
 from utils.config import Config
 from utils.errors import UserError
 

@@ -26,20 +26,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from envs.camera import Intrinsics
-from envs.camera_calibration import CameraCalibration
-from envs.cell import Cell
+from envs.cell import Cell, Intrinsics
 from envs.closed_loop_tracker import ObjectTracker, WristCamera, WristImage
 from envs.execution import ApproachResult, GraspFailure
 from envs.robot_kinematics import (
+    HALF_TURN,
     JOINT_LOWER,
     JOINT_UPPER,
     forward_kinematics,
     geometric_jacobian,
+    must_flip,
     pose_error,
+    should_flip,
 )
-from envs.robot_postures import HALF_TURN, must_flip, should_flip
 from envs.robot_safety import ArmStoppedError, reaching_down
+from envs.scenarios import CameraCalibration
 from envs.servo_arm import ServoArm, image_period
 from utils.errors import CollinearPointsError, FeatureCountError, ServoError, TargetLostError
 from utils.result_records import OPEN_LOOP
@@ -110,7 +111,7 @@ class ClosedLoop:
 
     controller: a key of LAWS. frame: the frame on which the grasp was planned, with the
     calibration's camera pose. taught_T_CE: (4, 4) the gripper in the wrist camera as that camera
-    has shown it (`envs.camera_calibration.teach`); the goal views of ibvs and hybrid come from it.
+    has shown it (`envs.scenarios.teach`); the goal views of ibvs and hybrid come from it.
     latency: s.
     camera: returns a WristImage, or None where no new image has arrived; None: the cell's.
     target: the tracked object, once the approach has begun.

@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.camera import Intrinsics
-from envs.cell import Cell
+from envs.cell import Cell, Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.depth import make_depth_noise
 from utils.errors import TargetLostError

@@ -22,8 +22,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from envs.camera import camera_intrinsics
-from envs.cell import PhysicsError
+from envs.cell import PhysicsError, camera_intrinsics
 from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from envs.camera import camera_intrinsics, wrist_mount
-from envs.cell import Cell, PhysicsError
+from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.env_rewards import GraspGoals, Outline
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY
 from utils.config import Config

@@ -1,6 +1,6 @@
 """The RGB-D camera in MuJoCo: images drawn without a window by MuJoCo's OpenGL renderer.
 
-Camera model, depth and light settings are those of `envs.camera`. Knows nothing of robots, objects
+Camera model, depth and light settings are those of `envs.cell`. Knows nothing of robots, objects
 or tasks.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics
+from envs.cell import DEFAULT_LIGHT, Camera, Image, Intrinsics
 from envs.mujoco_panda import load_mujoco
 from utils.errors import UserError
 

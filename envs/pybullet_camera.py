@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from envs.camera import DEFAULT_LIGHT, Camera, Image, Intrinsics
+from envs.cell import DEFAULT_LIGHT, Camera, Image, Intrinsics
 from utils.errors import UserError
 
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z with y up

@@ -16,14 +16,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from envs.camera_calibration import CameraCalibration, teach
 from envs.cell import Cell, PhysicsError
 from envs.cell_scenes import Scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
 from envs.policy_approach import PolicyApproach
 from envs.robot_kinematics import forward_kinematics
-from envs.scenarios import SCENARIOS, disturbed
+from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from models.planners import Planner, needs_truth, reset_planner
 from utils.errors import TargetLostError
 from utils.result_records import (

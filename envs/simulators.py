@@ -1,6 +1,6 @@
 """The simulators, by the names that the config's key `simulator` takes, and `make_cell`.
 
-A new simulator brings a `Cell`, a `Robot` and a `Camera` (`envs.cell`, `envs.robot`, `envs.camera`)
+A new simulator brings a `Cell`, a `Robot` and a `Camera` (`envs.cell`, `envs.robot`, `envs.cell`)
 and an entry here.
 """
 

@@ -24,8 +24,7 @@ import gymnasium
 import imageio.v2 as imageio
 import numpy as np
 
-from envs.camera import Intrinsics
-from envs.cell import Cell
+from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.registries import check_names

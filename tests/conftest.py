@@ -46,7 +46,7 @@ def taught_cell(request, config: Config):
     """The cell of each simulator, whose wrist camera has been shown the board."""
     if request.param == "mujoco":
         pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-    from envs.camera_calibration import teach
+    from envs.scenarios import teach
     from envs.simulators import SIMULATORS
 
     with SIMULATORS[request.param](config) as cell:

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.bench_servo_cell import pose
 from envs.board import Board
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from envs.pybullet_bodies import add_board, static_box
 from envs.pybullet_camera import PybulletCamera
 from utils.errors import TargetLostError

@@ -11,13 +11,13 @@ import pytest
 
 import evaluate
 from envs import closed_loop_tracker
-from envs.camera_calibration import teach, true_calibration, wrong_calibration
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import GraspFailure, execute_grasp
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian
 from envs.rounds import run_round
+from envs.scenarios import teach, true_calibration, wrong_calibration
 from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
 from utils.config import load_config

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.camera_calibration import teach, true_calibration
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
+from envs.scenarios import teach, true_calibration
 from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box
 from utils.config import load_config

@@ -15,8 +15,7 @@ import pytest
 import torch
 
 from envs import data_generation
-from envs.camera import Intrinsics, camera_intrinsics
-from envs.cell import PhysicsError
+from envs.cell import Intrinsics, PhysicsError, camera_intrinsics
 from envs.cell_appearance import Appearance, Texture, draw_camera
 from envs.cell_scenes import SceneError
 from envs.data_generation import (

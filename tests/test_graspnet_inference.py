@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from models import graspnet_inference
 from models.graspnet_io import metres_per_pixel
 from tests.helpers.hand_made import CUBES, FOCAL, OVERHEAD, PIXEL, cell_of_cubes, hand_made

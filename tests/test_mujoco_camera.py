@@ -6,8 +6,7 @@ from scipy import ndimage
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
-from envs.camera import Intrinsics
-from envs.cell import ROBOT, TABLE_OR_BACKGROUND
+from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Intrinsics
 from envs.cell_scenes import make_scene
 from envs.mujoco_camera import camera_of
 from envs.mujoco_cell import MujocoCell

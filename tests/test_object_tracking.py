@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from utils.errors import TargetLostError
 from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
 from utils.table_plane import fit_table_plane

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import predict
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from envs.studio import write_rgbd
 from models.graspnet import GraspNet
 from models.graspnet_io import save_graspnet

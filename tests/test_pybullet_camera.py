@@ -4,7 +4,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from envs.pybullet_bodies import static_box
 from envs.pybullet_camera import PybulletCamera, load_renderer
 from utils.errors import UserError

@@ -7,8 +7,7 @@ import pytest
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
-from envs.robot_kinematics import forward_kinematics, inverse_kinematics
-from envs.robot_postures import choose_posture
+from envs.robot_kinematics import choose_posture, forward_kinematics, inverse_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.config import with_settings
 from utils.transforms import top_down_pose

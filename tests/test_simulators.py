@@ -7,7 +7,7 @@ import inspect
 import numpy as np
 import pytest
 
-from envs.camera import Camera
+from envs.cell import Camera
 from envs.cell_scenes import Placement, Scene
 from envs.execution import execute_grasp
 from envs.objects import load_object_set

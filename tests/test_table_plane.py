@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.camera import Intrinsics
+from envs.cell import Intrinsics
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell

@@ -249,7 +249,7 @@ class RandomView:
         self.fov_scale = self._value("camera_fov", 1.0)
 
     def lit(self, light: Mapping[str, Any]) -> dict[str, Any]:
-        """Light settings as in `envs.camera.DEFAULT_LIGHT`, changed from nominal ones."""
+        """Light settings as in `envs.cell.DEFAULT_LIGHT`, changed from nominal ones."""
         lit = {name: self._value(key, light[name]) for key, name in LIGHTS.items()}
         x, y, z = light["lightDirection"]
         tilt = np.radians(
