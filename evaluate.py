@@ -28,6 +28,7 @@ from pathlib import Path
 
 from envs.evaluation_worker import check_everything, set_up, work
 from envs.registries import check_names
+from envs.transfer_columns import columns_of
 from envs.transfer_scenes import (
     check_open_loop,
     check_rows,
@@ -195,7 +196,7 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
 
 def report_transfer(config: Config, options: argparse.Namespace) -> int:
     """Score each row on the same scenes in every column, and report how the columns agree."""
-    rows, columns = config.transfer.policies, config.transfer.columns
+    rows, columns = config.transfer.policies, columns_of(config)
     if options.csv is not None or options.latex is not None:
         raise UserError("--csv, --latex: the transfer report has no paired differences; omit them")
     check_open_loop(config)
@@ -227,7 +228,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
     complete = error is None and not interrupted
     content = {"complete": complete, "device": device_of(config)}
-    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines)}
+    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines, columns)}
     for path in filter(None, [run / "results.json", options.results]):
         save_results(path, content)
     write_atomic(run / "transfer.png", draw_transfer(lines, columns))

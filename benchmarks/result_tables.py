@@ -243,10 +243,10 @@ def ppo(say: Say, part: Figures) -> str:
 def cornell(say: Say, part: Figures) -> str:
     lines = []
     for row in rows_of(part, "simulated"):
-        worlds = row["worlds"]
-        if not worlds:
+        columns = row["columns"]
+        if not columns:
             continue
-        cells = [worlds.get(name) for name in ("cornell", "cornell_as_taken")]
+        cells = [columns.get(name) for name in ("cornell", "cornell_as_taken")]
         lines.append([row["policy"], row["training"], *(
             "-" if one is None else rate(one["successes"], one["trials"]) for one in cells
         )])  # fmt: skip

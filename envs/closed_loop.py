@@ -66,7 +66,6 @@ LAWS = {
     "hybrid": (HybridVisualServo, {"scheme": "2.5d"}),  # 2 1/2-D
 }
 CONTROLLERS = (OPEN_LOOP, *LAWS)
-_TAUGHT = ("ibvs", "hybrid")  # controllers whose goals are views that the camera itself has shown
 
 _DAMPING = 0.02  # of the arm's Jacobian
 _AVOIDANCE_GAIN = 0.5  # 1/s, of the redundant joint's motion away from its limits
@@ -111,7 +110,7 @@ class ClosedLoop:
 
     controller: a key of LAWS. frame: the frame on which the grasp was planned, with the
     calibration's camera pose. taught_T_CE: (4, 4) the gripper in the wrist camera as that camera
-    has shown it (`envs.scenarios.teach`); the goal views of ibvs and hybrid come from it.
+    has shown it (`envs.scenarios.teach`); the goal views of image-based laws come from it.
     latency: s.
     camera: returns a WristImage, or None where no new image has arrived; None: the cell's.
     target: the tracked object, once the approach has begun.
@@ -138,8 +137,8 @@ class ClosedLoop:
         period = image_period(cell) * cell.dt
         self.law = make_law(controller, self.K, self.T_EC, grasp.gain, period)
         self.far_law = make_law("pbvs", self.K, self.T_EC, grasp.gain, period)
-        T_CE = taught_T_CE if controller in _TAUGHT else inverse_pose(self.T_EC)
-        self.goal_T_CE = T_CE
+        # The goal of an image-based law is a view that the camera itself has shown.
+        self.goal_T_CE = taught_T_CE if self.law.image_based else inverse_pose(self.T_EC)
         self.record = LoopRecord()
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:

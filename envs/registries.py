@@ -2,9 +2,10 @@
 
 Each registry stands beside the code that it lists. A new entry there is all that a config needs to
 name it: `utils.config_schema` takes any text for these keys, because `utils` imports neither `envs`
-nor `models`, and each script calls `check_names` before it does any work. Planners and learned
-policies (`evaluate.policies`) also have names that are files: `models.planners` and
-`envs.policy_approach` check them.
+nor `models`, and each script calls `check_names` before it does any work. Two kinds of names are
+checked elsewhere: planners and learned policies (`evaluate.policies`), which may also be files, by
+`models.planners` and `envs.policy_approach`, and depth noises (`camera.depth_noise`) by
+`utils.config_schema`, because their registry stands in `utils.depth`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from envs.env_rewards import make_reward
 from envs.objects import check_object_set
 from envs.scenarios import SCENARIOS
 from envs.simulators import SIMULATORS
+from envs.transfer_columns import COLUMNS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config
 from utils.errors import unknown_choice
@@ -29,6 +31,7 @@ REGISTRIES: dict[str, Collection[str]] = {
     "train.backbone": BACKBONES,
     "evaluate.controllers": CONTROLLERS,
     "evaluate.scenarios": SCENARIOS,
+    "transfer.columns": COLUMNS,
     "env.scenario": LAYOUTS,
 }
 OBJECT_SET_KEYS = ("data.object_sets", "evaluate.object_sets", "env.objects")

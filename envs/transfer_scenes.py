@@ -1,7 +1,8 @@
 """What the transfer report scores: its rows on their scenes in each simulated column, and the
 planners on photographs.
 
-`utils.transfer` makes the report of the scores, evaluate.py plays the evaluations.
+`envs.transfer_columns` has the registry of the columns, `utils.transfer` makes the report of the
+scores, evaluate.py plays the evaluations.
 """
 
 from __future__ import annotations
@@ -13,17 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from envs.policy_approach import check_learned, is_learned
-from models.photographs import judge_as_taken, judge_photographs
+from envs.transfer_columns import PhotographColumn, SimulatedColumn, columns_of, config_of
 from models.rectangle_examples import draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
 from utils.errors import UserError
 from utils.evaluation import policies_of
-from utils.real_data import RealSample
+from utils.real_samples import RealSample
 from utils.result_records import OPEN_LOOP
 from utils.transfer import Score
-
-# The columns of the report that are not simulated.
-PHOTOGRAPHS = {"cornell": judge_photographs, "cornell_as_taken": judge_as_taken}
 
 
 class Scenes(NamedTuple):
@@ -61,18 +59,10 @@ def evaluations_of(config: Config) -> list[TransferEvaluation]:
         plan = {"policies": list(dict.fromkeys(row.planner for row in rows))}
         plan |= {"scenarios": list(scenes.scenarios), "object_sets": list(scenes.objects)}
         here = with_settings(config, "evaluate", plan)
-        for column in config.transfer.columns:
-            if column not in PHOTOGRAPHS:
-                found.append(TransferEvaluation(column, scenes, rows, config_of(here, column)))
+        for name, column in columns_of(config).items():
+            if isinstance(column, SimulatedColumn):
+                found.append(TransferEvaluation(name, scenes, rows, config_of(here, column)))
     return found
-
-
-def config_of(config: Config, column: str) -> Config:
-    """The config of an evaluation in a column of the report: `pybullet`, `mujoco`, or `outside`,
-    which is PyBullet changed by the section `randomization`."""
-    config = with_settings(config, "evaluate", {"randomise": column == "outside"})
-    simulator = "mujoco" if column == "mujoco" else "pybullet"
-    return config.model_copy(update={"simulator": simulator})
 
 
 def scenes_of(row: TransferPolicy, config: Config) -> Scenes:
@@ -122,12 +112,14 @@ def score_photographs(
     scores: dict[str, Score] = {}
     if row.scenes is not None or not is_trained(row) or is_learned(row.planner):
         return scores
-    for column in (column for column in config.transfer.columns if column in PHOTOGRAPHS):
-        judged = PHOTOGRAPHS[column](row.planner, samples, config.seed)
+    for name, column in columns_of(config).items():
+        if not isinstance(column, PhotographColumn):
+            continue
+        judged = column.judge(row.planner, samples, config.seed)
         if judged is None:
             continue
         shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
-        scores[column] = Score(sum(one.correct for _, one in shown), len(samples))
+        scores[name] = Score(sum(one.correct for _, one in shown), len(samples))
         if shown:
-            draw_rectangles(pictures / f"{Path(row.planner).stem}-{column}.png", *zip(*shown))
+            draw_rectangles(pictures / f"{Path(row.planner).stem}-{name}.png", *zip(*shown))
     return scores

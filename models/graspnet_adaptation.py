@@ -27,7 +27,7 @@ from models.graspnet_data import Example, TrainingData
 from models.graspnet_scores import predict
 from models.graspnet_training import Trainer
 from models.photographs import K, frame_of, from_above
-from models.rectangle_examples import RectangleImages, View
+from models.rectangle_examples import RectangleImages
 from models.rectangle_folds import IN_MEMORY, Changed, Chosen
 from utils.adaptation import (
     SOURCE,
@@ -46,7 +46,8 @@ from utils.checkpoint import load_weights
 from utils.config import AdaptationConfig, Config, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
-from utils.real_data import KEY, RealSample, UnlabelledImages
+from utils.real_data import KEY, UnlabelledImages
+from utils.real_samples import RealSample, View
 from utils.runs import write_atomic
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 

@@ -23,12 +23,12 @@ from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth, su
 from models.graspnet_io import SavedGraspNet
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth
-from models.rectangle_examples import Judged, View, best_rectangle, judged
-from models.rectangle_folds import VIEWS
+from models.rectangle_examples import Judged, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.images import overhead_view
-from utils.real_data import RealSample, existing_folder, open_real_data
+from utils.real_data import FORMATS, existing_folder, open_real_data
+from utils.real_samples import RealSample, View
 from utils.rectangles import GraspRectangle
 from utils.table_plane import find_table_camera
 from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
@@ -114,7 +114,7 @@ def judge_as_taken(
 
 def _as_taken(metres_per_pixel: float) -> View:
     """Return Cornell's view in pixels that span `metres_per_pixel`, a multiple of 8 of them."""
-    view = VIEWS["cornell"]
+    view = FORMATS["cornell"].view
     span = view.size * view.metres_per_pixel  # m
     size = 8 * round(span / metres_per_pixel / 8)
     return replace(view, size=size, metres_per_pixel=span / size)

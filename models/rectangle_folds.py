@@ -2,7 +2,7 @@
 
 Protocol: each fold's images are tested by a network trained on the other folds only, for a fixed
 schedule, with its last weights. No test image chooses anything, so there is no separate validation
-split. This module knows the data sets' cameras (`VIEWS`, `CROPS`), but not their files.
+split. `utils.real_data.FORMATS` has the data sets, their views and the sizes of their examples.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from models.rectangle_examples import (
     Judged,
     RectangleExamples,
     RectangleImages,
-    View,
     draw_rectangles,
     judge,
     median_plate_length,
@@ -30,20 +29,11 @@ from models.rectangle_examples import (
 from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
 from utils.errors import UserError
-from utils.real_data import RealSample, open_real_data
+from utils.real_data import FORMATS, open_real_data
+from utils.real_samples import RealSample, View
 from utils.statistics import wilson_interval
 
-VIEWS = {
-    # The table, which fills the middle of the image, seen 45 degrees from above. A first Kinect
-    # (525 px focal length) at a median 1.2 m; at three fifths of its resolution the network sees
-    # all of a cereal box at once.
-    "cornell": View(side=400, size=240, metres_per_pixel=1.2 / 525 * 400 / 240, slanted=True),
-    # The whole image, as small as GG-CNN and GR-ConvNet take it. Its objects have no true size
-    # (ShapeNet's are scaled at random): a pixel is taken to span what one of Cornell does.
-    "jacquard": View(side=1024, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
-}
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does
-CROPS = {"cornell": 128, "jacquard": 160}  # pixels of the view, side of a training example
 IN_MEMORY = 1000  # data sets of up to so many images are decoded once: all of Cornell, 2 GB
 ASKED_FOR_PLATES = 500  # the labels of at most so many images give the length of the plates
 METRIC = "top-1, IoU > 0.25 and angle < 30 degrees"
@@ -177,7 +167,7 @@ def real_folds(config: Config) -> list[Fold]:
     dataset = open_real_data(settings.kind, settings.root)
     splits = folds_of(dataset.object_ids, settings.split, settings.folds, config.seed)
     numbers = range(settings.folds) if settings.fold is None else [settings.fold]
-    view = VIEWS[settings.kind]
+    view = FORMATS[settings.kind].view
     samples = Changed(dataset, view.levelled) if view.slanted else dataset
     samples = list(samples) if len(dataset) <= IN_MEMORY else samples
     return [_fold(config, number, splits[number], samples, dataset.names) for number in numbers]
@@ -186,11 +176,11 @@ def real_folds(config: Config) -> list[Fold]:
 def _fold(
     config: Config, number: int, split: Split, samples: Sequence[RealSample], names: Sequence[str]
 ) -> Fold:
-    view = VIEWS[config.data.kind]
+    view = FORMATS[config.data.kind].view
     train, test = Chosen(samples, split.train), Chosen(samples, split.test)
     examples = RectangleExamples(
         train, view, AUGMENTATION, seed=config.seed, repeats=config.data.repeats,
-        crop=CROPS[config.data.kind], max_width=MAX_WIDTH,
+        crop=FORMATS[config.data.kind].crop, max_width=MAX_WIDTH,
         graspable_from=config.train.graspable_from,
     )  # fmt: skip
     data = TrainingData(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hypothesis
 import pytest
 
+from envs.simulators import SIMULATORS
 from utils.config import Config, load_config
 
 # The same examples everywhere, and no verdict from how busy the machine is.
@@ -41,13 +42,12 @@ def tiny_data(tmp_path_factory):
     return folder, overrides
 
 
-@pytest.fixture(scope="module", params=["pybullet", "mujoco"])
+@pytest.fixture(scope="module", params=list(SIMULATORS))
 def taught_cell(request, config: Config):
     """The cell of each simulator, whose wrist camera has been shown the board."""
     if request.param == "mujoco":
         pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
     from envs.scenarios import teach
-    from envs.simulators import SIMULATORS
 
     with SIMULATORS[request.param](config) as cell:
         teach(cell)  # empties the cell, the first time

@@ -15,15 +15,10 @@ import grimp
 import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
+from envs.simulators import SIMULATORS
+
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl")
-# A simulator's package: the beginning of the names of the only modules that may import it.
-SIMULATORS = {
-    "pybullet": "envs.pybullet_",
-    "pybullet_data": "envs.pybullet_",
-    "pybullet_utils": "envs.pybullet_",
-    "mujoco": "envs.mujoco_",
-}
 # `python -m` of the first starts the demonstration in the second, below `__name__ == "__main__"`;
 # nothing is imported so when the first is imported.
 DEMONSTRATIONS = {
@@ -48,13 +43,15 @@ def test_contracts_of_import_linter_are_kept(capsys, monkeypatch):
 
 
 def test_only_a_simulators_own_modules_import_it(imports):
-    strangers = {
-        (module, package)
+    """Packages NAME and NAME_..., such as pybullet_data, by modules envs.NAME_... alone."""
+    importers = {
+        (name, module)
+        for name in SIMULATORS
         for module, imported in imports.items()
-        for package, beginning in SIMULATORS.items()
-        if package in imported and not module.startswith(beginning)
+        if any(one == name or one.startswith(f"{name}_") for one in imported)
     }
-    assert not strangers
+    assert {name for name, _ in importers} == set(SIMULATORS)
+    assert not [(name, one) for name, one in importers if not one.startswith(f"envs.{name}_")]
 
 
 def test_no_circle_of_imports(imports):

@@ -12,15 +12,16 @@ from PIL import Image
 from models.rectangle_examples import (
     RectangleExamples,
     RectangleImages,
-    View,
     best_rectangle,
     judge,
     median_plate_length,
 )
-from models.rectangle_folds import AUGMENTATION, VIEWS, real_folds
+from models.rectangle_folds import AUGMENTATION, real_folds
 from tests.helpers.real_images import SHAPE, VIEW, sample, write_cornell
 from utils.augmentation import Similarity
 from utils.config import load_config
+from utils.real_data import FORMATS
+from utils.real_samples import View
 from utils.rectangles import GraspRectangle, rectangle_match
 
 
@@ -61,7 +62,7 @@ def test_a_view_looks_at_the_middle_of_the_image():
 
 def test_views_are_of_their_cameras_scale():
     # Cornell's Kinect: 2.29 mm a pixel at 1.2 m, three fifths as many in the view.
-    assert VIEWS["cornell"].metres_per_pixel == pytest.approx(0.0038095, rel=1e-4)
+    assert FORMATS["cornell"].view.metres_per_pixel == pytest.approx(0.0038095, rel=1e-4)
 
 
 def test_widths_go_from_pixels_to_metres_and_back():
@@ -165,7 +166,7 @@ def test_only_slanted_views_level_their_samples(tmp_path):
     fold = real_folds(config)[0]
     for samples in (fold.test_samples, fold.data.train.samples):
         assert np.ptp(samples[0].depth) < 0.05
-    assert VIEWS["cornell"].slanted and not VIEWS["jacquard"].slanted
+    assert FORMATS["cornell"].view.slanted and not FORMATS["jacquard"].view.slanted
 
 
 def test_the_same_rectangle_matches_itself_through_a_view():

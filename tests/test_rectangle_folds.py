@@ -10,7 +10,7 @@ import pytest
 import train_graspnet
 from models.graspnet import create_model
 from models.graspnet_io import SHIPPED, load_graspnet, save_graspnet
-from models.rectangle_folds import CROPS, VIEWS, folds_of, image_folds, object_folds, real_folds
+from models.rectangle_folds import folds_of, image_folds, object_folds, real_folds
 from tests.helpers.real_images import write_cornell, write_jacquard
 from utils.config import load_config
 from utils.errors import UserError
@@ -39,8 +39,9 @@ def test_object_folds_keep_objects_whole_and_are_as_equal_as_these_allow():
         object_folds(objects, 5)
 
 
-def test_every_format_has_a_view_and_a_crop():
-    assert set(VIEWS) == set(CROPS) == set(FORMATS)
+def test_a_training_example_is_a_part_of_the_view():
+    for kind, one in FORMATS.items():
+        assert 0 < one.crop < one.view.size <= one.view.side, kind
 
 
 def test_objects_that_come_again_stay_in_one_fold():
@@ -91,7 +92,7 @@ def test_one_epoch_on_cornell(tmp_path, monkeypatch, capsys):
             assert (folder / f"fold{fold['fold']}" / file).is_file()
     saved = load_graspnet(folder / "fold0" / "graspnet.pt")
     assert saved.model.max_width == 0.25
-    assert saved.metres_per_pixel == VIEWS["cornell"].metres_per_pixel
+    assert saved.metres_per_pixel == FORMATS["cornell"].view.metres_per_pixel
     told = capsys.readouterr().out
     assert f"{correct} of 10 correct" in told and "fixed schedule, last weights" in told
 

@@ -46,6 +46,7 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("evaluate.object_sets=random_urdf", "an existing folder or .* did you mean random_urdfs?"),
         ("env.objects=bx", "env.objects: got 'bx', expected one of box, .* did you mean box?"),
         ("data.object_sets=no_module:sets", "data.object_sets: .* there is no module 'no_module'"),
+        ("transfer.columns=mujcoo", "transfer.columns: got 'mujcoo', .* did you mean mujoco?"),
         ("transfer.policies=[[a, b, random, [pil, box], null]]", "transfer.policies: got 'pil'"),
         ("transfer.policies=[[a, b, random, [pile, bx], null]]", "transfer.policies: got 'bx'"),
     ],

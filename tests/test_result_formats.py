@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, stopped
+from utils import result_formats
+from utils.report import write_report
 from utils.result_formats import (
+    TableColumn,
     format_comparisons,
     format_stop_reasons,
     format_table,
@@ -76,6 +79,17 @@ def test_a_closed_loop_s_turns_have_a_column():
     assert "turn ms, 95 %" in table[0]
     assert "8.0, 14.0" in table[-1] and "8.0" not in table[2]
     assert "turn ms" not in format_table(summarise(ROUNDS, 0))
+
+
+def test_a_new_column_is_an_entry_of_the_list(monkeypatch, tmp_path):
+    """The printed table and the page show it without any other change."""
+    new = TableColumn("seed of the run", lambda row: str(row.seed), number=True)
+    monkeypatch.setattr(result_formats, "COLUMNS", (*result_formats.COLUMNS, new))
+    rows = summarise(ROUNDS, seed=77)
+    assert all(line.endswith("77") for line in format_table(rows).splitlines()[2:])
+    write_report(tmp_path / "report.html", rows, ROUNDS, [], CONFIG)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert '<th class="n">seed of the run</th>' in page and page.count(">77</td>") == len(rows)
 
 
 def test_reasons_of_failures_are_lines_with_their_scene():

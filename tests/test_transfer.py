@@ -10,6 +10,7 @@ import pytest
 from utils.config import TransferPolicy
 from utils.result_records import AttemptRecord, RoundRecord
 from utils.transfer import (
+    Column,
     Score,
     TransferLine,
     agreements,
@@ -19,6 +20,12 @@ from utils.transfer import (
     transfer_content,
     transfer_notes,
 )
+
+COLUMNS = {
+    "pybullet": Column("PyBullet"),
+    "mujoco": Column("MuJoCo", simulation="pybullet"),
+    "cornell": Column("Cornell photographs", if_empty="add transfer.cornell=path/to/cornell"),
+}
 
 
 def round_of(policy: str, *reasons: str) -> RoundRecord:
@@ -54,7 +61,7 @@ def lines():
 
 
 def test_columns_agree_as_far_as_they_do(lines):
-    (one,) = agreements(lines)
+    (one,) = agreements(lines, COLUMNS)
     assert (one.real, one.simulation, one.policies) == ("mujoco", "pybullet", 3)
     assert one.pearson_r == pytest.approx(np.corrcoef([20, 80, 90], [10, 90, 85])[0, 1])
     # "good" and "net" change places; in MuJoCo they differ by 0.05.
@@ -70,36 +77,37 @@ def test_policies_are_compared_on_the_same_scenes_alone(lines):
         return TransferLine(who, "isolated of box", scores)
 
     with_one = [*lines, boxes("a", 100, 0)]
-    assert agreements(with_one) == agreements(lines)
-    piles, alone = agreements([*with_one, boxes("b", 50, 50)])
-    assert piles == agreements(lines)[0]
+    assert agreements(with_one, COLUMNS) == agreements(lines, COLUMNS)
+    piles, alone = agreements([*with_one, boxes("b", 50, 50)], COLUMNS)
+    assert piles == agreements(lines, COLUMNS)[0]
     assert (alone.scenes, alone.policies) == ("isolated of box", 2)
     assert alone.pearson_r == pytest.approx(-1.0)
     assert alone.mmrv == pytest.approx(0.5)  # the two, 0.5 apart, change places
 
 
 def test_the_table_says_what_is_missing(lines):
-    columns = ("pybullet", "mujoco", "cornell")
-    table = format_transfer(lines, columns).splitlines()
+    table = format_transfer(lines, COLUMNS).splitlines()
     assert "80 % [71, 87] 80/100" in table[3]
     assert "50 % [22, 78] 4/8" in table[4] and "not trained" in table[5]
-    notes = transfer_notes(lines, columns)
+    notes = transfer_notes(lines, COLUMNS)
     assert any("python train.py --weights x" in note for note in notes)
     assert not any("transfer.cornell" in note for note in notes)
-    assert any("transfer.cornell" in note for note in transfer_notes(lines[:2], columns))
+    assert any("transfer.cornell" in note for note in transfer_notes(lines[:2], COLUMNS))
 
 
 def test_results_and_picture(lines):
-    content = json.loads(json.dumps(transfer_content(lines), allow_nan=False))
-    assert content["rows"][1]["worlds"]["mujoco"]["success_rate"] == 0.9
+    content = json.loads(json.dumps(transfer_content(lines, COLUMNS), allow_nan=False))
+    assert content["rows"][1]["columns"]["mujoco"]["success_rate"] == 0.9
     assert content["rows"][3]["trained"] is False
     assert content["agreement"][0]["policies"] == 3
 
 
 def test_the_picture_has_one_panel_more_for_each_column(lines):
     sizes = []
-    for columns in (("pybullet", "mujoco"), ("pybullet", "mujoco", "cornell")):
+    for names in (("pybullet",), ("pybullet", "mujoco"), tuple(COLUMNS)):
+        columns = {name: COLUMNS[name] for name in names}
         picture = iio.imread(BytesIO(draw_transfer(lines, columns)))
         assert picture.std() > 10, "not an empty sheet"
         sizes.append(picture.shape)
-    assert sizes[1][1] > sizes[0][1] + 150 and sizes[1][0] == sizes[0][0]
+    for before, after in zip(sizes, sizes[1:]):
+        assert after[1] > before[1] + 150 and after[0] == before[0]

@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 
 import evaluate
+from envs.registries import check_names
+from envs.simulators import SIMULATORS
+from envs.transfer_columns import COLUMNS, SimulatedColumn, columns_of
 from envs.transfer_scenes import Scenes, evaluations_of, score_photographs
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
+from utils.transfer import pairs_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 REPORT = REPOSITORY / "configs" / "sim_to_real.yaml"
@@ -79,6 +83,40 @@ def test_rows_on_the_same_scenes_are_one_evaluation():
     assert one.folder == "isolated_of_a_meshes" != two.folder
 
 
+def test_the_columns_of_the_report_are_one_registry():
+    """The simulated ones name simulators, and what predicts a column is a column, too."""
+    simulated = [one for one in COLUMNS.values() if isinstance(one, SimulatedColumn)]
+    assert {one.simulator for one in simulated} <= set(SIMULATORS)
+    assert {one.simulation for one in COLUMNS.values()} <= {None, *COLUMNS}
+    assert list(columns_of(load_config())) == list(COLUMNS)
+
+
+def test_each_simulated_column_says_what_is_played():
+    config = load_config(REPORT, ["transfer.columns=[pybullet,mujoco,outside]"])
+    played = {one.column: one.config for one in evaluations_of(config)}
+    found = {name: (one.simulator, one.evaluate.randomise) for name, one in played.items()}
+    assert found == {
+        "pybullet": ("pybullet", False),
+        "mujoco": ("mujoco", False),
+        "outside": ("pybullet", True),
+    }
+
+
+def test_an_unknown_column_is_answered_by_the_known_ones():
+    config = load_config(REPORT, ["transfer.columns=[pybullet,mujcoo]"])
+    with pytest.raises(UserError, match="transfer.columns: got 'mujcoo', .* did you mean mujoco?"):
+        evaluations_of(config)
+
+
+def test_a_new_column_is_an_entry_of_the_registry(monkeypatch):
+    noisy = SimulatedColumn("MuJoCo again", simulation="mujoco", simulator="mujoco")
+    monkeypatch.setitem(COLUMNS, "again", noisy)
+    config = load_config(REPORT, ["transfer.columns=[mujoco,again]"])
+    check_names(config)
+    assert {one.config.simulator for one in evaluations_of(config)} == {"mujoco"}
+    assert pairs_of(columns_of(config)) == [("again", "mujoco")]
+
+
 def test_a_row_that_cannot_play_its_scenes_is_named():
     with pytest.raises(UserError, match="the row PPO, none is scored on pile of box; give it"):
         evaluate.main(
@@ -123,7 +161,7 @@ def test_the_command_from_end_to_end(tmp_path):
     assert "transfer.cornell" in done.stdout
     rows = json.loads((tmp_path / "copy.json").read_text())["rows"]
     heuristic = next(row for row in rows if row["policy"] == "heuristic")
-    assert set(heuristic["worlds"]) == {"pybullet", "outside"}
+    assert set(heuristic["columns"]) == {"pybullet", "outside"}
     (run,) = (tmp_path / "runs" / "evaluate").iterdir()
     assert (run / "transfer.png").exists()
     for scenes in ("isolated_of_primitives", "isolated_of_box"):

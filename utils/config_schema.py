@@ -191,11 +191,8 @@ class EvaluateConfig(Section):
     name: Name | None
 
 
-TransferColumn = Literal["pybullet", "outside", "mujoco", "cornell", "cornell_as_taken"]
-
-
 class TransferPolicy(NamedTuple):
-    """A row of the transfer report. policy, training: what the reader is told. planner: as in
+    """A row of the transfer report. policy, training: as the report shows them. planner: as in
     evaluate.policies. scenes: scenario and object set that it is scored on, None for those of the
     section evaluate. train_with: the command that makes the planner's file."""
 
@@ -220,7 +217,7 @@ TransferRow = Annotated[
 
 class TransferConfig(Section):
     policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(no_repeats)] | None
-    columns: Annotated[tuple[TransferColumn, ...], Several, AfterValidator(no_repeats)]
+    columns: Names
     cornell: Annotated[Path, Field(strict=False)] | None
 
 

@@ -1,9 +1,9 @@
 """Real RGB-D images from disk: Cornell and Jacquard with labelled rectangles, and unlabelled ones.
 
 A missing or broken file is a `UserError` that names the file. A new format is a `RealDataset` in
-this file and an entry in `FORMATS`, whose names `data.kind` accepts, and a view of its camera in
-`models.rectangle_folds`. The data themselves are not part of this project. This module knows no
-network and no simulator.
+this file and an entry in `FORMATS`, whose names `data.kind` accepts: the data set, the view of its
+camera and the size of a training example. The data themselves are not part of this project. This
+module knows no network and no simulator.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from utils.errors import UserError, unknown_choice
 from utils.images import open_image
+from utils.real_samples import RealSample, View
 from utils.rectangles import GraspRectangle, rectangles_from_corners
 from utils.transforms import known_depth
 
@@ -37,27 +38,6 @@ CORNELL_HINT = (
     "; Cornell's archives hold point clouds pcdNNNN.txt from which pcdNNNNd.tiff is made "
     "(float32, metres)"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class RealSample:
-    """One real image with its labels.
-
-    name: the image's id. object_id: images with the same id show the same object.
-    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis, holes filled.
-    positives, negatives: rectangles in pixels of this image; Jacquard has no negatives.
-    object_mask: (H, W) bool, the object's pixels, or None where the format has none.
-    skipped: rectangles left out because a corner is NaN.
-    """
-
-    name: str
-    object_id: str
-    rgb: np.ndarray
-    depth: np.ndarray
-    positives: tuple[GraspRectangle, ...]
-    negatives: tuple[GraspRectangle, ...] = ()
-    object_mask: np.ndarray | None = None
-    skipped: int = 0
 
 
 @dataclass(frozen=True)
@@ -167,9 +147,35 @@ class JacquardDataset(RealDataset):
         return RealSample(record.name, record.object_id, rgb, depth, positives, object_mask=mask)
 
 
-FORMATS: dict[str, Callable[[str | Path], RealDataset]] = {
-    "cornell": CornellDataset,
-    "jacquard": JacquardDataset,
+@dataclass(frozen=True)
+class RealFormat:
+    """A format of real data with labels.
+
+    open: makes the data set of a folder. view: what a network sees of its images. crop: side of a
+    training example, pixels of the view.
+    """
+
+    open: Callable[[str | Path], RealDataset]
+    view: View
+    crop: int
+
+
+FORMATS = {
+    # The table, which fills the middle of the image, seen 45 degrees from above. A first Kinect
+    # (525 px focal length) at a median 1.2 m; at three fifths of its resolution the network sees
+    # all of a cereal box at once.
+    "cornell": RealFormat(
+        CornellDataset,
+        View(side=400, size=240, metres_per_pixel=1.2 / 525 * 400 / 240, slanted=True),
+        crop=128,
+    ),
+    # The whole image, as small as GG-CNN and GR-ConvNet take it. Its objects have no true size
+    # (ShapeNet's are scaled at random): a pixel is taken to span what one of Cornell does.
+    "jacquard": RealFormat(
+        JacquardDataset,
+        View(side=1024, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
+        crop=160,
+    ),
 }
 
 
@@ -185,7 +191,7 @@ def open_real_data(kind: str, root: str | Path | None) -> RealDataset:
             f"data.root: data.kind={kind} needs the folder that holds the data set: add "
             f"data.root=path/to/{kind}"
         )
-    return FORMATS[kind](root)
+    return FORMATS[kind].open(root)
 
 
 # --- Reading files --------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
 from utils.image_overlay import contact_sheet, draw_grasp
-from utils.result_formats import failures_in_words, turn_ms_in_words
+from utils.result_formats import columns_of, failures_in_words
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stop_reasons
 from utils.runs import git_state, write_atomic
@@ -79,8 +79,8 @@ def write_report(
         failures_in_words=failures_in_words,
         stops=stop_reasons(rounds),
         turns_known=any(row.turn_ms_p95 is not None for row in rows),
-        turn_ms_in_words=turn_ms_in_words,
         rows=rows,
+        columns=columns_of(rows),
         totals={"rounds": len(rounds), "grasps": sum(row.attempts for row in rows)},
         interruption=interruption,
         gallery=[(_png(item.image), item.caption, item.success) for item in gallery],

@@ -1,15 +1,17 @@
 """Figures of an evaluation for people and other programs: results.json, CSV, LaTeX, aligned text.
 
-This module formats what `utils.results` has counted.
+This module formats what `utils.results` has counted. `COLUMNS` is the one list of columns of the
+table that evaluate.py prints and that report.html shows.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 from utils.config import Config
 from utils.result_records import FAILURES
@@ -65,12 +67,10 @@ def _flat(row: Row) -> dict[str, object]:
 
 def format_table(rows: Sequence[Row]) -> str:
     """The rows as aligned plain text."""
-    header = ["policy", "scenario", "objects", "success", "cleared", "plan ms", "picks/h", "failed"]
-    lines = [list(_cells(row)) for row in rows]
-    if any(row.turn_ms_p95 is not None for row in rows):  # of a closed loop
-        for line, cell in zip([header, *lines], ["turn ms, 95 %", *map(turn_ms_in_words, rows)]):
-            line.insert(-1, cell)
-    return aligned(header, lines, to_the_right=(5, 6))
+    columns = [column for column in columns_of(rows) if column.printed]
+    lines = [[column.cell(row) for column in columns] for row in rows]
+    to_the_right = [place for place, column in enumerate(columns) if column.number]
+    return aligned([column.title for column in columns], lines, to_the_right)
 
 
 def format_stop_reasons(stops: Iterable[StopReason]) -> str:
@@ -99,23 +99,16 @@ def aligned(
     )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    def share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
-        if rate is None:
-            return "-"
-        low, high = interval
-        return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
+def _share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
+    """' 50 % [19, 81] 3/6'; '-' for an undefined rate."""
+    if rate is None:
+        return "-"
+    low, high = interval
+    return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
 
-    return (
-        row.policy,
-        row.scenario,
-        row.objects,
-        share(row.success_rate, row.success_ci95, row.successes, row.attempts),
-        share(row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total),
-        "-" if row.plan_ms_median is None else f"{row.plan_ms_median:.1f}",
-        "-" if row.picks_per_hour is None else f"{row.picks_per_hour:.0f}",
-        failures_in_words(row),
-    )
+
+def _decimal(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def failures_in_words(row: Row) -> str:
@@ -128,6 +121,51 @@ def turn_ms_in_words(row: Row) -> str:
     """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' for an open loop."""
     known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
     return ", ".join(f"{ms:.1f}" for ms in known) or "-"
+
+
+class TableColumn(NamedTuple):
+    """A column of the table that evaluate.py prints and that report.html shows.
+
+    title: its heading. cell: the text of a row. number: whether it is aligned to the right.
+    printed: whether the printed table has it, too; a terminal is narrower than a page. known:
+    whether a row has a value at all; a column without any is left out.
+    """
+
+    title: str
+    cell: Callable[[Row], str]
+    number: bool = False
+    printed: bool = True
+    known: Callable[[Row], bool] | None = None
+
+
+COLUMNS = (
+    TableColumn("policy", lambda row: row.policy),
+    TableColumn("scenario", lambda row: row.scenario),
+    TableColumn("objects", lambda row: row.objects),
+    TableColumn("rounds", lambda row: str(row.rounds), number=True, printed=False),
+    TableColumn(
+        "success",
+        lambda row: _share(row.success_rate, row.success_ci95, row.successes, row.attempts),
+    ),
+    TableColumn(
+        "cleared",
+        lambda row: _share(
+            row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total
+        ),
+    ),
+    TableColumn("plan ms", lambda row: _decimal(row.plan_ms_median, 1), number=True),
+    TableColumn(
+        "s per pick", lambda row: _decimal(row.sim_seconds_per_pick, 1), number=True, printed=False
+    ),
+    TableColumn("picks/h", lambda row: _decimal(row.picks_per_hour, 0), number=True),
+    TableColumn("turn ms, 95 %", turn_ms_in_words, known=lambda row: row.turn_ms_p95 is not None),
+    TableColumn("failed", failures_in_words),
+)
+
+
+def columns_of(rows: Sequence[Row]) -> list[TableColumn]:
+    """The columns of a table of these rows."""
+    return [column for column in COLUMNS if column.known is None or any(map(column.known, rows))]
 
 
 # --- Comparisons --------------------------------------------------------------------------------

@@ -40,6 +40,8 @@ SCHEMES = ("blend", "2.5d")
 class ImageBasedVisualServo(VisualServo):
     """v_C = -gain L^+ (s - s*), s the normalised coordinates of three or more points."""
 
+    image_based = True
+
     def __init__(
         self,
         camera_config: Mapping,
@@ -145,6 +147,8 @@ class HybridVisualServo(VisualServo):
     its depth, and the rotation is position-based; L is block triangular and regular wherever the
     object is seen.
     """
+
+    image_based = True
 
     def __init__(
         self,

@@ -60,7 +60,12 @@ class VisualServo(ABC):
     """What the laws share: gain, smooth start, limits, the loop, and the arm behind the camera.
 
     A law implements `_correct`, the displacement that would null the error at once.
+
+    image_based: whether the law compares images, so that its goal has to be a view that the camera
+    itself has shown, and not one computed with a calibration.
     """
+
+    image_based = False
 
     def __init__(
         self,

@@ -1,7 +1,8 @@
 """The transfer report: how well each policy does where it was not trained.
 
 One table of success rates, rows of policies by columns such as another simulator, and how well one
-column predicts another. This module counts and draws; `envs.transfer_scenes` names what is played.
+column predicts another. This module counts and draws; `envs.transfer_columns` has their registry,
+`envs.transfer_scenes` says what is played.
 """
 
 from __future__ import annotations
@@ -20,15 +21,21 @@ from utils.result_formats import aligned
 from utils.result_records import RoundRecord
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
 
-TITLES = {
-    "pybullet": "PyBullet",
-    "outside": "PyBullet outside the ranges",
-    "mujoco": "MuJoCo",
-    "cornell": "Cornell photographs",
-    "cornell_as_taken": "Cornell as taken",
-}
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
-PAIRS = (("mujoco", "pybullet"), ("outside", "pybullet"))  # (stands for reality, its simulation)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the report.
+
+    title: its heading. simulation: the column that should predict this one, which stands for
+    reality; None where nothing is compared. if_empty: what the reader can do about a column
+    without scores.
+    """
+
+    title: str
+    simulation: str | None = None
+    if_empty: str | None = None
 
 
 @dataclass(frozen=True)
@@ -79,12 +86,21 @@ def score_of(rounds: Sequence[RoundRecord], planner: str) -> Score:
     return Score(sum(r.successes for r in mine), sum(r.executed for r in mine))
 
 
-def agreements(lines: Sequence[TransferLine]) -> list[Agreement]:
+def pairs_of(columns: Mapping[str, Column]) -> list[tuple[str, str]]:
+    """The columns that stand for reality, each with the one that should predict it."""
+    return [
+        (name, column.simulation)
+        for name, column in columns.items()
+        if column.simulation in columns
+    ]
+
+
+def agreements(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> list[Agreement]:
     """The agreement of each pair of columns on each kind of scenes, over the policies that were
     scored in both; a single policy has no order and gives none."""
     found = []
     for scenes in dict.fromkeys(line.scenes for line in lines):
-        for real, simulation in PAIRS:
+        for real, simulation in pairs_of(columns):
             rates = [
                 (line.scores[real].rate, line.scores[simulation].rate)
                 for line in lines
@@ -103,14 +119,15 @@ def _scored(line: TransferLine, column: str) -> bool:
     return column in line.scores and line.scores[column].trials > 0
 
 
-def format_transfer(lines: Sequence[TransferLine], columns: Sequence[str]) -> str:
+def format_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> str:
     """The table as aligned text."""
-    header = ("policy", "randomised in training", "scenes", *(TITLES[column] for column in columns))
+    titles = [column.title for column in columns.values()]
+    header = ("policy", "randomised in training", "scenes", *titles)
     table = []
     for line in lines:
         cells = [line.row.policy, line.row.training, line.scenes]
         if line.trained:
-            cells += [_cell(line.scores.get(column)) for column in columns]
+            cells += [_cell(line.scores.get(name)) for name in columns]
         else:
             cells += ["not trained", *([""] * (len(columns) - 1))]
         table.append(cells)
@@ -124,17 +141,19 @@ def _cell(score: Score | None) -> str:
     return f"{100 * score.rate:3.0f} % [{low:.0f}, {high:.0f}] {score.successes}/{score.trials}"
 
 
-def transfer_notes(lines: Sequence[TransferLine], columns: Sequence[str]) -> list[str]:
+def transfer_notes(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> list[str]:
     """Sentences on how the columns agree, and on how to get the scores that are missing."""
     notes = []
-    for one in agreements(lines):
+    for one in agreements(lines, columns):
         r = "undefined" if one.pearson_r is None else f"{one.pearson_r:.3f}"
         notes.append(
-            f"{one.scenes}: {TITLES[one.simulation]} predicts {TITLES[one.real]}: Pearson r {r}, "
-            f"mean maximum rank violation {one.mmrv:.3f}, {one.policies} policies"
+            f"{one.scenes}: {columns[one.simulation].title} predicts {columns[one.real].title}: "
+            f"Pearson r {r}, mean maximum rank violation {one.mmrv:.3f}, {one.policies} policies"
         )
-    if "cornell" in columns and not any("cornell" in line.scores for line in lines):
-        notes.append("no photographs were scored: add transfer.cornell=path/to/cornell")
+    for advice in dict.fromkeys(column.if_empty for column in columns.values()):
+        names = [name for name, column in columns.items() if column.if_empty == advice]
+        if advice and not any(name in line.scores for line in lines for name in names):
+            notes.append(advice)
     for line in lines:
         if not line.trained:
             how = line.row.train_with or f"put its weights at {line.row.planner}"
@@ -142,7 +161,9 @@ def transfer_notes(lines: Sequence[TransferLine], columns: Sequence[str]) -> lis
     return notes
 
 
-def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
+def transfer_content(
+    lines: Sequence[TransferLine], columns: Mapping[str, Column]
+) -> dict[str, Any]:
     """Plain data for results.json."""
     return {
         "rows": [
@@ -152,7 +173,7 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
                 "scenes": line.scenes,
                 "planner": line.row.planner,
                 "trained": line.trained,
-                "worlds": {
+                "columns": {
                     column: {
                         "successes": score.successes,
                         "trials": score.trials,
@@ -173,12 +194,12 @@ def transfer_content(lines: Sequence[TransferLine]) -> dict[str, Any]:
                 "pearson_r": one.pearson_r,
                 "mmrv": one.mmrv,
             }
-            for one in agreements(lines)
+            for one in agreements(lines, columns)
         ],
     }
 
 
-def draw_transfer(lines: Sequence[TransferLine], columns: Sequence[str]) -> bytes:
+def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:
     """The bytes of a PNG file: one small panel for each column with the rows' rates and 95 %
     intervals, and below them one panel for each pair of columns that agree or do not."""
     shown = [line for line in lines if line.scores]
@@ -186,18 +207,20 @@ def draw_transfer(lines: Sequence[TransferLine], columns: Sequence[str]) -> byte
     figure = Figure(figsize=(3.4 + 2.1 * len(columns), rows + 5.0), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(rows + 1.0, 4.0))
     panels = above.subplots(1, len(columns), sharey=True, squeeze=False)[0]
-    for panel, column in zip(panels, columns):
-        _draw_column(panel, shown, column)
+    for panel, (name, column) in zip(panels, columns.items()):
+        _draw_column(panel, shown, name, column.title)
     panels[0].set_yticks(range(len(shown)), [_label(line) for line in shown], fontsize=8)
     panels[0].set_ylim(len(shown) - 0.5, -0.5)  # the first row on top
-    for panel, pair in zip(below.subplots(1, len(PAIRS)), PAIRS):
-        _draw_agreement(panel, shown, *pair)
+    pairs = pairs_of(columns)
+    panels = below.subplots(1, len(pairs), squeeze=False)[0] if pairs else ()
+    for panel, (real, simulation) in zip(panels, pairs):
+        _draw_agreement(panel, shown, columns, real, simulation)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     return file.getvalue()
 
 
-def _draw_column(panel: Axes, lines: Sequence[TransferLine], column: str) -> None:
+def _draw_column(panel: Axes, lines: Sequence[TransferLine], column: str, title: str) -> None:
     """The rates of the rows that were scored in a column, with a rule between kinds of scenes."""
     colours = _colours(lines)
     for place, line in enumerate(lines):
@@ -209,7 +232,7 @@ def _draw_column(panel: Axes, lines: Sequence[TransferLine], column: str) -> Non
                 rate, place, xerr=span, fmt="o", color=colours[line.row.policy], markersize=4,
                 elinewidth=1.2, capsize=2,
             )  # fmt: skip
-    panel.set_title(TITLES[column], fontsize=9)
+    panel.set_title(title, fontsize=9)
     panel.set(xlim=(-3, 103), xticks=(0, 50, 100))
     panel.set_xlabel("success, %", fontsize=8)
     panel.tick_params(labelsize=8, left=False)
@@ -217,7 +240,13 @@ def _draw_column(panel: Axes, lines: Sequence[TransferLine], column: str) -> Non
     panel.spines[["top", "right", "left"]].set_visible(False)
 
 
-def _draw_agreement(panel: Axes, lines: Sequence[TransferLine], real: str, simulation: str) -> None:
+def _draw_agreement(
+    panel: Axes,
+    lines: Sequence[TransferLine],
+    columns: Mapping[str, Column],
+    real: str,
+    simulation: str,
+) -> None:
     """One column against another: a colour for each policy, filled on the first kind of scenes."""
     colours, kinds = _colours(lines), list(dict.fromkeys(line.scenes for line in lines))
     panel.plot([0, 100], [0, 100], color="0.7", linewidth=1)
@@ -233,13 +262,13 @@ def _draw_agreement(panel: Axes, lines: Sequence[TransferLine], real: str, simul
             )  # fmt: skip
     titles = [
         f"{one.scenes}: r = {one.pearson_r:.2f}, MMRV = {one.mmrv:.3f}"
-        for one in agreements(lines)
+        for one in agreements(lines, columns)
         if (one.real, one.simulation) == (real, simulation) and one.pearson_r is not None
     ]
     panel.set_title("\n".join(titles), fontsize=8)
     panel.set(xlim=(0, 103), ylim=(0, 103), aspect="equal")
-    panel.set_xlabel(f"{TITLES[simulation]}, %", fontsize=8)
-    panel.set_ylabel(f"{TITLES[real]}, %", fontsize=8)
+    panel.set_xlabel(f"{columns[simulation].title}, %", fontsize=8)
+    panel.set_ylabel(f"{columns[real].title}, %", fontsize=8)
     panel.tick_params(labelsize=8)
     panel.grid(alpha=0.3)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.photographs import K
-from utils.real_data import RealSample
+from utils.real_samples import RealSample
 from utils.rectangles import GraspRectangle
 from utils.transforms import RGBDFrame, deproject, look_at
 

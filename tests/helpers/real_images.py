@@ -8,10 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from models.rectangle_examples import (
-    View,
-)
-from utils.real_data import RealSample
+from utils.real_samples import RealSample, View
 from utils.rectangles import GraspRectangle
 
 SHAPE = (120, 160)  # rows, columns
