@@ -127,7 +127,7 @@ def test_architecture_lists_every_module_once():
 
 def test_recipes_name_files_and_registries_that_exist():
     """Each recipe of CONTRIBUTING: its files, and its registry as a name in one of them."""
-    table = text_of(ROOT / "CONTRIBUTING.md").split("## Ten changes")[1].split("\n## ")[0]
+    table = text_of(ROOT / "CONTRIBUTING.md").split("## Recipes")[1].split("\n## ")[0]
     rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| a")]
     assert len(rows) >= 10
     for _, file, registry, test in rows:
