@@ -96,11 +96,11 @@ def seconds_per_step(env: gymnasium.Env) -> float:
     return (perf_counter() - start) / STEPS
 
 
-# --- Worlds -----------------------------------------------------------------------------------
+# --- Physics clients ----------------------------------------------------------------------------
 
 
 @contextmanager
-def our_world(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
+def our_client(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
     """A physics client with our table, (robot and bin,) and the scene's objects."""
     if robot:
         with PybulletCell(config) as cell:
@@ -117,7 +117,7 @@ def our_world(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
 
 
 @contextmanager
-def stock_world(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
+def stock_client(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
     """The same from the URDF files that PyBullet ships, on its plane."""
     client = pybullet.connect(pybullet.DIRECT)
     set_up_physics(client, config.sim)
@@ -140,15 +140,15 @@ def stock_world(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
     pybullet.disconnect(physicsClientId=client)
 
 
-def both_worlds(
+def mean_over_scenes(
     config: Config, scenes: Sequence[Scene], robot: bool, compare: Callable[[int, int], float]
 ) -> float:
-    """Mean over scenes of compare(client of the stock world, client of ours)."""
+    """Mean over scenes of compare(client with the stock files, client with ours)."""
     values = []
     for scene in scenes:
         with ExitStack() as stack:
-            stock = stack.enter_context(stock_world(scene, config, robot))
-            ours = stack.enter_context(our_world(scene, config, robot))
+            stock = stack.enter_context(stock_client(scene, config, robot))
+            ours = stack.enter_context(our_client(scene, config, robot))
             values.append(compare(stock, ours))
     return float(np.mean(values))
 
@@ -182,7 +182,7 @@ def bench_frames(config: Config, scenes: Sequence[Scene], repeats: int) -> list[
     return [
         Metric(
             f"frame_{side}_vs_stock",
-            both_worlds(config, scenes, True, partial(compare, side=side)),
+            mean_over_scenes(config, scenes, True, partial(compare, side=side)),
             "x",
             at_least=target,
         )
@@ -212,10 +212,10 @@ def bench_physics(config: Config, scenes: Sequence[Scene], repeats: int) -> list
         )
 
     return [
-        Metric("physics_5_objects_vs_stock", both_worlds(config, scenes, False, compare), "x",
+        Metric("physics_5_objects_vs_stock", mean_over_scenes(config, scenes, False, compare), "x",
                at_least=2.0),
-        Metric("physics_5_objects_and_robot_vs_stock", both_worlds(config, scenes, True, compare),
-               "x"),
+        Metric("physics_5_objects_and_robot_vs_stock",
+               mean_over_scenes(config, scenes, True, compare), "x"),
     ]  # fmt: skip
 
 

@@ -61,7 +61,7 @@ class Appearance:
             return
         cell.randomizable().paint([self.table, *self.objects])
 
-    def photograph(
+    def render(
         self, cell: Cell, intrinsics: Intrinsics, T_WC: np.ndarray, rng: np.random.Generator
     ) -> RGBDFrame:
         """The painted scene in this light, with textures and colour noise, and with its truth."""

@@ -261,13 +261,13 @@ def label_scene(
         if config.data.randomise_physics:
             part = with_other_physics(part, config, number)
         cell.load(part)
-        look = Appearance.draw(rng, len(part.placements))
+        appearance = Appearance.draw(rng, len(part.placements))
         intrinsics, T_WC = draw_camera(rng, configured)
         if not config.data.randomise:
-            look = Appearance()
+            appearance = Appearance()
             intrinsics, T_WC = camera_intrinsics(configured), cell.camera_pose()
-        look.paint(cell)
-        frame = look.photograph(cell, intrinsics, T_WC, rng)
+        appearance.paint(cell)
+        frame = appearance.render(cell, intrinsics, T_WC, rng)
         labels = dense_labels(frame, cell.gripper, workspace)
         trials = []
         if rng.random() < config.data.executed_share:

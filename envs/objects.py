@@ -142,7 +142,7 @@ def load_object_set(
     split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in both.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
     fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
-        so that the middle side of its oriented bounding box has this many metres.
+        so that the second longest side of its oriented bounding box has this many metres.
     density: kg/m3 of the objects of `random_urdfs` or of a folder; `box` and `primitives` have
         their own. No object weighs less than 0.02 kg.
     max_opening: m, of the gripper; a warning names the first object of a folder that is too wide
@@ -190,7 +190,7 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
             found = found(settings)
         except UserError:
             raise
-        except Exception as error:  # whatever the plug-in raises is its author's to mend
+        except Exception as error:  # whatever the plug-in raises is its author's to fix
             raise ObjectError(
                 f"objects: {path!r} raised {type(error).__name__}: {' '.join(str(error).split())}"
             ) from error

@@ -154,7 +154,7 @@ def plugin_planner(path: str, gripper: GripperGeometry, workspace: Workspace, se
         return loaded
     try:
         planner = loaded(gripper, workspace, seed)
-    except Exception as error:  # whatever the module's own code raises is its author's to mend
+    except Exception as error:  # whatever the module's own code raises is its author's to fix
         raise UserError(
             f"evaluate.policies: {path!r} raised {type(error).__name__}: {error}; it is called "
             "with gripper, workspace and seed"

@@ -219,7 +219,7 @@ def test_a_push_in_the_final_approach_ends_in_a_collision(cell):
 
 
 def test_the_hand_is_fed_forward_the_way_the_object_goes(cell):
-    """A law that wishes for nothing: what is left is the velocity of the object's point below the
+    """A law that desires no velocity: what is left is the velocity of the object's point below the
     hand, v + omega x r by hand, and the goal's sinking. Ahead of the object, not behind it."""
     descent = GuidedApproach(loop(cell, "pbvs"), ServoArm(cell), grasp_of_box(cell))
     state = descent.target.motion.state

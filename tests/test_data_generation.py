@@ -281,16 +281,16 @@ def test_a_texture_colours_what_it_is_on_and_leaves_the_depth(cell_with_scene):
     cell.load(scene)
     view = camera_intrinsics(cell.config.camera), cell.camera_pose()
     rng = np.random.default_rng(0)
-    plain = Appearance().photograph(cell, *view, rng)
+    plain = Appearance().render(cell, *view, rng)
     count = len(scene.placements)
     for index in range(-1, count):  # the table, then every object
         textures = tuple(stripes(0.5) if i == index else None for i in range(-1, count))
-        seen = Appearance(textures=textures).photograph(cell, *view, rng)
+        seen = Appearance(textures=textures).render(cell, *view, rng)
         assert np.array_equal(seen.depth, plain.depth)
         changed = (seen.rgb != plain.rgb).any(axis=-1)
         assert changed[plain.segmentation == index].mean() > 0.5
         assert not changed[plain.segmentation != index].any()
-    noisy = Appearance(noise=5.0).photograph(cell, *view, rng)
+    noisy = Appearance(noise=5.0).render(cell, *view, rng)
     assert np.array_equal(noisy.depth, plain.depth)
     middle = (plain.rgb > 30) & (plain.rgb < 225)  # not cut off at 0 or 255
     # Rounding down takes half a step from the mean and adds a variance of a twelfth.

@@ -125,15 +125,19 @@ def test_architecture_lists_every_module_once():
         assert sorted(listed) == sorted(there)
 
 
-def test_recipes_name_files_and_registries_that_exist():
-    """Each recipe of CONTRIBUTING: its files, and its registry as a name in one of them."""
-    table = text_of(ROOT / "CONTRIBUTING.md").split("## Recipes")[1].split("\n## ")[0]
-    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| a")]
+@pytest.mark.parametrize(
+    ("page", "title"),
+    [("CONTRIBUTING.md", "## Recipes"), ("docs/architecture.md", "## Where to change what")],
+)
+def test_recipes_name_files_and_registries_that_exist(page, title):
+    """Each recipe: its files, its registry as a name in one of them, and its test."""
+    table = text_of(ROOT / page).split(title)[1].split("\n## ")[0]
+    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
     assert len(rows) >= 10
-    for _, file, registry, test in rows:
+    for _, file, registry, *test in rows:
         files = re.findall(r"`((?:envs|models|utils|configs)/\w+\.[\w.]+)`", file + registry)
         files = [text_of(ROOT / name) for name in files if "NAME" not in name]
         for name in re.findall(r"`([A-Z_]{3,})`", file + registry):
             assert any(re.search(rf"^{name}\b", one, re.MULTILINE) for one in files), name
-        for path in re.findall(r"`(tests/\w+\.py)`", test):
+        for path in re.findall(r"`(tests/\w+\.py)`", "".join(test)):
             assert (ROOT / path).exists(), path

@@ -134,10 +134,10 @@ def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, caps
     (tmp_path / "sample.jsonl").write_text("\n".join([*lines, random]))
     monkeypatch.chdir(tmp_path)
     assert evaluate.main(["--replay", "sample.jsonl", "evaluate.workers=1"]) == 1
-    told = capsys.readouterr().out
-    assert "the rounds were played with 1.0" in told and "python is" not in told
-    assert "different: heuristic, isolated, scene 0" in told
-    assert "1 of 2 rounds are the same" in told
+    printed = capsys.readouterr().out
+    assert "the rounds were played with 1.0" in printed and "python is" not in printed
+    assert "different: heuristic, isolated, scene 0" in printed
+    assert "1 of 2 rounds are the same" in printed
 
 
 MODULE = """

@@ -199,11 +199,11 @@ def test_a_checkpoint_is_an_ordinary_network_with_the_target_s_statistics(tmp_pa
     assert isinstance(saved.backbone.encoder[0][1], nn.BatchNorm2d)
     network, images = trainer.trained.eval(), pair(9).target
     with torch.no_grad():
-        told = saved(images, logits=True, centres=True)
+        reloaded = saved(images, logits=True, centres=True)
         theirs, ours = (network(images, domain).task for domain in (TARGET, SOURCE))
-    for a, b in zip(told, theirs):
+    for a, b in zip(reloaded, theirs):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-    assert not torch.allclose(told[0], ours[0], rtol=1e-3), "the source has others"
+    assert not torch.allclose(reloaded[0], ours[0], rtol=1e-3), "the source has others"
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])

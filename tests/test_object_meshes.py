@@ -157,7 +157,7 @@ def test_a_damaged_byte_anywhere_in_the_cache_is_told_or_harmless(tmp_path):
     decompose(bracket, tmp_path)
     (path,) = tmp_path.glob("parts-*.npz")
     whole = path.read_bytes()
-    told = 0
+    compared = 0
     for place in range(0, len(whole), 7):
         damaged = bytearray(whole)
         damaged[place] ^= 0xFF
@@ -166,5 +166,5 @@ def test_a_damaged_byte_anywhere_in_the_cache_is_told_or_harmless(tmp_path):
             decompose(bracket, tmp_path)
         except ObjectError as error:
             assert path.name in str(error)
-            told += 1
-    assert told > len(whole) / 7 / 2
+            compared += 1
+    assert compared > len(whole) / 7 / 2

@@ -91,13 +91,13 @@ def test_objects_without_a_table_are_blocks_of_consecutive_images(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "suffix, told",
+    "suffix, named",
     [("d.tiff", "pcd0001d.tiff.*point clouds"), ("r.png", "pcd0001r.png"), ("cneg.txt", "cneg")],
 )
-def test_missing_file(tmp_path, suffix, told):
+def test_missing_file(tmp_path, suffix, named):
     write_cornell(tmp_path, 1)
     (tmp_path / f"pcd0001{suffix}").unlink()
-    with pytest.raises(UserError, match=f"1 files are missing: .*{told}"):
+    with pytest.raises(UserError, match=f"1 files are missing: .*{named}"):
         CornellDataset(tmp_path)
 
 
@@ -115,7 +115,7 @@ def test_missing_folder_empty_folder_and_unknown_kind(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "positives, told",
+    "positives, named",
     [
         (SQUARE[:-6], "3 corner rows"),
         (SQUARE.replace("5", "x"), "line 1"),
@@ -125,9 +125,9 @@ def test_missing_folder_empty_folder_and_unknown_kind(tmp_path):
         ("1 1\n" * 4, "width and height > 0"),
     ],
 )
-def test_broken_cornell_labels(tmp_path, positives, told):
+def test_broken_cornell_labels(tmp_path, positives, named):
     data = CornellDataset(write_cornell(tmp_path, 1, positives))
-    with pytest.raises(UserError, match=rf"pcd0001cpos\.txt.*{told}"):
+    with pytest.raises(UserError, match=rf"pcd0001cpos\.txt.*{named}"):
         data[0]
 
 
@@ -143,11 +143,11 @@ def test_half_written_images(tmp_path, suffix, keep):
 
 
 @pytest.mark.parametrize(
-    "depth, told",
+    "depth, named",
     [(1200, "millimetres"), (0, "every depth is zero"), (np.nan, "every depth is zero")],
 )
-def test_implausible_depth(tmp_path, depth, told):
-    with pytest.raises(UserError, match=told):
+def test_implausible_depth(tmp_path, depth, named):
+    with pytest.raises(UserError, match=named):
         CornellDataset(write_cornell(tmp_path, 1, depth=depth))[0]
 
 
@@ -186,7 +186,7 @@ def test_jacquard_sample(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "grasps, told",
+    "grasps, named",
     [
         ("", "holds no grasp"),
         ("1;2;3;4\n", "line 1: need 5 numbers"),
@@ -195,9 +195,9 @@ def test_jacquard_sample(tmp_path):
         ("1;2;3;4;five\n", "line 1"),
     ],
 )
-def test_broken_jacquard_labels(tmp_path, grasps, told):
+def test_broken_jacquard_labels(tmp_path, grasps, named):
     data = JacquardDataset(write_jacquard(tmp_path, grasps))
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=named):
         data[0]
 
 

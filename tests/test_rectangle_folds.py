@@ -93,8 +93,8 @@ def test_one_epoch_on_cornell(tmp_path, monkeypatch, capsys):
     saved = load_graspnet(folder / "fold0" / "graspnet.pt")
     assert saved.model.max_width == 0.25
     assert saved.metres_per_pixel == FORMATS["cornell"].view.metres_per_pixel
-    told = capsys.readouterr().out
-    assert f"{correct} of 10 correct" in told and "fixed schedule, last weights" in told
+    printed = capsys.readouterr().out
+    assert f"{correct} of 10 correct" in printed and "fixed schedule, last weights" in printed
 
     # Everything is there: resuming only tests again, with the same outcome.
     before = (folder / "results.json").read_text()

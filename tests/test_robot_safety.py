@@ -61,16 +61,16 @@ def gate(*overrides, **options) -> SafetyGate:
     return SafetyGate(config.safety, config.robot, DT, **options)
 
 
-def passed(wish, *overrides, q=HOME, contact_force=0.0, age=0.0, **options) -> np.ndarray:
-    """What the gate lets pass of a wish that it does not refuse."""
-    verdict = gate(*overrides, **options).check(np.asarray(wish), q, contact_force, age)
+def passed(desired, *overrides, q=HOME, contact_force=0.0, age=0.0, **options) -> np.ndarray:
+    """What the gate lets pass of a desired velocity that it does not refuse."""
+    verdict = gate(*overrides, **options).check(np.asarray(desired), q, contact_force, age)
     assert verdict.reason is None
     return verdict.velocity
 
 
-def refusal(wish, *overrides, q=HOME, contact_force=0.0, age=0.0) -> str:
+def refusal(desired, *overrides, q=HOME, contact_force=0.0, age=0.0) -> str:
     """Why the gate stops the arm; the velocity is zero then."""
-    verdict = gate(*overrides).check(np.asarray(wish), q, contact_force, age)
+    verdict = gate(*overrides).check(np.asarray(desired), q, contact_force, age)
     np.testing.assert_array_equal(verdict.velocity, np.zeros(7))
     return verdict.reason
 
@@ -102,14 +102,16 @@ def test_what_is_legal_passes_as_it_is():
 
 def test_a_command_that_is_too_fast_is_slowed_as_a_whole():
     # Joint 1 is asked for 4.35 rad/s, twice its limit, joint 5 for 1 rad/s: half of both.
-    wish = joint(1, 4.35) + joint(5, 1.0)
+    desired = joint(1, 4.35) + joint(5, 1.0)
     made = arm_gate()
-    q, velocity = made.passed(HOME + DT * wish, wish)
-    np.testing.assert_allclose(q, HOME + DT * wish / 2)
-    np.testing.assert_allclose(velocity, wish / 2)
+    q, velocity = made.passed(HOME + DT * desired, desired)
+    np.testing.assert_allclose(q, HOME + DT * desired / 2)
+    np.testing.assert_allclose(velocity, desired / 2)
     # The next one is counted from what was sent: the other half of the way is just legal.
-    np.testing.assert_allclose(made.passed(HOME + DT * wish, wish / 2)[0], HOME + DT * wish)
-    # A jump of the reference counts even where the velocity that is told is harmless.
+    np.testing.assert_allclose(
+        made.passed(HOME + DT * desired, desired / 2)[0], HOME + DT * desired
+    )
+    # A jump of the reference counts even where the velocity of the command is harmless.
     q, _ = arm_gate("robot.velocity_scale=0.5").passed(HOME + joint(1, 0.1), np.zeros(7))
     np.testing.assert_allclose(q, HOME + joint(1, 2.175 / 2 * DT))
 
@@ -160,7 +162,7 @@ def test_the_open_loop_does_not_leave_the_workspace(narrow, box_set):
     assert outcome.reason == "stopped"
     assert outcome.detail.startswith("stopped: the workspace ends here (y = -0.30")
     assert outcome.object_index == 0, "what was in the hand is named"
-    # It was told to hold still at the edge, 30 cm, at the carry's full speed of over 1 m/s.
+    # It was commanded to stop at the edge, 30 cm, at the carry's full speed of over 1 m/s.
     assert -0.32 < min(lowest) < -0.30
     np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
 
@@ -224,34 +226,34 @@ def test_a_home_outside_the_box_is_refused():
         PybulletCell(config)
 
 
-def test_a_harmless_wish_passes_unchanged():
-    wish = np.array([0.1, -0.05, 0.02, 0.1, -0.1, 0.05, 0.2])
-    np.testing.assert_array_equal(passed(wish), wish)
+def test_a_harmless_velocity_passes_unchanged():
+    desired = np.array([0.1, -0.05, 0.02, 0.1, -0.1, 0.05, 0.2])
+    np.testing.assert_array_equal(passed(desired), desired)
     np.testing.assert_array_equal(passed(np.zeros(7)), np.zeros(7))
 
 
 def test_joint_speeds_are_scaled_together():
-    wish = np.array([0.435, -0.1, 0, 0.2, 0, 0, 0.05])
-    # A tenth of 2.175 rad/s is half of the first joint's wish.
-    np.testing.assert_allclose(passed(wish, "robot.velocity_scale=0.1"), wish / 2)
+    desired = np.array([0.435, -0.1, 0, 0.2, 0, 0, 0.05])
+    # A tenth of 2.175 rad/s is half of the first joint's desired velocity.
+    np.testing.assert_allclose(passed(desired, "robot.velocity_scale=0.1"), desired / 2)
 
 
 def test_the_arm_speeds_up_and_slows_down_within_the_acceleration_limits():
-    wish = np.array([0.2, -0.1, 0, 0.2, 0, 0, 0.05])
+    desired = np.array([0.2, -0.1, 0, 0.2, 0, 0, 0.05])
     # In 1/240 s joints 1, 2 and 4 may change by 15, 7.5 and 12.5 rad/s^2 times that, which are
-    # shares of 0.3125, 0.3125 and 0.2604 of this wish: the last one is everybody's.
+    # shares of 0.3125, 0.3125 and 0.2604 of it: the last one applies to all joints.
     share = 12.5 / 240 / 0.2
-    speed_up = gate().check(wish, HOME, 0.0, 0.0, np.zeros(7)).velocity
-    np.testing.assert_allclose(speed_up, share * wish, rtol=1e-9)
-    slow_down = gate().check(np.zeros(7), HOME, 0.0, 0.0, wish).velocity
-    np.testing.assert_allclose(slow_down, (1 - share) * wish, rtol=1e-9)
-    near = wish + 0.01
-    np.testing.assert_allclose(gate().check(near, HOME, 0.0, 0.0, wish).velocity, near)
-    half = gate("robot.acceleration_scale=0.5").check(wish, HOME, 0.0, 0.0, np.zeros(7)).velocity
-    np.testing.assert_allclose(half, share / 2 * wish, rtol=1e-9)
+    speed_up = gate().check(desired, HOME, 0.0, 0.0, np.zeros(7)).velocity
+    np.testing.assert_allclose(speed_up, share * desired, rtol=1e-9)
+    slow_down = gate().check(np.zeros(7), HOME, 0.0, 0.0, desired).velocity
+    np.testing.assert_allclose(slow_down, (1 - share) * desired, rtol=1e-9)
+    near = desired + 0.01
+    np.testing.assert_allclose(gate().check(near, HOME, 0.0, 0.0, desired).velocity, near)
+    half = gate("robot.acceleration_scale=0.5").check(desired, HOME, 0.0, 0.0, np.zeros(7)).velocity
+    np.testing.assert_allclose(half, share / 2 * desired, rtol=1e-9)
 
 
-def test_a_wish_to_come_back_is_no_reason_to_stop():
+def test_a_velocity_that_leads_back_is_no_reason_to_stop():
     q = HOME.copy()
     q[6] = JOINT_UPPER[6] - 0.02  # at the limit, and still going there
     verdict = gate().check(joint(7, -0.5), q, 0.0, 0.0, joint(7, 0.5))
@@ -279,13 +281,15 @@ def test_linear_speed_of_what_is_carried():
 def test_a_joint_brakes_before_its_limit_and_takes_the_others_along():
     q = HOME.copy()
     q[6] = JOINT_UPPER[6] - 0.02 - 0.002  # 2 mrad before the margin; 20 rad/s^2
-    wish = joint(7, 0.9) + joint(1, 0.3)
+    desired = joint(7, 0.9) + joint(1, 0.3)
     share = np.sqrt(2 * 20.0 * 0.002) / 0.9  # 0.283 rad/s are allowed
-    np.testing.assert_allclose(passed(wish, q=q), share * wish, rtol=1e-9)
-    np.testing.assert_array_equal(passed(-wish, q=q), -wish)  # away from it nothing holds it back
+    np.testing.assert_allclose(passed(desired, q=q), share * desired, rtol=1e-9)
+    np.testing.assert_array_equal(
+        passed(-desired, q=q), -desired
+    )  # away from it nothing holds it back
     # Very near, the next period must not cross the limit: 0.1 mrad in 1/240 s.
     q[6] = JOINT_UPPER[6] - 0.02 - 1e-4
-    np.testing.assert_allclose(passed(wish, q=q), 1e-4 / DT / 0.9 * wish, rtol=1e-9)
+    np.testing.assert_allclose(passed(desired, q=q), 1e-4 / DT / 0.9 * desired, rtol=1e-9)
 
 
 def test_a_joint_at_its_limit_stops_the_arm_and_may_come_back():
@@ -305,30 +309,30 @@ def test_a_joint_at_its_limit_stops_the_arm_and_may_come_back():
 def test_the_arm_brakes_before_each_side_of_the_box(axis, sign, place):
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
     direction = sign * np.eye(3)[axis]
-    wish = towards(0.2 * direction)
+    desired = towards(0.2 * direction)
     for room, allowed in ((0.002, np.sqrt(2 * 6.5 * 0.002)), (1e-4, 1e-4 / DT)):
         box[(sign + 1) // 2, axis] = place + sign * room
         sides = [f"safety.box_{n}={b.tolist()}" for n, b in zip(("lower", "upper"), box)]
         np.testing.assert_allclose(
-            geometric_jacobian(HOME)[:3] @ passed(wish, *sides), allowed * direction,
+            geometric_jacobian(HOME)[:3] @ passed(desired, *sides), allowed * direction,
             rtol=0.02, atol=1e-9,  # the place of E above is rounded to 1 um
         )  # fmt: skip
-        np.testing.assert_allclose(passed(-wish, *sides), -wish)
+        np.testing.assert_allclose(passed(-desired, *sides), -desired)
     box[(sign + 1) // 2, axis] = place - sign * 0.01  # it is outside
     sides = [f"safety.box_{n}={b.tolist()}" for n, b in zip(("lower", "upper"), box)]
-    assert f"the workspace ends here ({'xyz'[axis]} = " in refusal(wish, *sides)
-    np.testing.assert_allclose(passed(-wish, *sides), -wish)
+    assert f"the workspace ends here ({'xyz'[axis]} = " in refusal(desired, *sides)
+    np.testing.assert_allclose(passed(-desired, *sides), -desired)
 
 
 def test_old_perception_means_zero_velocity():
-    wish = joint(1, 0.1)
-    np.testing.assert_array_equal(passed(wish, age=0.1), wish)
-    assert refusal(wish, age=0.105) == (
+    desired = joint(1, 0.1)
+    np.testing.assert_array_equal(passed(desired, age=0.1), desired)
+    assert refusal(desired, age=0.105) == (
         "what was seen last is 105 ms old, the watchdog allows 100 ms"
     )
-    assert "watchdog" in refusal(wish, "safety.watchdog=0.05", age=0.06)
-    assert "watchdog" in refusal(wish, age=np.inf)
-    assert "watchdog" in refusal(wish, age=np.nan)
+    assert "watchdog" in refusal(desired, "safety.watchdog=0.05", age=0.06)
+    assert "watchdog" in refusal(desired, age=np.inf)
+    assert "watchdog" in refusal(desired, age=np.nan)
 
 
 def test_contact_stops_the_arm():
@@ -349,8 +353,8 @@ def test_numbers_that_are_not_finite_go_nowhere(broken):
     st.tuples(*[st.floats(-5, 5)] * 7),
     st.sampled_from([0.1, 0.5, 1.0]),
 )
-def test_whatever_passes_keeps_every_limit_and_its_direction(q, wish, scale):
-    q, wish = np.array(q), np.array(wish)
+def test_whatever_passes_keeps_every_limit_and_its_direction(q, desired, scale):
+    q, desired = np.array(q), np.array(desired)
     lower, upper, guarded = [-0.9, -0.9, 0.0], [0.9, 0.9, 1.2], np.eye(3) * 0.1
     T, J = forward_kinematics(q), geometric_jacobian(q)
     points = T[:3, 3] + guarded @ T[:3, :3].T
@@ -358,11 +362,11 @@ def test_whatever_passes_keeps_every_limit_and_its_direction(q, wish, scale):
     verdict = gate(
         f"robot.velocity_scale={scale}", f"safety.box_lower={lower}", f"safety.box_upper={upper}",
         guarded_E=guarded,
-    ).check(wish, q, 0.0, 0.0)  # fmt: skip
+    ).check(desired, q, 0.0, 0.0)  # fmt: skip
     v = verdict.velocity
     assert (verdict.reason is None) or not v.any()
-    assert np.dot(v, wish) >= 0
-    np.testing.assert_allclose(np.linalg.norm(v) * wish, np.linalg.norm(wish) * v, atol=1e-9)
+    assert np.dot(v, desired) >= 0
+    np.testing.assert_allclose(np.linalg.norm(v) * desired, np.linalg.norm(desired) * v, atol=1e-9)
     assert (np.abs(v) <= scale * JOINT_VELOCITY * (1 + 1e-9)).all()
     assert (q + DT * v >= JOINT_LOWER + 0.02 - 1e-12).all()
     assert (q + DT * v <= JOINT_UPPER - 0.02 + 1e-12).all()

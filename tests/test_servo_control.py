@@ -72,7 +72,7 @@ def test_pseudo_inverse_refuses_infinity_even_when_damped():
 
 @pytest.fixture(scope="module")
 def panda():
-    """A fixed Panda; gives T_WE, Jacobian and E's world velocity, told by PyBullet."""
+    """A fixed Panda; gives T_WE, Jacobian and E's velocity in W, from PyBullet."""
     client = BulletClient(pybullet.DIRECT)
     client.setAdditionalSearchPath(pybullet_data.getDataPath())
     body = client.loadURDF("franka_panda/panda.urdf", useFixedBase=True)

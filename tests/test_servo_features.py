@@ -63,7 +63,7 @@ def test_pose_from_points_finds_the_pose(twist):
 
 
 def test_depths_are_learned_from_motion():
-    # START is about 1 m away; told 0.4 m, the estimator must find out on the way.
+    # START is about 1 m away; started at 0.4 m, the estimator must find out on the way.
     servo = ImageBasedVisualServo(CAMERA, depth=DepthFromMotion(0.4))
     history = servo.simulate(SQUARE, START, GOAL, depth_factor=None, tolerance=1e-5)
     assert history.converged

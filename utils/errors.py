@@ -1,4 +1,4 @@
-"""Errors that are the user's to fix, told in one sentence.
+"""Errors that are the user's to fix, each one sentence.
 
 This module knows nothing about what went wrong; it only fixes how it is said.
 

@@ -71,7 +71,7 @@ def _import(module_name: str, path: str, what: str) -> Any:
                 "folder that holds it, or add that folder to PYTHONPATH"
             ) from error
         raise _failed(error, path, what) from error
-    except Exception as error:  # whatever the module's own code raises is its author's to mend
+    except Exception as error:  # whatever the module's own code raises is its author's to fix
         raise _failed(error, path, what) from error
 
 
@@ -80,5 +80,5 @@ def _failed(error: Exception, path: str, what: str) -> UserError:
     reason = " ".join(str(error).split())
     return UserError(
         f"{what}: {path!r} cannot be loaded: its module raised {type(error).__name__}: {reason} "
-        f"({last.filename}, line {last.lineno}); mend the module"
+        f"({last.filename}, line {last.lineno}); correct the module"
     )

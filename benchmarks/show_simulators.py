@@ -1,6 +1,6 @@
-"""One scene in both simulators, side by side: python -m benchmarks.show_worlds --output FILE.png
+"""One scene in both simulators: python -m benchmarks.show_simulators --output FILE.png
 
-Writes what a visitor and what the cell's camera sees in PyBullet (left) and in MuJoCo (right), and
+Writes a picture of the cell and the images of its camera, PyBullet's left and MuJoCo's right, and
 prints how far depth, segmentation and the settled objects' places differ; `seed` chooses the scene.
 """
 
@@ -29,7 +29,7 @@ _DEEPEST, _HIGHEST = 0.81, 0.70  # m, black and white in the picture of depth
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("worlds.png"), help="PNG file")
+        parser.add_argument("--output", type=Path, default=Path("simulators.png"), help="PNG file")
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
 
