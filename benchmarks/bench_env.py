@@ -26,7 +26,7 @@ from envs.cell_scenes import Scene, make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
 from envs.pybullet_bodies import add_table, set_up_physics, spawn
-from envs.pybullet_camera import PybulletCamera
+from envs.pybullet_camera import PybulletCamera, projection_matrix
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config, load_config, run_script, with_settings
 
@@ -166,7 +166,7 @@ def bench_frames(config: Config, scenes: Sequence[Scene], repeats: int) -> list[
         camera = Intrinsics(side, side, view.fov_deg, view.near, view.far)
         matrices = {
             "viewMatrix": np.linalg.inv(T_WC @ np.diag([1.0, -1.0, -1.0, 1.0])).T.ravel(),
-            "projectionMatrix": camera.projection_matrix(pybullet.ER_TINY_RENDERER),
+            "projectionMatrix": projection_matrix(camera, pybullet.ER_TINY_RENDERER),
         }
 
         def stock_frame() -> None:

@@ -23,7 +23,7 @@ from envs.cell_scenes import make_scene
 from envs.env_actions import ACTION_ENTRIES, ActionDecoder, near_pose, pretraining_state
 from envs.env_observations import Observer, observed_names
 from envs.env_rewards import SHORTEST_LIFT, RewardState, make_reward, progress
-from envs.objects import ObjectSet, load_object_set
+from envs.objects import ObjectSet, check_object_set, load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import (
     JOINT_VELOCITY,
@@ -155,6 +155,7 @@ class RobotGraspingEnv(gymnasium.Env):
         }
         names = observed_names(self.config, by_name="observations" in settings)
         self._reward = make_reward(self.settings.reward)
+        check_object_set(self.settings.objects, "env.objects")
         self.objects = _object_set(
             self.settings.objects, self.config.gripper.max_opening, self.config.cache_folder,
             self.config.objects,

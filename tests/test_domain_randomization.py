@@ -539,11 +539,11 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
          "env.max_steps=1", "env.substeps=1", "sim.renderer=tiny"],
     )  # fmt: skip
     with training_envs(config, 2) as several:
-        several.keep_episodes(tmp_path / "episodes", first=2)
+        several.record_episodes(tmp_path / "episodes", first=2)
         several.restart([1, 2])
         still = np.zeros((2, *several.action_space.shape), np.float32)
         several.step(still)
-        several.keep_episodes(None)
+        several.record_episodes(None)
         several.restart([3, 4])
         several.step(still)
     files = sorted((tmp_path / "episodes").iterdir())
