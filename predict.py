@@ -67,7 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame = replace(image, T_WC=table.T_WC)
-    found = predict(saved.model, saved.metres_per_pixel, frame, table.height, options.count)
+    found = predict(
+        saved.model, saved.metres_per_pixel, frame, table.height, saved.gripper, options.count
+    )
 
     text = json.dumps(as_plain(found, frame, table, options), indent=2, allow_nan=False)
     write(out / "grasps.png", picture(found, frame, saved))

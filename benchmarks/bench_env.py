@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.cell import Intrinsics
-from envs.cell_scenes import Scene, make_scene
+from envs.cell_layout import Scene
+from envs.cell_scenes import make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
 from envs.pybullet_bodies import add_table, set_up_physics, spawn

@@ -153,7 +153,7 @@ def prepare(frame: RGBDFrame) -> torch.Tensor:
 
 
 def post_process(maps: Maps, frame: RGBDFrame) -> list:
-    return decode_grasps(*maps, frame.K, frame.T_WC, frame.depth)
+    return decode_grasps(*maps, frame.K, frame.T_WC, frame.depth, GripperGeometry())
 
 
 def maps_with_peaks(maps: Maps, frame: RGBDFrame) -> Maps:

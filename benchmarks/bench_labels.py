@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.cell_scenes import Scene, make_scene
+from envs.cell_layout import Scene
+from envs.cell_scenes import make_scene
 from envs.data_generation import execute_pairs
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell

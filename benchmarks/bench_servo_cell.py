@@ -18,7 +18,7 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.board import Board
 from envs.board_servo import BoardCamera, servo_settings, servo_to_goal, view_of
 from envs.cell import wrist_mount
-from envs.cell_scenes import Scene
+from envs.cell_layout import Scene
 from envs.pybullet_bodies import PybulletCarriedBoard, add_board
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM

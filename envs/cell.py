@@ -15,13 +15,12 @@ from typing import Any, Self
 import numpy as np
 
 from envs.board import Board, CarriedBoard
-from envs.cell_layout import on_table
-from envs.cell_scenes import EMPTY, Scene
+from envs.cell_layout import EMPTY, Scene, on_table
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
 from envs.robot_safety import ArmGate
 from utils.config import CameraConfig, Config
-from utils.depth import make_depth_noise
+from utils.depth import NoiseStream, seeded_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
 from utils.geometry import SceneGeometry, SolidObject
@@ -104,8 +103,6 @@ def wrist_mount(camera: CameraConfig) -> np.ndarray:
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the round.
 _REACH = 0.63
-# Keeps the depth noise of a seed apart from the scene of the same seed.
-_DEPTH_NOISE_STREAM = 1
 
 
 class PhysicsError(RuntimeError):
@@ -122,7 +119,8 @@ class Cell(ABC):
     has moved yet, before_step before every physics step (to disturb the objects), on_step after it
     (to film). view: changes what cameras see; None changes nothing. sample: the randomisation drawn
     for this scene alone (`utils.domain_randomization`), None for a nominal cell. on_action: changes
-    each action of a policy that moves the hand step by step; None leaves it as it is.
+    each action of a policy that moves the hand step by step; None leaves it as it is. taught: (4,
+    4) T_CE that `envs.scenarios.teach` has measured with this cell's wrist camera; None before.
     """
 
     robot: Robot
@@ -156,6 +154,7 @@ class Cell(ABC):
         self.view: RandomView | None = None
         self.sample: dict[str, Any] | None = None
         self.on_action: Callable[[np.ndarray], np.ndarray] | None = None
+        self.taught: np.ndarray | None = None
 
     # --- Scene --------------------------------------------------------------------------------
 
@@ -213,10 +212,12 @@ class Cell(ABC):
     def randomizable(self) -> Randomizable:
         """The scene as built, whose physics and colours can be changed: the same object until the
         next build. Raises UserError in a simulator that does not implement it."""
-        raise UserError(
-            f"simulator={self.config.simulator}: its cell cannot be randomised; use "
-            "simulator=pybullet"
-        )
+        raise not_randomizable(self.config)
+
+    @classmethod
+    def can_be_randomized(cls) -> bool:
+        """Whether cells of this class implement `randomizable`."""
+        return cls.randomizable is not Cell.randomizable
 
     @abstractmethod
     def close(self) -> None:
@@ -354,15 +355,14 @@ class Cell(ABC):
         """
         camera = self.config.camera
         frame = self.look(camera_intrinsics(camera), self.camera_pose(), with_truth)
-        focal = float(frame.K[0, 0])
-        noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
+        noise = camera.make_noise(float(frame.K[0, 0]))
         if noise is not None:
             if self.scene is None:
                 raise ValueError(
                     "Depth noise follows the scene's seed; build or load a scene first"
                 )
-            rng = np.random.default_rng([self.scene.seed, self.frames, _DEPTH_NOISE_STREAM])
-            frame = replace(frame, depth=noise(frame.depth, rng))
+            measure = seeded_noise(noise, NoiseStream.PLANNING, self.scene.seed, self.frames)
+            frame = replace(frame, depth=measure(frame.depth))
         self.frames += 1
         return frame
 
@@ -411,6 +411,13 @@ class Cell(ABC):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def not_randomizable(config: Config) -> UserError:
+    """The error for a simulator whose cells do not implement `Cell.randomizable`."""
+    return UserError(
+        f"simulator={config.simulator}: its cell cannot be randomised; use simulator=pybullet"
+    )
 
 
 def _box(config: Config) -> tuple[list[float], list[float]]:

@@ -1,15 +1,22 @@
-"""What stands in every cell, in numbers: gravity, table, bin, walls, and when an object rests.
+"""What stands in a cell, as data: gravity, table, bin, walls, objects, and the scene of a round.
 
-Both simulators build their cells from these constants. This module knows no simulator, robot or
-object.
+Every simulator builds its cell from these constants and from a `Scene`. `envs.objects` makes the
+objects, `envs.cell_scenes` lays scenes out. This module knows no simulator and no robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from envs.object_files import FineVisual
+from envs.object_primitives import NativeShape
+from utils.geometry import ConvexSolid
 
 GRAVITY = 9.81  # m/s^2
 
@@ -68,3 +75,63 @@ def on_table(position: np.ndarray) -> bool:
     """Whether a point (3,) in W is over the table and not below its top."""
     x, y, z = position
     return bool(_X_MIN <= x <= _X_MAX and _Y_MIN <= y <= _Y_MAX and z > -TABLE_THICKNESS)
+
+
+# --- Objects and scenes ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """One rigid object. Lengths are metres in the body frame: origin at the centre of mass of
+    uniform density, axes as in the source.
+
+    parts: vertex arrays (V, 3) of the convex parts.
+    mass: kg. inertia: (3,) moments about the body axes, kg m2.
+    friction: lateral coefficient. rolling_friction, spinning_friction: metres.
+    color: RGBA in 0..1.
+    collision: a native shape, or an OBJ file with one `o` group for each convex part.
+    fine_visual: the original mesh for pictures, None where the collision shape is the original.
+    extents: (3,) sides of the bounding box along the body axes.
+    """
+
+    name: str
+    parts: tuple[np.ndarray, ...]
+    mass: float
+    inertia: np.ndarray
+    friction: float
+    color: tuple[float, float, float, float]
+    collision: NativeShape | Path
+    fine_visual: FineVisual | None
+    extents: np.ndarray
+    rolling_friction: float = 0.0
+    spinning_friction: float = 0.0
+
+    def geometry(self) -> tuple[ConvexSolid, ...]:
+        """The convex parts as solids, in the body frame."""
+        return self._solids
+
+    @cached_property
+    def _solids(self) -> tuple[ConvexSolid, ...]:
+        return tuple(ConvexSolid.from_vertices(part) for part in self.parts)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An object and its resting pose: position (3,) of the centre of mass, quaternion (4,), W."""
+
+    model: ObjectModel
+    position: np.ndarray
+    quaternion: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
+    drawn."""
+
+    layout: str
+    seed: int
+    placements: tuple[Placement, ...]
+
+
+EMPTY = Scene("isolated", 0, ())

@@ -2,19 +2,19 @@
 
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. The last two follow VGN (Breyer et al.,
-"Volumetric Grasping Network", CoRL 2020). This module knows no robot, camera, task or simulator:
-`envs.pybullet_bodies` simulates how objects come to rest.
+"Volumetric Grasping Network", CoRL 2020). The objects come to rest in PyBullet, on a
+`envs.pybullet_bodies.LayoutTable`, whichever simulator the scene is for, so that all simulators
+start from the same poses. The scene itself is data (`envs.cell_layout.Scene`). This module knows no
+robot, camera or task.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import square_walls
-from envs.objects import ObjectModel, ObjectSet
+from envs.cell_layout import ObjectModel, Placement, Scene, square_walls
+from envs.objects import ObjectSet
 from envs.pybullet_bodies import LayoutTable
 from utils.config import Config
 from utils.errors import UserError
@@ -27,27 +27,6 @@ _PILE_WALLS = {"half_size": 0.12, "height": 0.30, "thickness": 0.02}  # m
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
 _PACKED_GAP = 0.004  # m, least distance between neighbours
 _TRIES = 50
-
-
-@dataclass(frozen=True)
-class Placement:
-    """An object and its resting pose: position (3,) of the centre of mass, quaternion (4,), W."""
-
-    model: ObjectModel
-    position: np.ndarray
-    quaternion: np.ndarray
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Objects at rest. layout: one of LAYOUTS. seed: from which the scene was drawn."""
-
-    layout: str
-    seed: int
-    placements: tuple[Placement, ...]
-
-
-EMPTY = Scene("isolated", 0, ())
 
 
 class SceneError(UserError):
@@ -69,11 +48,11 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     for _ in range(_TRIES):
         chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
-        table = LayoutTable(config)
-        bodies = arrange(table, models, rng, config)
-        if bodies is None or not table.settle(bodies):
-            continue
-        poses = [table.pose(body) for body in bodies]
+        with LayoutTable(config) as table:
+            bodies = arrange(table, models, rng, config)
+            if bodies is None or not table.settle(bodies):
+                continue
+            poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
             return Scene(layout, seed, placements)

@@ -17,12 +17,10 @@ import numpy as np
 
 from envs.cell import Cell, Intrinsics
 from envs.robot_kinematics import forward_kinematics
-from utils.depth import make_depth_noise
+from utils.depth import NoiseStream, seeded_noise
 from utils.errors import TargetLostError
 from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part
-
-_NOISE_STREAM = 3  # keeps these draws apart from the scene's of the same seed
 
 
 class WristImage(NamedTuple):
@@ -48,16 +46,13 @@ class WristCamera:
             grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
         )
         self._coming: deque[WristImage] = deque()
-        focal = float(self.intrinsics.K[0, 0])
-        self._noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
-        self._rng = np.random.default_rng([cell.scene.seed, cell.frames, _NOISE_STREAM])
+        noise = camera.make_noise(float(self.intrinsics.K[0, 0]))
+        self._measure = seeded_noise(noise, NoiseStream.WRIST, cell.scene.seed, cell.frames)
 
     def __call__(self) -> WristImage | None:
         """Take an image now; the newest image that has arrived since the last call, or None."""
         cell = self.cell
-        depth = cell.look(self.intrinsics, cell.camera_pose("wrist")).depth
-        if self._noise is not None:
-            depth = self._noise(depth, self._rng)
+        depth = self._measure(cell.look(self.intrinsics, cell.camera_pose("wrist")).depth)
         self._coming.append(WristImage(depth, cell.robot.q, cell.seconds))
         arrived = None
         while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:

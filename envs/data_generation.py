@@ -8,28 +8,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
-import signal
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import yaml
 from tqdm import tqdm
 
 from envs.cell import PhysicsError, camera_intrinsics
 from envs.cell_appearance import Appearance, draw_camera
-from envs.cell_scenes import LAYOUTS, Scene, SceneError, make_scene
+from envs.cell_layout import Scene
+from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config, dump_config, with_settings
 from utils.errors import UserError
+from utils.executor import process_pool
 from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
@@ -96,12 +95,7 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
         check_bin(config)
     workers = config.data.workers or max(1, (os.cpu_count() or 1) // ranks)
     workers = min(workers, len(missing))
-    pool = ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(config,),
-    )
+    pool = process_pool(workers, _set_up, config)
     jobs = []
     try:
         with (
@@ -178,10 +172,8 @@ _worker_cell: PybulletCell
 _worker_sets: dict[tuple[str, str], ObjectSet]
 
 
-def _start_worker(config: Config) -> None:
+def _set_up(config: Config) -> None:
     global _worker_config, _worker_cell, _worker_sets
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    cv2.setNumThreads(1)  # the workers fill the cores
     _worker_config, _worker_cell = config, PybulletCell(config)
     _worker_sets = object_sets(config)
 

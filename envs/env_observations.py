@@ -17,7 +17,7 @@ from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.env_rewards import GraspGoals, Outline
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY
 from utils.config import Config
-from utils.depth import make_depth_noise
+from utils.depth import NoiseStream, seeded_noise
 from utils.errors import unknown_choice
 
 # Entries of info that can be observed, and their sizes.
@@ -30,7 +30,6 @@ OBSERVATIONS = ("rgb", "depth", "state", *INFO_OBSERVATIONS)
 _NEAR = 0.03  # m, the scale of the tanh in `object_offset`
 _JOINT_SLACK = 0.1  # rad: the motors may overshoot a limit a little
 _OPENING_SLACK = 0.01  # m
-_DEPTH_NOISE_STREAM = 5  # keeps these random numbers apart from others of the same seed
 # An object that has tipped over offers other grasps: it leans this much, and moves this slowly.
 _LEANING, _STILL = 0.2, 0.05  # rad, m/s
 
@@ -65,11 +64,7 @@ class Observer:
         self._wrist, self._with_goals = config.env.camera == "wrist", config.env.goal == "grasp"
         self._intrinsics = camera_intrinsics(config.camera)
         self._T_EC = wrist_mount(config.camera)
-        self._depth_noise = make_depth_noise(
-            config.camera.depth_noise,
-            float(self._intrinsics.K[0, 0]),
-            config.camera.depth_noise_args,
-        )
+        self._depth_noise = config.camera.make_noise(float(self._intrinsics.K[0, 0]))
         widest = config.gripper.max_opening + _OPENING_SLACK
         low = np.concatenate([JOINT_LOWER - _JOINT_SLACK, -2 * JOINT_VELOCITY, [-_OPENING_SLACK]])
         high = np.concatenate([JOINT_UPPER + _JOINT_SLACK, 2 * JOINT_VELOCITY, [widest]])
@@ -164,12 +159,10 @@ class Observer:
         and the number of images since the scene began."""
         T_WC = self.T_WE @ self._T_EC if self._wrist else self._cell.camera_pose()
         image = self._cell.image(self._intrinsics, T_WC)
-        depth = image.depth
-        if self._depth_noise is not None:
-            seed = [self._cell.scene.seed, self._frames, _DEPTH_NOISE_STREAM]
-            depth = self._depth_noise(depth, np.random.default_rng(seed))
+        seed, stream = self._cell.scene.seed, NoiseStream.OBSERVATION
+        measure = seeded_noise(self._depth_noise, stream, seed, self._frames)
         self._frames += 1
-        return image.rgb, depth[..., None]
+        return image.rgb, measure(image.depth)[..., None]
 
     def placeholder(self) -> dict[str, np.ndarray]:
         """An observation within its space for the end of an episode whose physics failed."""

@@ -14,7 +14,13 @@ from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
-from envs.policy_approach import check_learned, is_learned, learned_approach, placeholder
+from envs.policy_approach import (
+    PolicyApproach,
+    check_learned,
+    is_learned,
+    learned_approach,
+    placeholder,
+)
 from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
@@ -68,11 +74,12 @@ def new_planner(name: str, config: Config) -> Planner:
 _config: Config
 _cell: Cell
 _planners: dict[str, Planner]  # each is made once and reset for every round
+_approaches: dict[str, PolicyApproach]  # of learned policies, each made once for the cell
 
 
 def set_up(config: Config) -> None:
-    global _config, _cell, _planners
-    _config, _cell, _planners = config, make_cell(config), {}
+    global _config, _cell, _planners, _approaches
+    _config, _cell, _planners, _approaches = config, make_cell(config), {}, {}
 
 
 def work(task: Task) -> TaskResult:
@@ -83,7 +90,9 @@ def work(task: Task) -> TaskResult:
     for name, controller in task.policies:
         policy, approach, planner = policy_name(name, controller), None, placeholder
         if is_learned(name):
-            approach = learned_approach(name, _cell)
+            if name not in _approaches:
+                _approaches[name] = learned_approach(name, _cell)
+            approach = _approaches[name]
         else:
             if name not in _planners:
                 _planners[name] = new_planner(name, _config)

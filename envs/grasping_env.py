@@ -70,12 +70,13 @@ class RobotGraspingEnv(gymnasium.Env):
     | all         |      | last entry, `gripper="opening"`: -1 closed, 1 open | half of the opening    |
     | all         |      | last entry, `gripper="change"`: of the opening | `gripper_step` m           |
 
-    The commanded opening stays within 20 mm of the true one. Directions are those of W, or with `frame="hand"` those of the commanded E, whose z is the
-    approach. Changes add up on the *commanded* pose, stay within the workspace and the joint
-    limits, and are scaled down as a whole where a joint would exceed its speed limit. The command
-    stays where it is when the arm cannot reach the new one, when something holds the arm up, or
-    when the new one lies outside the workspace box (`safety`). No joint exceeds 2.175 rad/s, the
-    lowest of the Panda's joint speed limits; only the torque limits bound its acceleration.
+    With `gripper="change"` the commanded opening stays within 20 mm of the true one. Directions are
+    those of W, or with `frame="hand"` those of the commanded E, whose z is the approach. Changes
+    add up on the *commanded* pose, stay within the workspace and the joint limits, and are scaled
+    down as a whole where a joint would exceed its speed limit. The command stays where it is when
+    the arm cannot reach the new one, when something holds the arm up, or when the new one lies
+    outside the workspace box (`safety`). No joint exceeds 2.175 rad/s, the lowest of the Panda's
+    joint speed limits; only the torque limits bound its acceleration.
 
     **Reward**: `reward="dense"` adds the terms below, `"sparse"` is the first one alone, and
     `"my_module:my_reward"` calls a function with an `envs.env_rewards.RewardState`.

@@ -22,13 +22,13 @@ from envs.cell_layout import (
     REST_SPEED,
     TABLE_COLOUR,
     Box,
+    ObjectModel,
+    Scene,
     bin_walls,
     table_box,
 )
-from envs.cell_scenes import Scene
 from envs.mujoco_camera import MujocoCamera, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
-from envs.objects import ObjectModel
 from utils.config import Config
 from utils.geometry import GripperGeometry
 from utils.transforms import pose_matrix, position_quaternion

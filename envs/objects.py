@@ -10,10 +10,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -21,12 +18,14 @@ import numpy as np
 import trimesh
 from tqdm import tqdm
 
-from envs.object_files import FineVisual, fine_visual, object_files, read_object
+from envs.cell_layout import ObjectModel
+from envs.object_files import fine_visual, object_files, read_object
 from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
 from utils.errors import UserError, did_you_mean
-from utils.geometry import ConvexSolid, GripperGeometry
+from utils.executor import process_pool
+from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
@@ -41,41 +40,6 @@ LARGEST_EXTENT = 0.5
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
 ROLLING_FRICTION = 0.0005
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectModel:
-    """One rigid object. Lengths are metres in the body frame: origin at the centre of mass of
-    uniform density, axes as in the source.
-
-    parts: vertex arrays (V, 3) of the convex parts.
-    mass: kg. inertia: (3,) moments about the body axes, kg m2.
-    friction: lateral coefficient. rolling_friction, spinning_friction: metres.
-    color: RGBA in 0..1.
-    collision: a native shape, or an OBJ file with one `o` group for each convex part.
-    fine_visual: the original mesh for pictures, None where the collision shape is the original.
-    extents: (3,) sides of the bounding box along the body axes.
-    """
-
-    name: str
-    parts: tuple[np.ndarray, ...]
-    mass: float
-    inertia: np.ndarray
-    friction: float
-    color: tuple[float, float, float, float]
-    collision: NativeShape | Path
-    fine_visual: FineVisual | None
-    extents: np.ndarray
-    rolling_friction: float = 0.0
-    spinning_friction: float = 0.0
-
-    def geometry(self) -> tuple[ConvexSolid, ...]:
-        """The convex parts as solids, in the body frame."""
-        return self._solids
-
-    @cached_property
-    def _solids(self) -> tuple[ConvexSolid, ...]:
-        return tuple(ConvexSolid.from_vertices(part) for part in self.parts)
 
 
 class ObjectSet(ABC, Sequence[ObjectModel]):
@@ -210,11 +174,14 @@ def prepare(objects: ObjectSet, workers: int) -> None:
         for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
             objects[index]
         return
-    # "spawn": a forked copy of a process that runs physics or torch threads may hang.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with process_pool(workers) as pool:
         models = pool.map(objects.__getitem__, range(len(objects)), chunksize=4)
         bar = tqdm(models, total=len(objects), desc=f"objects {objects.name}")
-        objects._models.update(enumerate(bar))
+        try:
+            objects._models.update(enumerate(bar))
+        except BaseException:  # Ctrl-C, or an object that cannot be made: begin no others
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 # --- the sets -------------------------------------------------------------------------------

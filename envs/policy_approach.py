@@ -151,7 +151,6 @@ def _check_spaces(policy: Sb3Policy, config: Config) -> None:
         env.close()
 
 
-@functools.cache
 def learned_approach(name: str, cell: Cell) -> PolicyApproach:
     """The approach of a learned policy in a cell. A policy of Stable-Baselines3 brings no config,
     so that it acts in the environment of the cell's."""

@@ -8,9 +8,11 @@ This module knows no cell, robot or camera.
 
 from __future__ import annotations
 
+import atexit
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import ClassVar, Self
 
 import numpy as np
 import pybullet
@@ -24,12 +26,12 @@ from envs.cell_layout import (
     TABLE_COLOUR,
     WALL_COLOUR,
     Box,
+    ObjectModel,
     bin_walls,
     table_box,
 )
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
-from envs.objects import ObjectModel
 from utils.config import Config, SimConfig
 from utils.transforms import inverse_pose, pose_matrix, position_quaternion, transform_points
 
@@ -276,22 +278,46 @@ def _resting(client: int, body: int) -> bool:
     return max(map(abs, linear)) < REST_SPEED and max(map(abs, angular)) < 10 * REST_SPEED
 
 
-# A client takes 25 ms to connect, an isolated scene 5 ms to lay out: each thread keeps one client.
-_CLIENTS = threading.local()
+# --- The table on which scenes are laid out --------------------------------------------------
 
 
 class LayoutTable:
-    """A table alone, on which objects are put down and come to rest.
+    """A table alone, on which objects are put down and come to rest. Use it in a `with` block.
 
-    A thread has one such table at a time: a new one takes everything off it.
+    Entering takes everything off the table. All tables of a process share one physics client,
+    because connecting takes 25 ms and laying out an isolated scene 5 ms; it is connected at first
+    use and disconnected when the process ends. So only one table can be in use at a time: entering
+    a second one inside the first raises RuntimeError, and another thread waits for its turn.
     """
 
+    _client: ClassVar[int | None] = None
+    _turn: ClassVar[threading.RLock] = threading.RLock()
+    _in_use: ClassVar[bool] = False
+
     def __init__(self, config: Config):
-        if not hasattr(_CLIENTS, "number"):
-            _CLIENTS.number = pybullet.connect(pybullet.DIRECT)
-        self._client, self._config = _CLIENTS.number, config
+        self._config = config
+
+    def __enter__(self) -> Self:
+        LayoutTable._turn.acquire()
+        if LayoutTable._in_use:
+            LayoutTable._turn.release()
+            raise RuntimeError("a LayoutTable is in use already; leave its with block first")
+        LayoutTable._in_use = True
+        if LayoutTable._client is None:
+            LayoutTable._client = pybullet.connect(pybullet.DIRECT)
+            atexit.register(LayoutTable._disconnect)
         set_up_physics(self._client, self._config.sim)
         add_table(self._client)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        LayoutTable._in_use = False
+        LayoutTable._turn.release()
+
+    @staticmethod
+    def _disconnect() -> None:
+        pybullet.disconnect(physicsClientId=LayoutTable._client)
+        LayoutTable._client = None
 
     def put(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
         """Add an object with its centre of mass at position (3,); its body number."""

@@ -12,7 +12,7 @@ import pybullet
 
 from envs.board import Board, CarriedBoard
 from envs.cell import Cell, PhysicsError
-from envs.cell_scenes import Scene
+from envs.cell_layout import Scene
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
     PybulletCarriedBoard,
@@ -49,8 +49,8 @@ class PybulletCell(Cell):
         super().__init__(config)
         if config.simulator != "pybullet":
             raise UserError(
-                f"simulator={config.simulator}: only evaluate.py can score policies there; leave "
-                "it out, or set simulator=pybullet"
+                f"simulator={config.simulator} works in evaluate.py alone; set simulator=pybullet "
+                "here"
             )
         self.fine = fine
         self._gui = gui

@@ -13,14 +13,14 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from envs.cell import Cell, PhysicsError
-from envs.cell_scenes import Scene
+from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
-from envs.execution import Approach, GraspOutcome, execute_grasp, open_loop
-from envs.policy_approach import PolicyApproach
+from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from models.planners import Planner, needs_truth, reset_planner
@@ -41,6 +41,16 @@ TRIED_ANGLE = np.deg2rad(30)
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
 
+class GraspFinder(Protocol):
+    """An `envs.execution.Approach` that finds its own grasps on the way, such as
+    `envs.policy_approach.PolicyApproach`. closed_at: the hand's pose when it closed, None if it has
+    not closed."""
+
+    closed_at: Grasp | None
+
+    def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult: ...
+
+
 class PlannerError(Exception):
     """A planner raised an exception or returned something else than grasps."""
 
@@ -56,7 +66,7 @@ def run_round(
     scenario: str | None = None,
     controller: str = OPEN_LOOP,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
-    approach_by: PolicyApproach | None = None,
+    approach_by: GraspFinder | None = None,
 ) -> RoundRecord:
     """Load a scene, let a planner work on it, and return the record.
 

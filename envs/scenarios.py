@@ -18,7 +18,6 @@ physics alone moves them from there on. Knows no control law.
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -91,11 +90,16 @@ def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
     return replace(frame, T_WC=T_WC)
 
 
-@functools.lru_cache(maxsize=2)
 def teach(cell: Cell) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: from the board's pose in one image, taken
-    while the jig holds the board at a known pose in E. The first call empties the cell; later calls
-    return the same pose."""
+    while the jig holds the board at a known pose in E. The first call with a cell empties it and
+    keeps the pose as `cell.taught`; later calls return that."""
+    if cell.taught is None:
+        cell.taught = _measure_mount(cell)
+    return cell.taught
+
+
+def _measure_mount(cell: Cell) -> np.ndarray:
     servo, camera = cell.config.servo, cell.config.camera
     intrinsics = Intrinsics(
         servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far

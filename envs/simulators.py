@@ -1,17 +1,17 @@
 """The simulators, by the names that the config's key `simulator` takes, and `make_cell`.
 
-A new simulator brings a `Cell`, a `Robot` and a `Camera` (`envs.cell`, `envs.robot`, `envs.cell`)
-and an entry here.
+A new simulator brings a `Cell` and a `Camera` (`envs.cell`), a `Robot` (`envs.robot`), and an entry
+here. It can be randomised if its cell implements `randomizable`.
 """
 
 from __future__ import annotations
 
-from envs.cell import Cell
+from envs.cell import Cell, not_randomizable
 from envs.mujoco_cell import MujocoCell
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
-from utils.errors import UserError, unknown_choice
+from utils.errors import unknown_choice
 
 SIMULATORS: dict[str, type[Cell]] = {"pybullet": PybulletCell, "mujoco": MujocoCell}
 
@@ -37,7 +37,5 @@ def check_simulator(config: Config) -> None:
     """Raise UserError for an unknown simulator, and for one that cannot be randomised."""
     if config.simulator not in SIMULATORS:
         raise unknown_choice("simulator", config.simulator, SIMULATORS)
-    if config.simulator != "pybullet" and config.evaluate.randomise:
-        raise UserError(
-            "evaluate.randomise=true changes PyBullet's physics; use simulator=pybullet"
-        )
+    if config.evaluate.randomise and not SIMULATORS[config.simulator].can_be_randomized():
+        raise not_randomizable(config)

@@ -176,8 +176,8 @@ class GraspNet(nn.Module):
 
         x: (1, C, H, W). The returned dict holds `x` and `y` in fractions of the image, `theta` in
         fractions of 180 degrees (bin k is centred at k / num_angle_bins), `width` in metres and
-        `quality`. With K, T_WC and depth it also holds `grasps`, the list that
-        `decode_grasps(..., **decoding)` returns, best first.
+        `quality`. With K, T_WC, depth and, in `decoding`, a gripper it also holds `grasps`, the
+        list that `decode_grasps(..., **decoding)` returns, best first.
         """
         if len(x) != 1:
             raise ValueError(f"predict_grasp takes one image, got a batch of {len(x)}")

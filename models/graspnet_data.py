@@ -31,7 +31,7 @@ from utils.augmentation import (
     apply_similarity,
 )
 from utils.config import Config
-from utils.depth import DepthNoise, KinectNoise, make_depth_noise
+from utils.depth import DepthNoise, KinectNoise
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.grasp_data import SimulatedDataset
@@ -230,10 +230,8 @@ def simulated_data(config: Config, folder: Path, focal: float) -> TrainingData:
             ("validation", config.data.validation_frames),
         )
     )
-    camera = config.camera
     # Training meets noise even where the cell's own cameras have none.
-    noise = make_depth_noise(camera.depth_noise, focal, camera.depth_noise_args)
-    noise = noise or KinectNoise(image_focal=focal)
+    noise = config.camera.make_noise(focal) or KinectNoise(image_focal=focal)
     augmentation = Augmentation(
         turn_step=np.pi / ANGLE_BINS,  # whole bins are quick; the cameras' own turns fill the gaps
         colour=ColourJitter(hue=0.0),  # the scenes have every hue

@@ -19,7 +19,6 @@ from utils.grasp_labels import LabelSettings, grasp_below_surface
 from utils.height_map import local_maxima
 from utils.transforms import Grasp, ImageGrasp, known_depth
 
-PANDA_HAND = GripperGeometry()
 LABELS = LabelSettings()
 
 
@@ -53,7 +52,7 @@ def decode_grasps(
     K: np.ndarray,
     T_WC: np.ndarray,
     depth: np.ndarray,
-    gripper: GripperGeometry = PANDA_HAND,
+    gripper: GripperGeometry,
     table_height: float = 0.0,
     labels: LabelSettings = LABELS,
     peaks: PeakSettings = PeakSettings(),
@@ -71,7 +70,7 @@ def decode_grasps(
 
 
 def surface_grasps(
-    found: Peaks, depth: np.ndarray, gripper: GripperGeometry = PANDA_HAND, radius: int = 1
+    found: Peaks, depth: np.ndarray, gripper: GripperGeometry, radius: int = 1
 ) -> list[ImageGrasp]:
     """Place peaks on the visible surface: the depth is the median around them, and the width is
     limited to the gripper's opening. Peaks without known depth within `radius` pixels are left out.

@@ -15,7 +15,6 @@ import torch
 from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, to_input
 from models.graspnet_decoding import (
     LABELS,
-    PANDA_HAND,
     Peaks,
     PeakSettings,
     find_peaks,
@@ -62,17 +61,18 @@ def predict(
     metres_per_pixel: float,
     frame: RGBDFrame,
     table_height: float,
+    gripper: GripperGeometry,
     count: int = 20,
-    gripper: GripperGeometry = PANDA_HAND,
     labels: LabelSettings = LABELS,
     peaks: PeakSettings = PEAKS,
 ) -> Prediction:
     """Find the `count` best grasps in a frame of any size, aspect ratio and focal lengths.
 
     metres_per_pixel: the scale of the training images. table_height: z of the table in W, metres.
-    peaks: in pixels at the training's scale. A grasp needs a surface beside which the fingertips
-    fit, as in the labels; peaks on the table are left out. Raises UserError as `training_scale`
-    does.
+    gripper: the hand, whose opening limits the widths; `SavedGraspNet.gripper` is that of the
+    training. peaks: in pixels at the training's scale. A grasp needs a surface beside which the
+    fingertips fit, as in the labels; peaks on the table are left out. Raises UserError as
+    `training_scale` does.
     """
     scaling, maps = scaled_maps(model, metres_per_pixel, frame)
     grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)

@@ -21,6 +21,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from models.graspnet import GraspNet
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from utils.errors import UserError
+from utils.geometry import GripperGeometry
 from utils.runs import write_atomic
 
 SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
@@ -45,6 +46,12 @@ class SavedGraspNet(NamedTuple):
     metres_per_pixel: float
     config: dict[str, Any]
     extra: dict[str, Any]
+
+    @property
+    def gripper(self) -> GripperGeometry:
+        """The hand that the network was trained for: the section `gripper` of its config. A config
+        from before that section existed means the Panda's own hand."""
+        return GripperGeometry(**self.config.get("gripper", {}))
 
 
 def metres_per_pixel(K: np.ndarray, depth: float) -> float:

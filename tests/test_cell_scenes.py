@@ -7,6 +7,7 @@ import pytest
 from envs import cell_scenes
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.objects import load_object_set
+from envs.pybullet_bodies import LayoutTable
 from envs.pybullet_cell import PybulletCell
 from utils.config import with_settings
 
@@ -44,6 +45,15 @@ def test_packed_objects_stand_apart(primitives, config, cell):
     for i, a in enumerate(cell.bodies):
         for b in cell.bodies[:i]:
             assert not pybullet.getContactPoints(a, b, physicsClientId=cell.client)
+
+
+def test_one_layout_table_at_a_time(config):
+    with LayoutTable(config) as first:
+        with pytest.raises(RuntimeError, match="in use already"), LayoutTable(config):
+            pass
+        assert first.settle([])  # still there
+    with LayoutTable(config):
+        pass
 
 
 def test_impossible_scene_is_refused(box_set, config, monkeypatch):

@@ -132,7 +132,7 @@ def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch
 
     # A thread in place of the process, which would not know of the replaced functions.
     monkeypatch.setattr(
-        data_generation, "ProcessPoolExecutor", lambda workers, **_: ThreadPoolExecutor(workers)
+        data_generation, "process_pool", lambda workers, *_: ThreadPoolExecutor(workers)
     )
     monkeypatch.setattr(data_generation, "_make_shard", make_shard)
     config = load_config(None, [f"data.root={tmp_path / 'data'}", "data.frames=960",

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers.box_frames import CORNERS, yaw_pose
+from utils.config import load_config
 from utils.geometry import (
     ConvexSolid,
     GripperGeometry,
@@ -60,6 +61,10 @@ def test_a_moved_solid_is_hit_where_the_moved_line_was() -> None:
     )
     assert moved.enter == pytest.approx(still.enter) and moved.leave == pytest.approx(still.leave)
     np.testing.assert_allclose(moved.enter_normal, still.enter_normal @ T[:3, :3].T, atol=1e-9)
+
+
+def test_the_configs_default_hand_is_the_pandas_own() -> None:
+    assert load_config().gripper.geometry == GripperGeometry()
 
 
 def test_gripper_outline_bounds_pybullets_meshes() -> None:

@@ -11,6 +11,7 @@ from utils.grasp_labels import LabelSettings
 from utils.transforms import Grasp, angle_difference, grasp_to_image, look_at, project
 
 BINS = 18
+HAND = GripperGeometry()
 STEP = np.pi / BINS
 
 
@@ -93,8 +94,8 @@ def test_at_the_images_edge_and_on_a_plateau() -> None:
 def test_nothing_over_the_threshold_is_an_empty_list() -> None:
     K, T_WC, depth = camera(0.0)
     maps = maps_of([(50, 50, 1.0, 0.05, 0.45)], depth.shape)
-    assert decode_grasps(*maps, K, T_WC, depth) == []
-    assert len(decode_grasps(*maps, K, T_WC, depth, peaks=PeakSettings(threshold=0.3))) == 1
+    assert decode_grasps(*maps, K, T_WC, depth, HAND) == []
+    assert len(decode_grasps(*maps, K, T_WC, depth, HAND, peaks=PeakSettings(threshold=0.3))) == 1
 
 
 def test_busy_and_flat_maps_yield_as_many_grasps_as_asked_for() -> None:
@@ -102,7 +103,7 @@ def test_busy_and_flat_maps_yield_as_many_grasps_as_asked_for() -> None:
     torch.manual_seed(0)
     angle, width = torch.randn(1, BINS, 224, 224), torch.full((1, 1, 224, 224), 0.05)
     for quality in (torch.rand(1, 1, 224, 224), torch.full((1, 1, 224, 224), 0.9)):
-        found = decode_grasps(quality, angle, width, K, T_WC, depth)
+        found = decode_grasps(quality, angle, width, K, T_WC, depth, HAND)
         assert len(found) == PeakSettings().count
 
 
@@ -124,7 +125,7 @@ def camera(tilt: float, size: tuple[int, int] = (200, 224)):
 @pytest.mark.parametrize(("tilt", "tolerance"), [(0.0, 2e-4), (0.5, 1e-3)])
 def test_grasps_go_through_labels_and_back(tilt: float, tolerance: float) -> None:
     K, T_WC, depth = camera(tilt)
-    gripper, labels = GripperGeometry(), LabelSettings(depth=0.03)
+    labels = LabelSettings(depth=0.03)
     random = np.random.default_rng(2)
     wanted = []
     for quality, (x, y) in zip(
@@ -143,9 +144,7 @@ def test_grasps_go_through_labels_and_back(tilt: float, tolerance: float) -> Non
         top = Grasp((*grasp.position[:2], SURFACE), grasp.angle, grasp.width, grasp.quality)
         on_image = grasp_to_image(top, K, T_WC)
         blobs.append((*on_image.pixel, on_image.angle, grasp.width, grasp.quality))
-    found = decode_grasps(
-        *maps_of(blobs, depth.shape), K, T_WC, depth, gripper=gripper, labels=labels
-    )
+    found = decode_grasps(*maps_of(blobs, depth.shape), K, T_WC, depth, HAND, labels=labels)
     assert len(found) == len(wanted)
     for grasp, true in zip(found, wanted):
         assert np.abs(grasp.position - true.position).max() < tolerance
@@ -157,16 +156,15 @@ def test_the_fingertips_stay_off_the_table_and_the_hand_within_its_opening() -> 
     K, T_WC, depth = camera(0.0)
     u, v = project(np.array([0.5, 0.0, SURFACE]), K, T_WC)[0]
     maps = maps_of([(u, v, 0.5, 0.12, 0.9)], depth.shape)
-    gripper = GripperGeometry()
     # The grasp's position lies 7.2 mm over the tips' lowest point.
     for labelled, table, tip in (
         (LabelSettings(depth=0.03), 0.0, SURFACE - 0.03),
         (LabelSettings(depth=0.5, table_clearance=0.004), 0.0, 0.004),
         (LabelSettings(depth=0.5, table_clearance=0.01), 0.02, 0.03),
     ):
-        (grasp,) = decode_grasps(*maps, K, T_WC, depth, table_height=table, labels=labelled)
+        (grasp,) = decode_grasps(*maps, K, T_WC, depth, HAND, table_height=table, labels=labelled)
         assert grasp.position[2] == pytest.approx(tip + 0.0072, abs=2e-4)
-        assert grasp.width == gripper.max_opening
+        assert grasp.width == HAND.max_opening
 
 
 def test_surface_depth_ignores_holes_and_a_peak_in_the_dark_is_left_out() -> None:
@@ -177,7 +175,7 @@ def test_surface_depth_ignores_holes_and_a_peak_in_the_dark_is_left_out() -> Non
     assert found[[0, 2]] == pytest.approx([0.7, 0.7]) and np.isnan(found[1])
     K, T_WC, seen = camera(0.0)
     maps = maps_of([(100, 100, 0.5, 0.05, 0.9)], seen.shape)
-    assert decode_grasps(*maps, K, T_WC, np.zeros_like(seen)) == []
+    assert decode_grasps(*maps, K, T_WC, np.zeros_like(seen), HAND) == []
 
 
 def test_predict_grasp_keeps_the_tutorials_dict_and_adds_metric_grasps() -> None:
@@ -193,7 +191,8 @@ def test_predict_grasp_keeps_the_tutorials_dict_and_adds_metric_grasps() -> None
         {"x": 0.5, "y": 0.25, "theta": 70 / 180, "width": 0.05, "quality": 0.9}
     )
     assert model.training
-    (grasp,) = model.predict_grasp(torch.zeros(1, 4, 64, 80), K, T_WC, depth)["grasps"]
+    found = model.predict_grasp(torch.zeros(1, 4, 64, 80), K, T_WC, depth, gripper=HAND)
+    (grasp,) = found["grasps"]
     assert project(grasp.position, K, T_WC)[0] == pytest.approx((40, 16), abs=0.5)
     with pytest.raises(ValueError, match="batch of 2"):
         model.predict_grasp(torch.zeros(2, 4, 64, 80))

@@ -9,8 +9,11 @@ from envs.cell import Intrinsics
 from models import graspnet_inference
 from models.graspnet_io import metres_per_pixel
 from tests.helpers.hand_made import CUBES, FOCAL, OVERHEAD, PIXEL, cell_of_cubes, hand_made
+from utils.geometry import GripperGeometry
 from utils.images import PixelScaling
 from utils.transforms import RGBDFrame, angle_difference, grasp_to_image, look_at
+
+HAND = GripperGeometry()
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +41,7 @@ def test_resolutions_and_aspect_ratios_give_the_same_metric_grasps(cell):
     model, found = hand_made(), []
     for width, height in ((224, 224), (640, 480), (320, 240)):
         frame = cell.look(Intrinsics(width, height, 28), OVERHEAD)
-        result = graspnet_inference.predict(model, PIXEL, frame, 0.0)
+        result = graspnet_inference.predict(model, PIXEL, frame, 0.0, HAND)
         check_on_cubes(result.grasps, 0.0015)
         assert result.quality.shape == result.angle.shape == result.width.shape == (height, width)
         for grasp in result.grasps:  # the maps lie where the grasps do
@@ -57,7 +60,7 @@ def test_resolutions_and_aspect_ratios_give_the_same_metric_grasps(cell):
 def test_another_distance_and_focal_length_give_the_same_metric_grasps(cell):
     farther = look_at((0.5, 0.0, 1.3), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0))
     frame = cell.look(Intrinsics(400, 300, 20), farther)
-    check_on_cubes(graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0).grasps, 0.002)
+    check_on_cubes(graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0, HAND).grasps, 0.002)
 
 
 @pytest.mark.parametrize("unknown", [0.0, -1.0, np.inf, np.nan])
@@ -79,7 +82,7 @@ def test_pixels_that_are_not_square(cell):
         wider.image(square.rgb), wider.image(square.depth), wider.intrinsics(square.K), OVERHEAD
     )
     assert frame.depth.shape == (240, 400)
-    result = graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0)
+    result = graspnet_inference.predict(hand_made(), PIXEL, frame, 0.0, HAND)
     check_on_cubes(result.grasps, 0.0015)
     for grasp in result.grasps:  # the angle is that of the picture as it is
         shown = grasp_to_image(grasp.in_world, frame.K, OVERHEAD)

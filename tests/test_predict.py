@@ -170,6 +170,18 @@ def test_a_jpeg_and_holes_in_the_depth_do_not_matter(files, capsys):
     assert files.run(capsys, rgb=files.folder / "rgb.jpg")["grasps"] == found
 
 
+@pytest.mark.parametrize(
+    ("config", "opening"), [({"gripper": {"max_opening": 0.10}}, 0.10), ({}, 0.08)]
+)
+def test_widths_are_limited_to_the_hand_of_the_checkpoint(config, opening, files, tmp_path, capsys):
+    model = hand_made(max_width=0.2)
+    with torch.no_grad():
+        model.width_head.bias.fill_(20.0)  # as wide as it can, everywhere
+    save_graspnet(tmp_path / "wide.pt", model, PIXEL, config)
+    found = files.run(capsys, checkpoint=tmp_path / "wide.pt")["grasps"]
+    assert [grasp["width"] for grasp in found] == [opening] * len(CUBES)
+
+
 def test_count_and_table_height(files, capsys):
     assert len(files.run(capsys, count=1)["grasps"]) == 1
     given = files.run(capsys, table_height=0.045)  # fingertips stay 4 mm above it

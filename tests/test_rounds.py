@@ -4,7 +4,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs.cell_scenes import Placement, Scene, make_scene
+from envs.cell_layout import Placement, Scene
+from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round

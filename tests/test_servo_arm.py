@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.bench_servo_cell import make_task
 from envs.board import Board
-from envs.cell_scenes import Scene
+from envs.cell_layout import Scene
 from envs.pybullet_bodies import static_box
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian

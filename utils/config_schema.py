@@ -33,7 +33,7 @@ from utils.config_types import (
     Vector3,
     no_repeats,
 )
-from utils.depth import DEPTH_NOISES, make_depth_noise
+from utils.depth import DEPTH_NOISES, DepthNoise, make_depth_noise
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.transforms import look_at
@@ -86,8 +86,12 @@ class CameraConfig(Section):
         if self.near >= self.far:
             raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
         look_at(self.position, self.target, self.up)  # raises ValueError where that is undefined
-        make_depth_noise(self.depth_noise, float(self.height), self.depth_noise_args)  # as well
+        self.make_noise(float(self.height))  # as well
         return self
+
+    def make_noise(self, image_focal: float) -> DepthNoise | None:
+        """The depth noise of a camera whose focal length is image_focal pixels; None for none."""
+        return make_depth_noise(self.depth_noise, image_focal, self.depth_noise_args)
 
 
 class WorkspaceConfig(Section):

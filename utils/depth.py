@@ -3,7 +3,8 @@
 A depth noise is a callable `noise(depth, rng) -> depth` that turns a clean depth image into a
 measured one. `DEPTH_NOISES` lists the known ones; `make_depth_noise` makes one of them, or one of
 your own, for all that measure depth: the cell's cameras, the closed loop, the environments, the
-randomisation and the training.
+randomisation and the training. `seeded_noise` gives it the random numbers of a scene; `NoiseStream`
+lists who draws them.
 
 `KinectNoise` has four effects, after Handa et al., "A benchmark for RGB-D visual odometry, 3D
 reconstruction and SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -242,6 +244,31 @@ def make_depth_noise(
             "noise(depth, rng)"
         )
     return noise
+
+
+class NoiseStream(IntEnum):
+    """Who draws depth noise: each measures with random numbers of its own in the same scene.
+
+    The number 7 is taken by the motions of `envs.scenarios`.
+    """
+
+    PLANNING = 1  # frames that planners see (`envs.cell.Cell.frame`)
+    WRIST = 3  # images of the closed loop (`envs.closed_loop_tracker.WristCamera`)
+    OBSERVATION = 5  # images of the environment (`envs.env_observations.Observer`)
+
+
+def seeded_noise(
+    noise: DepthNoise | None, stream: NoiseStream, seed: int, frame: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from a clean depth image to the measured one; the same image for no noise.
+
+    seed: of the scene. frame: the number of images before. Further calls of one function go on with
+    its random numbers.
+    """
+    if noise is None:
+        return lambda depth: depth
+    rng = np.random.default_rng([seed, frame, stream])
+    return lambda depth: noise(depth, rng)
 
 
 # --- Holes ----------------------------------------------------------------------------------

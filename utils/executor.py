@@ -20,8 +20,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def process_pool(workers: int, set_up: Callable[..., None], *arguments: Any) -> Executor:
-    """Local processes, each of which first calls `set_up(*arguments)`.
+def process_pool(
+    workers: int, set_up: Callable[..., None] | None = None, *arguments: Any
+) -> Executor:
+    """Local processes, each of which first calls `set_up(*arguments)`, if one is given.
 
     The processes are spawned, because a forked copy of a process that runs physics or threads of
     torch may hang. They ignore Ctrl-C, which the main process handles.
@@ -34,10 +36,11 @@ def process_pool(workers: int, set_up: Callable[..., None], *arguments: Any) -> 
     )
 
 
-def _start_worker(set_up: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+def _start_worker(set_up: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # the workers fill the cores
-    set_up(*arguments)
+    if set_up is not None:
+        set_up(*arguments)
 
 
 def completed(

@@ -116,6 +116,10 @@ class GripperGeometry:
     below the hand frame and are 0.0538 long, so the tips lie 0.1122 below it; E
     (`panda_grasptarget`) is at 0.105. "Along" is the closing line, "across" is horizontal
     and at right angles to it.
+
+    The defaults are the Panda's own hand. Robot, planners, labels and networks take theirs from a
+    config or a checkpoint (`gripper.max_opening`), whose default repeats this one;
+    tests/test_geometry.py checks that the two are equal.
     """
 
     max_opening: float = 0.08  # two finger joints of 0.04 each

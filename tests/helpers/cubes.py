@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.cell_scenes import Placement, Scene
+from envs.cell_layout import Placement, Scene
 from utils.transforms import Grasp
 
 

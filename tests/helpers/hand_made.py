@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from envs.cell_scenes import Placement, Scene
+from envs.cell_layout import Placement, Scene
 from envs.pybullet_cell import PybulletCell
 from models import graspnet_backbones
 from models.graspnet import GraspNet
@@ -62,10 +62,10 @@ def hand_made_backbone() -> Iterator[None]:
         yield
 
 
-def hand_made() -> GraspNet:
+def hand_made(max_width: float = 0.08) -> GraspNet:
     """Depth falls by 0.6 units over a cube; half of that, blurred, is quality 0.5."""
     with hand_made_backbone():
-        model = GraspNet(max_width=0.08, backbone="hand_made").eval()
+        model = GraspNet(max_width=max_width, backbone="hand_made").eval()
     with torch.no_grad():
         for head in (model.quality_head, model.angle_head, model.width_head):
             head.weight.zero_()
