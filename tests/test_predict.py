@@ -171,13 +171,15 @@ def test_a_jpeg_and_holes_in_the_depth_do_not_matter(files, capsys):
 
 
 @pytest.mark.parametrize(
-    ("config", "opening"), [({"gripper": {"max_opening": 0.10}}, 0.10), ({}, 0.08)]
+    ("trained", "opening"), [({"gripper": {"max_opening": 0.10}}, 0.10), ({}, 0.08)]
 )
-def test_widths_are_limited_to_the_hand_of_the_checkpoint(config, opening, files, tmp_path, capsys):
+def test_widths_are_limited_to_the_hand_of_the_checkpoint(
+    trained, opening, files, tmp_path, capsys
+):
     model = hand_made(max_width=0.2)
     with torch.no_grad():
         model.width_head.bias.fill_(20.0)  # as wide as it can, everywhere
-    save_graspnet(tmp_path / "wide.pt", model, PIXEL, config)
+    save_graspnet(tmp_path / "wide.pt", model, PIXEL, trained)
     found = files.run(capsys, checkpoint=tmp_path / "wide.pt")["grasps"]
     assert [grasp["width"] for grasp in found] == [opening] * len(CUBES)
 
