@@ -10,10 +10,8 @@ from utils.servo_features import MOUNTINGS
 
 
 @pytest.mark.slow
-def test_quick_benchmark_reports_each_mounting_and_law(capfd, tmp_path, monkeypatch):
-    """One law; `test_board_servo` has the others."""
-    monkeypatch.setattr(bench_servo_cell, "LAWS", {"position_based": LAWS["position_based"]})
+def test_quick_benchmark_reports_every_law(capfd, tmp_path):
     bench_servo_cell.main(["--quick", "--json", str(tmp_path / "bench.json")])
     lines = capfd.readouterr().out.splitlines()
-    assert len(lines) >= 1 + 4 * len(MOUNTINGS)
+    assert len(lines) >= 1 + 4 * len(MOUNTINGS) * len(LAWS)
     assert not any(line.endswith("NO") for line in lines)

@@ -4,7 +4,6 @@ import numpy as np
 import pybullet
 import pytest
 
-from envs import cell_scenes
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.objects import load_object_set
 from envs.pybullet_bodies import LayoutTable
@@ -56,8 +55,7 @@ def test_one_layout_table_at_a_time(config):
         pass
 
 
-def test_impossible_scene_is_refused(box_set, config, monkeypatch):
-    monkeypatch.setattr(cell_scenes, "_TRIES", 2)
+def test_impossible_scene_is_refused(box_set, config):
     crowded = with_settings(config, "scene", {"count": 50})
     with pytest.raises(SceneError, match="scene.count"):
         make_scene("packed", box_set, 0, crowded)

@@ -14,7 +14,8 @@ from envs import closed_loop_tracker
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
-from envs.execution import GraspFailure, execute_grasp
+from envs.execution import execute_grasp
+from envs.mujoco_cell import MujocoCell
 from envs.robot_kinematics import forward_kinematics, geometric_jacobian
 from envs.rounds import run_round
 from envs.scenarios import teach, true_calibration, wrong_calibration
@@ -101,16 +102,28 @@ def frozen_after(camera, count):
 
 @pytest.mark.parametrize("images", [15, 52])
 def test_a_frozen_camera_stops_the_arm(cell, images):
-    grasp = grasp_of_box(cell)
+    """The gate's watchdog stops it, and it is at rest before the attempt sends it home."""
     approach = loop(cell, "ibvs", camera=frozen_after(WristCamera(cell), images))
-    with pytest.raises(GraspFailure) as failure:
-        approach(cell, grasp)
-    assert failure.value.reason == "stopped"
-    assert "the watchdog allows 100 ms" in failure.value.detail
+    # MuJoCo's arm loses the higher speed over the object a moment later than PyBullet's.
+    settling = 12 if isinstance(cell, MujocoCell) and images == 52 else 0
+    speeds, ends = [], []
+
+    def until_it_fails(cell, grasp):
+        try:
+            return approach(cell, grasp)
+        finally:
+            ends.append(cell.steps)
+            cell.step(settling)
+
+    cell.on_step = lambda cell: speeds.append(np.abs(cell.robot.joint_state()[1]).max())
+    outcome = execute_grasp(cell, grasp_of_box(cell), until_it_fails)
+    cell.on_step = None
+    assert outcome.reason == "stopped" and "the watchdog allows 100 ms" in outcome.detail
     # One period of 8 steps, and the watchdog's 24, after the last image; 24 to come to rest.
-    assert images * 8 + 20 < cell.steps < images * 8 + 24 + 8 + 30
-    cell.step(12)
-    assert np.abs(cell.robot.joint_state()[1]).max() < 1e-2, "the arm is at rest"
+    (end,) = ends
+    assert images * 8 + 20 < end < images * 8 + 24 + 8 + 30
+    assert max(speeds[: images * 8]) > 0.1, "the arm was on its way"
+    assert speeds[end + settling - 1] < 1e-2, "the arm is at rest"
 
 
 @IN_PYBULLET

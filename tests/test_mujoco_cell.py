@@ -1,4 +1,4 @@
-"""The cell in MuJoCo beside PyBullet's: what is gripped, what is a success."""
+"""The cell in MuJoCo beside PyBullet's: its bodies, what is gripped, what is a success."""
 
 import sys
 
@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-
-import pytest
 
 from envs.cell import PhysicsError
 from envs.cell_scenes import make_scene
@@ -135,9 +133,6 @@ def test_without_mujoco_the_error_says_what_to_do(config, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(UserError, match="pip install"):
         make_cell(load_config(None, ["simulator=mujoco"]))
-
-
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 
 @pytest.fixture(scope="module")

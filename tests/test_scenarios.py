@@ -12,6 +12,7 @@ from envs.cell import wrist_mount
 from envs.cell_layout import GRAVITY
 from envs.cell_scenes import make_scene
 from envs.mujoco_cell import MujocoCell
+from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import inverse_kinematics
 from envs.scenarios import (
     SCENARIOS,
@@ -28,10 +29,20 @@ from utils.config import load_config
 from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, top_down_pose
 
+IN_MUJOCO = pytest.mark.parametrize("taught_cell", ["mujoco"], indirect=True, scope="module")
+
 
 @pytest.fixture(scope="module")
 def scene(config, box_set):
     return make_scene("isolated", box_set, 0, config)
+
+
+@pytest.fixture(scope="module")
+def cells(config):
+    """The cells of both simulators, to be compared."""
+    pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
+    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
+        yield bullet, mujoco
 
 
 @pytest.fixture
@@ -39,6 +50,12 @@ def cell(taught_cell, scene):
     """The cell of either simulator with the scene of one box, loaded."""
     taught_cell.load(scene)
     return taught_cell
+
+
+def turn_between(before, after) -> float:
+    """rad about +z of W from one pose (4, 4) to another."""
+    R = after[:3, :3] @ before[:3, :3].T
+    return np.arctan2(R[1, 0], R[0, 0])
 
 
 def test_a_displacement_ends_where_it_says(cell):
@@ -49,8 +66,7 @@ def test_a_displacement_ends_where_it_says(cell):
         cell.step(240)
     after = cell.object_pose(0)
     np.testing.assert_allclose(after[:3, 3] - before[:3, 3], [0.04, -0.03, 0], atol=5e-4)
-    R = after[:3, :3] @ before[:3, :3].T
-    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(0.5, abs=0.01)
+    assert turn_between(before, after) == pytest.approx(0.5, abs=0.01)
     assert cell.before_step is None
 
 
@@ -71,31 +87,37 @@ def test_a_crossing_goes_through_the_middle(place):
 @pytest.mark.parametrize("turn_rate", [0.0, 0.4])
 def test_a_conveyor_moves_at_its_speed(cell, turn_rate):
     before = cell.object_pose(0)
+    within = 2e-4 if isinstance(cell, MujocoCell) else 5e-4  # m
     with disturbed(cell, Conveyor(0.05, np.pi / 2, turn_rate)):
         cell.step(48)  # up to speed, after half the way that the full speed would have made
         middle = cell.object_pose(0)
-        assert middle[1, 3] - before[1, 3] == pytest.approx(0.005, abs=5e-4)
+        assert middle[1, 3] - before[1, 3] == pytest.approx(0.005, abs=within)
         cell.step(240)
         after = cell.object_pose(0)
         assert cell.speed(0) == pytest.approx(0.05, rel=0.5), "the table brakes within a step"
     chord = 0.05 if turn_rate == 0 else 2 * 0.05 / turn_rate * np.sin(turn_rate / 2)
     travelled = np.linalg.norm(after[:2, 3] - middle[:2, 3])
-    assert travelled == pytest.approx(chord, abs=5e-4)
-    R = after[:3, :3] @ middle[:3, :3].T
-    assert np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(turn_rate, abs=5e-3)
+    assert travelled == pytest.approx(chord, abs=within)
+    assert turn_between(middle, after) == pytest.approx(turn_rate, abs=5e-3)
     assert after[2, 3] == pytest.approx(before[2, 3], abs=5e-4)
 
 
 @pytest.mark.parametrize("scenario", ["moved", "moving_10cm", "turning_5cm", "crossing_5cm"])
-def test_a_scenario_moves_the_object_along_its_path(cell, scenario):
-    before, motion = cell.object_pose(0), SCENARIOS[scenario].motion(cell, 0)
-    with disturbed(cell, motion):
-        cell.step(360)
-    after = cell.object_pose(0)
-    way, R = after[:3, 3] - before[:3, 3], after[:3, :3] @ before[:3, :3].T
-    expected = motion(360 * cell.dt)
-    np.testing.assert_allclose([*way[:2], np.arctan2(R[1, 0], R[0, 0])], expected, atol=3e-3)
-    assert np.linalg.norm(way) > 0.03
+def test_both_simulators_move_the_object_along_the_same_path(cells, scene, scenario):
+    ways, turns = [], []
+    for cell in cells:
+        cell.load(scene)
+        before, motion = cell.object_pose(0), SCENARIOS[scenario].motion(cell, 0)
+        with disturbed(cell, motion):
+            cell.step(360)
+        after = cell.object_pose(0)
+        ways.append(after[:3, 3] - before[:3, 3])
+        turns.append(turn_between(before, after))
+        expected = motion(360 * cell.dt)
+        np.testing.assert_allclose([*ways[-1][:2], turns[-1]], expected, atol=3e-3)
+        assert np.linalg.norm(ways[-1]) > 0.03
+    np.testing.assert_allclose(ways[0], ways[1], atol=1e-3)
+    assert turns[0] == pytest.approx(turns[1], abs=0.01)
 
 
 def test_the_robots_touch_ends_a_disturbance(cell):
@@ -112,14 +134,13 @@ def test_the_robots_touch_ends_a_disturbance(cell):
     assert cell.speed(0) < 1e-3, "friction has stopped it"
 
 
+@IN_MUJOCO
 def test_what_is_carried_flies_on_as_it_was_sent(cell):
     """A tilted cube let go in the air: p + v t - g t^2 / 2, and a turn about W's vertical, which a
-    cube keeps, whichever way its own axes point."""
+    cube keeps, whichever way its own axes point. PyBullet's damping slows a free flight."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("xyz", [0.5, -0.3, 1.0]).as_matrix()
     T[:3, 3] = [0.55, 0.05, 0.3]
-    if not isinstance(cell, MujocoCell):
-        pytest.skip("PyBullet's damping slows a free flight")
     cell.carry(0, T, np.array([0.3, -0.2, 0.1]), 2.0)
     np.testing.assert_allclose(cell.object_pose(0), T, atol=1e-12)
     cell.step(24)

@@ -87,9 +87,11 @@ def test_tensorboard_tells_training_from_validation_with_units(finished):
     history = json.loads((run / "results.json").read_text())["history"]
     tags = {
         "loss": "training/loss",
+        "quality_loss": "training/quality_loss_nats",
         "angle_loss": "training/angle_loss_nats",
         "width_loss": "training/width_loss_m",
         "label_quality": "validation/label_quality",
+        "precision": "validation/precision",
         "width_error": "validation/width_error_m",
     }
     for name, tag in tags.items():
