@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from envs.evaluation_worker import check_everything, set_up, work
+from envs.evaluation_worker import check_everything, privileged_policies, set_up, work
 from envs.registries import check_names
 from envs.transfer_columns import columns_of
 from envs.transfer_scenes import (
@@ -82,6 +82,7 @@ from utils.transfer import (
 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
+    check_options(options)
     check_names(config)
     for option in ("results", "csv", "latex"):
         check_writable(f"--{option}", getattr(options, option))
@@ -112,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(
         run / "report.html", rows, outcome.rounds, comparisons, config, gallery, outcome.films,
-        device, unfinished,
+        device, unfinished, privileged_policies(config),
     )  # fmt: skip
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
@@ -134,6 +135,23 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--replay", metavar="FILE", help="play the rounds of docs/results/*.jsonl again and compare"
     )
+
+
+# What plays no rounds of a config, or plays them with a config of its own, and the arguments that
+# would have no effect with it.
+IGNORED = {
+    "compare": ("replay", "config", "resume", "overrides"),
+    "replay": ("config", "resume", "results", "csv", "latex"),
+}
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Raise UserError for an argument that another one leaves without effect."""
+    for mode, others in IGNORED.items():
+        ignored = [name for name in others if getattr(options, name)]
+        if getattr(options, mode) is not None and ignored:
+            words = ["KEY=VALUE" if name == "overrides" else f"--{name}" for name in ignored]
+            raise UserError(f"--{mode}: {', '.join(words)} would have no effect with it; omit them")
 
 
 def announce(config: Config, run: Path) -> None:
@@ -203,7 +221,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     evaluations = evaluations_of(config)
     for evaluation in evaluations:
         check_rows(evaluation)
-        check_everything(evaluation.config)
+        check_everything(evaluation.config, "transfer.policies")
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
 

@@ -2,7 +2,7 @@
 
 A page says where a table stands by two comments, `<!-- results:NAME -->` and `<!-- /results -->`;
 NAME is a key of TABLES. Pages whose name has `zh` in it get their words in Chinese. A table names
-the commit, the seed and the command that it was measured by.
+the commit, the seed and the command that it was measured by, and the rounds of each row.
 
 This module formats what `benchmarks.results` measured and measures nothing.
 """
@@ -57,6 +57,9 @@ CHINESE = {
     "15 objects: success": "15 个物体:成功率",
     "measured at commit": "测量于提交",
     "seed": "种子",
+    "{} rounds a row": "每行 {} 轮",
+    "5 objects": "5 个物体",
+    "15 objects": "15 个物体",
     "not measured yet": "尚未测量",
     "On 15 objects GraspNet's success minus the heuristic's is {} points.": (
         "15 个物体时,GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点。"
@@ -129,15 +132,23 @@ def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def origin(say: Say, *parts: Figures) -> str:
-    """The line under a table: commit, seed and commands."""
+    """The line under a table: commit, date, seed, and each command with the rounds of its rows."""
     said = []
     for part in parts:
-        commands = "; ".join(f"`{one['command']}`" for one in part["commands"].values())
+        commands = "; ".join(
+            f"`{one['command']}`{_rounds(say, one)}" for one in part["commands"].values()
+        )
         said.append(
             f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']}), "
             f"{say('seed')} {part['seed']}: {commands}</sub>"
         )
     return "\n".join(said)
+
+
+def _rounds(say: Say, command: Figures) -> str:
+    """' (30 rounds a row)', or nothing for what has no rounds."""
+    counts = sorted({row["rounds"] for row in command.get("rows", ()) if "rounds" in row})
+    return f" ({say('{} rounds a row').format(' / '.join(map(str, counts)))})" if counts else ""
 
 
 def rows_of(part: Figures, command: str | None = None) -> list[Figures]:
@@ -163,7 +174,7 @@ def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
     ahead = points(_pair(clutter, "graspnet", "heuristic")["success"])
     sentence = say("On 15 objects GraspNet's success minus the heuristic's is {} points.")
     others = say("In real bins of 300 objects AnyGrasp reaches 93 %.")
-    below = f"{sentence.format(ahead)} {others} {_short(say, scoreboard)}"
+    below = f"{sentence.format(ahead)} {others} {_short(say, scoreboard, clutter)}"
     return "\n\n".join([table(list(map(say, header)), lines), below])
 
 
@@ -207,7 +218,7 @@ def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
         lines.append([f"`{row['objects']}`", row["scenario"], f"`{row['policy']}`", success(row),
                       success(same[0]) if same else "-"])  # fmt: skip
     header = ["objects", "scenario", "planner", "success with noise", "without"]
-    return "\n\n".join([table(header, lines), origin(say, part)])
+    return "\n\n".join([table(header, lines), origin(say, part, scoreboard)])
 
 
 def servo(say: Say, part: Figures) -> str:
@@ -292,11 +303,13 @@ def _planner_cells(row: Figures) -> list[str]:
     ]  # fmt: skip
 
 
-def _short(say: Say, part: Figures) -> str:
-    return (
-        f"<sub>{say('measured at commit')} `{part['commit'][:10]}`, {say('seed')} {part['seed']}, "
-        "95 % Wilson; [docs/results.md](docs/results.md)</sub>"
+def _short(say: Say, few: Figures, many: Figures) -> str:
+    origins = "; ".join(
+        f"{say(objects)}: {say('measured at commit')} `{part['commit'][:10]}`, {say('seed')} "
+        f"{part['seed']}{_rounds(say, next(iter(part['commands'].values())))}"
+        for objects, part in (("5 objects", few), ("15 objects", many))
     )
+    return f"<sub>{origins}; 95 % Wilson; [docs/results.md](docs/results.md)</sub>"
 
 
 def _pair(part: Figures, first: str, second: str) -> Figures:

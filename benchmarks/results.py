@@ -2,6 +2,8 @@
 
     make results                                  # all parts, about three hours on two cores
     make results PARTS=scoreboard,servo           # some of them
+    make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
+    make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
     make results PARTS=cornell CORNELL=path/to/cornell
     python -m benchmarks.results --list           # the parts, their commands and how long they take
     python -m benchmarks.results --write          # only write the tables from docs/results/*.json
@@ -10,7 +12,8 @@
 A part is a list of commands that anyone can run alone. The parts that stop early (Ctrl-C) go on
 with the next call: finished commands lie in runs/results/<commit>/, unfinished ones are resumed.
 A finished part leaves its figures in docs/results/<part>.json and the first rounds of each row in
-docs/results/<part>-<command>.jsonl; the tables are written from these files alone.
+docs/results/<part>-<command>.jsonl; the tables are written from these files alone and say how many
+rounds each row has. Each part has a file of its own, so that parts may have different scales.
 
 The seed is one that no choice was made on; docs/results.md lists those of the development.
 """
@@ -156,7 +159,15 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"{part.name}: skipped, because no --cornell names a folder of photographs")
             else:
                 measure(part, commit, options.scale, options.cornell)
-                write_tables(FIGURES)
+                if writes_docs(options):
+                    publish(part, commit, options.scale)
+                    write_tables(FIGURES)
+        if not writes_docs(options):
+            print(
+                f"the figures are in {RUNS / commit}; the docs stay as they are, because --scale "
+                "is below 1: add --write-docs (make results WRITE=1) to write them there"
+            )
+            return 0
     print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}", flush=True)
     return 0
 
@@ -164,12 +175,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description="Measure and write the tables of the docs.")
     parser.add_argument("--parts", help="names with commas between; default: all")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the rounds; 0.05 for a test")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the rounds; 0.05 for a trial")
+    parser.add_argument(
+        "--write-docs",
+        action="store_true",
+        help="write figures of a scale below 1 to the docs, too",
+    )
     parser.add_argument("--cornell", type=Path, help="folder of Cornell's photographs")
     parser.add_argument("--list", action="store_true", help="print the parts and measure nothing")
     parser.add_argument("--write", action="store_true", help="only write the tables again")
     parser.add_argument("--commit", metavar="HASH", help="write what runs/ holds of that commit")
     return parser
+
+
+def writes_docs(options: argparse.Namespace) -> bool:
+    """Whether figures go to the docs: not those of a trial, but all that --commit asks for."""
+    return options.scale >= 1 or options.write_docs or options.commit is not None
 
 
 def chosen_parts(names: str | None) -> list[Part]:
@@ -212,16 +233,28 @@ def _git(*arguments: str) -> str:
 
 
 def measure(part: Part, commit: str, scale: float, cornell: Path | None) -> None:
-    """Run a part's commands that are not finished yet, and write docs/results/<part>.json."""
-    measured: dict[str, Any] = {}
+    """Run a part's commands that are not finished yet."""
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
         if not file.exists():
             write_json_atomic(file, run_command(part, command, scale, commit, cornell))
-        measured[command.name] = json.loads(file.read_text())
-        if "run" in measured[command.name]:
-            keep_rounds(part, command, Path(measured[command.name].pop("run")))
-    content = {"part": part.name, "commit": commit, "seed": SEED, "date": str(date.today())}
+
+
+def publish(part: Part, commit: str, scale: float) -> None:
+    """Write the figures of a measured part, and the first rounds of each row, to docs/results."""
+    measured: dict[str, Any] = {}
+    for command in part.commands:
+        file = finished_file(part, command, commit, scale)
+        figures = json.loads(file.read_text())
+        # Files of older versions hold no date: the day on which they were written.
+        figures.setdefault("date", str(date.fromtimestamp(file.stat().st_mtime)))
+        if "run" in figures:
+            keep_rounds(part, command, Path(figures.pop("run")))
+        measured[command.name] = figures
+    content = {
+        "part": part.name, "commit": commit, "seed": SEED, "scale": scale,
+        "date": max(figures["date"] for figures in measured.values()),
+    }  # fmt: skip
     write_json_atomic(FIGURES / f"{part.name}.json", content | {"commands": measured})
 
 
@@ -264,6 +297,7 @@ def run_command(
     return {
         "command": command.line(rounds),
         "rounds": rounds,
+        "date": str(date.today()),
         "minutes": round((time.perf_counter() - start) / 60, 1),
         "device": f"{platform.machine()}, {environment_of['cpu_count']} cores",
         "versions": {"python": environment_of["python"]} | environment_of["packages"],

@@ -24,6 +24,7 @@ from envs.robot_kinematics import (
     rotation_matrix,
 )
 from utils.config import Config
+from utils.errors import unknown_choice
 
 # What each entry of an action means, by `env.control`.
 ACTION_ENTRIES = {
@@ -45,6 +46,13 @@ _SPEED_HEADROOM = 0.95
 _LONGEST_LEAD = 0.5  # rad that a command may be ahead of the arm; in free motion up to 0.25
 _GRIPPER_LEAD = 0.02  # m that a changed command may differ from the opening: grips at full force
 _FOLLOW_TRIES = 4  # steps of inverse kinematics for one action; nearly always the first is enough
+
+
+def action_entries(control: str) -> tuple[str, ...]:
+    """What each entry of an action means. Raises UserError for an unknown `env.control`."""
+    if control not in ACTION_ENTRIES:
+        raise unknown_choice("env.control", control, ACTION_ENTRIES)
+    return ACTION_ENTRIES[control]
 
 
 class ActionDecoder:

@@ -1,9 +1,9 @@
 """Reward of `RobotGraspingEnv`: named terms, the way that the hand has to go, and what it leads to.
 
-Read from the end: `reward` adds `TERMS` with the scales of `REWARDS`; `progress` says how far an
-episode has come; `way_to_grasp` measures the distance to a grasp in metres. That distance is taken
-to the middle of the nearest object (`Outline`, config `env.goal=object`) or to the nearest grasp
-that the object offers (`GraspGoals`, `env.goal=grasp`).
+Read from the end: `make_reward` adds `TERMS` with the scales of `REWARDS`; `progress` says how far
+an episode has come; `way_to_grasp` measures the distance to a grasp in metres. That distance is
+taken to the middle of the nearest object (`Outline`, config `env.goal=object`) or to the nearest
+grasp that the object offers (`GraspGoals`, `env.goal=grasp`).
 
 Everything here is ground truth of the simulator: it serves rewards, critics and the training of a
 state estimator, never a policy at work. Knows no robot and no simulator.
@@ -394,16 +394,27 @@ REWARDS: dict[str, dict[str, float]] = {
 }
 
 
-def reward(state: RewardState, scales: Mapping[str, float]) -> float:
-    """The terms named in `scales`, each times its scale, added up in that order."""
-    return sum(scale * TERMS[name](state) for name, scale in scales.items())
+def make_reward(chosen: str | Mapping[str, float]) -> Reward:
+    """The reward of `env.reward`: a name from REWARDS; an import path `module:function`, which is
+    the whole reward; or scales of terms, each a name from TERMS or an import path. The terms, each
+    times its scale, are added up in that order.
+
+    A function takes a `RewardState` and returns a number. Raises UserError.
+    """
+    if isinstance(chosen, str) and is_import_path(chosen):
+        return load_plugin(chosen, "env.reward")
+    if isinstance(chosen, str):
+        if chosen not in REWARDS:
+            others = ("module:function", "scales of terms {success: 1, my_module:term: 0.1}")
+            raise unknown_choice("env.reward", chosen, [*REWARDS, *others])
+        chosen = REWARDS[chosen]
+    terms = [(scale, _term(name)) for name, scale in chosen.items()]
+    return lambda state: sum(scale * term(state) for scale, term in terms)
 
 
-def make_reward(name: str) -> Reward:
-    """The reward of `env.reward`: a name from REWARDS, or an import path `module:function` of a
-    function that takes a `RewardState` and returns a number. Raises UserError."""
+def _term(name: str) -> Reward:
     if is_import_path(name):
         return load_plugin(name, "env.reward")
-    if name not in REWARDS:
-        raise unknown_choice("env.reward", name, [*REWARDS, "module:function"])
-    return lambda state: reward(state, REWARDS[name])
+    if name not in TERMS:
+        raise unknown_choice("env.reward, a term", name, [*TERMS, "module:function"])
+    return TERMS[name]

@@ -25,7 +25,7 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
-from models.planners import Planner, make_planner
+from models.planners import Planner, make_planner, needs_truth
 from utils.config import Config
 from utils.evaluation import Task, TaskResult, policies_of, worker_count
 from utils.geometry import Workspace
@@ -36,9 +36,10 @@ from utils.transforms import Grasp, RGBDFrame
 # --- In the main process, before any work is done --------------------------------------------
 
 
-def check_everything(config: Config) -> None:
+def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     """Raise UserError for a policy, a cell or an object set that cannot be used.
 
+    key: of the config, where the policies' names stand; for errors.
     The user's own meshes are read and cut into convex parts here, so that the error names a broken
     one before any work is done.
     """
@@ -47,13 +48,19 @@ def check_everything(config: Config) -> None:
             controllers = [controller for _, controller in policies_of(config)]
             check_learned(name, config.evaluate.scenarios, controllers, config)
         else:
-            new_planner(name, config)
+            new_planner(name, config, key)
     make_cell(config).close()
     check_bin(config)
     for name in config.evaluate.object_sets:
         objects = load_objects(name, config)
         if name not in OBJECT_SETS:
             prepare(objects, min(worker_count(config), len(objects)))
+
+
+def privileged_policies(config: Config) -> set[str]:
+    """The policies of the evaluation whose planners see the true scene."""
+    planned = [name for name in config.evaluate.policies if not is_learned(name)]
+    return {name for name in planned if needs_truth(new_planner(name, config))}
 
 
 @functools.cache
@@ -64,9 +71,9 @@ def load_objects(name: str, config: Config) -> ObjectSet:
     )  # fmt: skip
 
 
-def new_planner(name: str, config: Config) -> Planner:
+def new_planner(name: str, config: Config, key: str = "evaluate.policies") -> Planner:
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
-    return make_planner(name, config.gripper.geometry, workspace, config.seed)
+    return make_planner(name, config.gripper.geometry, workspace, config.seed, key)
 
 
 # --- In a worker process ----------------------------------------------------------------------

@@ -20,7 +20,7 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from envs.cell import PhysicsError
 from envs.cell_layout import on_table
 from envs.cell_scenes import make_scene
-from envs.env_actions import ACTION_ENTRIES, ActionDecoder, near_pose, pretraining_state
+from envs.env_actions import ActionDecoder, action_entries, near_pose, pretraining_state
 from envs.env_observations import Observer, observed_names
 from envs.env_rewards import SHORTEST_LIFT, RewardState, make_reward, progress
 from envs.objects import ObjectSet, check_object_set, load_object_set
@@ -79,7 +79,8 @@ class RobotGraspingEnv(gymnasium.Env):
     joint speed limits; only the torque limits bound its acceleration.
 
     **Reward**: `reward="dense"` adds the terms below, `"sparse"` is the first one alone, and
-    `"my_module:my_reward"` calls a function with an `envs.env_rewards.RewardState`.
+    `"my_module:my_reward"` calls a function with an `envs.env_rewards.RewardState`. Scales of terms,
+    such as `{"success": 1, "progress": 0.5, "my_module:my_term": 0.1}`, add these up.
 
     | term       | value                                    | scale |
     |------------|------------------------------------------|-------|
@@ -155,8 +156,11 @@ class RobotGraspingEnv(gymnasium.Env):
             "render_fps": round(self.config.sim.frequency / self.settings.substeps)
         }
         names = observed_names(self.config, by_name="observations" in settings)
+        # Names and plug-ins are checked before a simulator starts.
         self._reward = make_reward(self.settings.reward)
         check_object_set(self.settings.objects, "env.objects")
+        entries, camera = action_entries(self.settings.control), self.config.camera
+        camera.make_noise(float(camera.height))
         self.objects = _object_set(
             self.settings.objects, self.config.gripper.max_opening, self.config.cache_folder,
             self.config.objects,
@@ -175,7 +179,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._closed = False
         self._seen = Observer(self.cell, self.config, names)
         self.observation_space = self._seen.space
-        size = len(ACTION_ENTRIES[self.settings.control])
+        size = len(entries)
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
         self._hold_steps = max(
             1,
@@ -345,7 +349,7 @@ class RobotGraspingEnv(gymnasium.Env):
             control = self.settings.control
             raise InvalidAction(
                 f"action has shape {action.shape}; control={control!r} takes "
-                f"{self.action_space.shape}: {', '.join(ACTION_ENTRIES[control])}, each in [-1, 1]"
+                f"{self.action_space.shape}: {', '.join(action_entries(control))}, each in [-1, 1]"
             )
         if abs(action).max() <= 1.0:
             return action

@@ -134,7 +134,9 @@ def check_object_set(name_or_path: str, where: str) -> None:
     if name_or_path in OBJECT_SETS or Path(name_or_path).expanduser().is_dir():
         return
     if is_import_path(name_or_path):
-        load_plugin(name_or_path, where, must_be_callable=False)
+        found = load_plugin(name_or_path, where, must_be_callable=False)
+        if not (callable(found) or isinstance(found, ObjectSet) or _is_folder(found)):
+            raise _no_objects(name_or_path, found, where)
         return
     raise ObjectError(
         f"{where}: got {name_or_path!r}, expected one of {', '.join(OBJECT_SETS)}, an existing "
@@ -160,10 +162,18 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
             ) from error
     if isinstance(found, ObjectSet):
         return found
-    if isinstance(found, str | Path) and Path(found).expanduser().is_dir():
+    if _is_folder(found):
         return _folder(Path(found), settings)
-    raise ObjectError(
-        f"objects: {path!r} gives {found!r:.80}, expected an envs.objects.ObjectSet or the path of "
+    raise _no_objects(path, found, "objects")
+
+
+def _is_folder(found: object) -> bool:
+    return isinstance(found, str | Path) and Path(found).expanduser().is_dir()
+
+
+def _no_objects(path: str, found: object, where: str) -> ObjectError:
+    return ObjectError(
+        f"{where}: {path!r} gives {found!r:.80}, expected an envs.objects.ObjectSet or the path of "
         "an existing folder"
     )
 

@@ -14,11 +14,13 @@ from collections.abc import Collection
 
 from envs.cell_scenes import LAYOUTS
 from envs.closed_loop import CONTROLLERS
+from envs.env_actions import ACTION_ENTRIES
 from envs.env_rewards import make_reward
 from envs.objects import check_object_set
 from envs.scenarios import SCENARIOS
 from envs.simulators import SIMULATORS
 from envs.transfer_columns import COLUMNS
+from models.grasp_policy import ACTIVATIONS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config
 from utils.errors import unknown_choice
@@ -33,12 +35,15 @@ REGISTRIES: dict[str, Collection[str]] = {
     "evaluate.scenarios": SCENARIOS,
     "transfer.columns": COLUMNS,
     "env.scenario": LAYOUTS,
+    "env.control": ACTION_ENTRIES,
+    "rl.activation": ACTIVATIONS,
 }
 OBJECT_SET_KEYS = ("data.object_sets", "evaluate.object_sets", "env.objects")
 
 
 def check_names(config: Config) -> None:
-    """Raise UserError for a name in the config that is in none of the registries."""
+    """Raise UserError for a name in the config that is in none of the registries, and for a
+    plug-in that cannot be loaded or refuses its parameters."""
     for key, registry in REGISTRIES.items():
         for name in _names(config, key):
             if name not in registry:
@@ -47,6 +52,7 @@ def check_names(config: Config) -> None:
         for name in _names(config, key):
             check_object_set(name, key)
     make_reward(config.env.reward)
+    config.camera.make_noise(float(config.camera.height))
     for row in config.transfer.policies or ():
         if row.scenes is not None:
             scenario, objects = row.scenes

@@ -93,9 +93,11 @@ def run_round(
         while cell.remaining and len(failed) < max_failures:
             frame = calibrated(cell, calibration, cell.frame(privileged))
             start = time.perf_counter()
-            with planner_errors(policy):
-                grasps = checked_grasps(plan(frame if privileged else frame.without_truth()))
-            plan_seconds = time.perf_counter() - start
+            try:
+                with planner_errors(policy):
+                    grasps = checked_grasps(plan(frame if privileged else frame.without_truth()))
+            finally:
+                plan_seconds = time.perf_counter() - start
             if not grasps:
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
                 ended = NO_PLAN

@@ -21,6 +21,7 @@ import torch
 from models.graspnet import to_input
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
+from models.planner_antipodal import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth
 from models.rectangle_examples import Judged, best_rectangle, judged
@@ -39,7 +40,7 @@ SHAPE = (480, 640)  # rows and columns of its images
 HAND = GripperGeometry()
 OPENING = 0.15  # m, of the hand that photographs are judged for: the tutorial's widest
 SHRUNK = OPENING / HAND.max_opening  # how many times smaller a photograph's world becomes
-REACH = 0.04  # m outside a workspace that the planners' search still grasps (`SearchSettings`)
+REACH = SearchSettings().reach  # m outside a workspace that the planners' search still grasps
 # With it planners reach 0.30 m of the shrunk world, as large a square as the cell's.
 WORKSPACE = Workspace((0.0, 0.0), 0.30 - 2 * REACH)
 PIXEL = 0.002  # m, of the view from which the height of a planner's grasp is read
@@ -78,7 +79,7 @@ def judge_photographs(
     An entry is None where the planner finds no grasp. The result is None for a planner with an
     attribute `needs_truth` that is true: a photograph has no true scene.
     """
-    planned = make_planner(planner, HAND, WORKSPACE, seed)
+    planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if needs_truth(planned):
         return None
     found: list[Judged | None] = []
@@ -100,7 +101,7 @@ def judge_as_taken(
     They are levelled and at the network's scale, but neither seen from above nor in a smaller
     world. Returns None for other planners, which need the camera's pose.
     """
-    planned = make_planner(planner, HAND, WORKSPACE, seed)
+    planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if not isinstance(planned, GraspNetPlanner):
         return None
     model, view = planned.network.model.eval(), _as_taken(planned.network.metres_per_pixel)

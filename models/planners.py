@@ -125,11 +125,18 @@ PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
 }
 
 
-def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
+def make_planner(
+    name: str,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    seed: int,
+    key: str = "evaluate.policies",
+) -> Planner:
     """The planner that `name` stands for.
 
     name: a key of `PLANNERS`; a GraspNet checkpoint FILE.pt; or an import path `module:name`, see
-    `plugin_planner`. seed: starts the planner's own random generator.
+    `plugin_planner`. seed: starts the planner's own random generator. key: of the
+    config, where the name stands; for errors.
 
     Raises UserError for any other name, and for a file or module that cannot be loaded.
     """
@@ -138,30 +145,32 @@ def make_planner(name: str, gripper: GripperGeometry, workspace: Workspace, seed
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
     if is_import_path(name):
-        return plugin_planner(name, gripper, workspace, seed)
+        return plugin_planner(name, gripper, workspace, seed, key)
     others = ("a GraspNet checkpoint FILE.pt", "module:name", "ppo", "ppo:FILE.pt", "sb3:FILE.zip")
-    raise unknown_choice("evaluate.policies", name, [*PLANNERS, *others])
+    raise unknown_choice(key, name, [*PLANNERS, *others])
 
 
-def plugin_planner(path: str, gripper: GripperGeometry, workspace: Workspace, seed: int) -> Planner:
+def plugin_planner(
+    path: str, gripper: GripperGeometry, workspace: Workspace, seed: int, key: str
+) -> Planner:
     """The planner that an import path `module:name` names: a function `plan(frame)`; or an object
     that a class, or a function with the parameters gripper, workspace and seed, makes of these.
 
     Raises UserError where it cannot be loaded or made.
     """
-    loaded = load_plugin(path, "evaluate.policies")
+    loaded = load_plugin(path, key)
     if not (isinstance(loaded, type) or _makes_planners(loaded)):
         return loaded
     try:
         planner = loaded(gripper, workspace, seed)
     except Exception as error:  # whatever the module's own code raises is its author's to fix
         raise UserError(
-            f"evaluate.policies: {path!r} raised {type(error).__name__}: {error}; it is called "
+            f"{key}: {path!r} raised {type(error).__name__}: {error}; it is called "
             "with gripper, workspace and seed"
         ) from error
     if not callable(planner):
         raise UserError(
-            f"evaluate.policies: {path!r} made a {type(planner).__name__}, expected a planner, "
+            f"{key}: {path!r} made a {type(planner).__name__}, expected a planner, "
             "which can be called with a frame"
         )
     return planner

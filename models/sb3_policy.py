@@ -59,9 +59,10 @@ class Sb3Policy:
 
 
 def load_sb3(path: Path) -> Sb3Policy:
-    """Load the file that `model.save` of PPO, A2C, SAC, TD3, DDPG or DQN has written, on the CPU.
+    """Load the file that `model.save` of PPO, A2C, SAC, TD3 or DDPG has written, on the CPU.
 
-    Raises UserError where Stable-Baselines3 is missing and where the file cannot be loaded.
+    Raises UserError where Stable-Baselines3 is missing, where the file cannot be loaded, and for
+    a policy of another algorithm, such as DQN, whose actions are discrete.
     """
     try:
         import stable_baselines3
@@ -70,14 +71,22 @@ def load_sb3(path: Path) -> Sb3Policy:
             f"sb3:{path}: Stable-Baselines3 is not installed; pip install stable-baselines3"
         ) from error
     # The file does not name its algorithm, but the module of its policy does.
-    algorithms = {"sac": "SAC", "td3": "TD3", "dqn": "DQN", "common": "PPO"}
+    algorithms = {"sac": "SAC", "td3": "TD3", "common": "PPO"}
     try:
         with zipfile.ZipFile(path) as archive:
             module = json.loads(archive.read("data"))["policy_class"]["__module__"]
-        algorithm = getattr(stable_baselines3, algorithms[module.split(".")[1]])
+        kind = module.split(".")[1]
+        if kind not in algorithms:
+            raise UserError(
+                f"sb3:{path}: the policy is of {module}, which has no continuous actions; train "
+                "with PPO, A2C, SAC, TD3 or DDPG"
+            )
+        algorithm = getattr(stable_baselines3, algorithms[kind])
         return Sb3Policy(path, algorithm.load(path, device="cpu"))
     except OSError as error:
         raise UserError(f"sb3:{path}: cannot read this file: {error.strerror}") from error
+    except UserError:
+        raise
     except Exception as error:  # unpickling raises whatever the file's objects raise
         raise UserError(
             f"sb3:{path}: not a policy of Stable-Baselines3 ({type(error).__name__}: {error}); "

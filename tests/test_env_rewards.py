@@ -20,6 +20,8 @@ from envs.env_rewards import (
 )
 from tests.helpers.shapes import cube_corners
 from tests.test_geometry import CORNERS
+from utils.config import ConfigError, changed_keys, load_config, with_settings
+from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject
 
 YAW = math.radians(30)
@@ -213,5 +215,42 @@ def test_a_reward_by_import_path(tmp_path, monkeypatch):
     (tmp_path / "far_reward.py").write_text(
         "def by_height(state):\n    return state.lift - state.way\n"
     )
-    monkeypatch.chdir(tmp_path)
-    assert make_reward("far_reward:by_height")(state_of(lift=0.5)) == pytest.approx(0.4)
+    monkeypatch.syspath_prepend(tmp_path)
+    own, state = "far_reward:by_height", state_of(lift=0.5)
+    assert make_reward(own)(state) == pytest.approx(0.4)
+    mixed = make_reward({"success": 2.0, "progress": 1, own: 0.5})
+    done = state._replace(success=True, progress=0.9, progress_before=0.5)
+    assert mixed(done) == 2.0 * 1.0 + 1 * (0.9 - 0.5) + 0.5 * (done.lift - done.way)
+
+
+def test_scales_of_the_named_rewards_give_the_same_bits():
+    rng = np.random.default_rng(0)
+    for before, after in rng.random((100, 2)):
+        state = state_of(success=after > 0.5, progress=after, progress_before=before)
+        dense = make_reward({"success": 1.0, "progress": 1.0})(state)
+        assert dense == make_reward("dense")(state) == float(after > 0.5) + (after - before)
+
+
+def test_scales_of_terms_are_a_value_of_the_config():
+    chosen = ["env.reward={success: 1, progress: 0.5, my_module:term: -0.1}"]
+    config = load_config(None, chosen)
+    scales = {"success": 1.0, "progress": 0.5, "my_module:term": -0.1}
+    assert config.env.reward == scales and hash(config)
+    assert load_config(None, changed_keys(config)) == config
+    assert with_settings(config, "env", {"reward": "sparse"}).env.reward == "sparse"
+    for wrong in ("{}", "{success: a}", "[success]"):
+        with pytest.raises(ConfigError, match="env.reward: got .*; expected one of dense, sparse"):
+            load_config(None, [f"env.reward={wrong}"])
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ("dence", "env.reward: got 'dence', .*did you mean dense"),
+        ({"progres": 1.0}, "env.reward, a term: got 'progres', .*did you mean progress"),
+        ({"no_module:term": 1.0}, "env.reward: .*there is no module 'no_module'"),
+    ],
+)
+def test_an_unknown_reward_or_term_is_refused(chosen, message):
+    with pytest.raises(UserError, match=message):
+        make_reward(chosen)

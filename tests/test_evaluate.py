@@ -19,6 +19,7 @@ from envs.evaluation_worker import load_objects
 from envs.pybullet_cell import PybulletCell
 from envs.rounds import run_round
 from models.planners import make_planner
+from utils.config import DEFAULTS
 from utils.config import run_script as end_like_a_script
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import read_rounds, write_sample
@@ -40,6 +41,7 @@ def refusal(arguments, folder, monkeypatch, capsys) -> str:
     refuses its input."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, arguments)])
+    monkeypatch.setattr(sys, "path", list(sys.path))  # a script adds the current folder
     with pytest.raises(SystemExit) as end:
         end_like_a_script(evaluate.main)
     assert end.value.code == 2
@@ -158,6 +160,7 @@ class Careless:
 def test_planners_of_another_module_are_scored(tmp_path, monkeypatch, capsys):
     (tmp_path / "my_planners.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     policies = "evaluate.policies=my_planners:plan,my_planners:Careless"
     settings = ["evaluate.scenarios=isolated", "evaluate.rounds=1", "evaluate.workers=1"]
     assert evaluate.main([*SMALL[2:], policies, *settings]) == 0, "the run goes on"
@@ -221,6 +224,19 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["evaluate.policies=no_such_module:plan"], "there is no module 'no_such_module'"),
         (["evaluate.policies=sb3:none.zip", "evaluate.scenarios=isolated"], "none.zip"),
         (["--compare", "here", "there"], "--compare here: not the folder of an evaluation"),
+        (["--compare", "a", "b", "seed=1"], "--compare: KEY=VALUE would have no effect with it"),
+        (["--compare", "a", "b", "--replay", "c"], "--compare: --replay would have no effect"),
+        (
+            ["--replay", "a", "--results", "b", "--csv", "c", "--latex", "d"],
+            "--replay: --results, --csv, --latex would have no effect with it; omit them",
+        ),
+        (["--replay", "a", "--config", str(DEFAULTS)], "--replay: --config would have no effect"),
+        (
+            ["transfer.policies=[[a, b, no_such_module:plan, null, null]]"],
+            "transfer.policies: 'no_such_module:plan' cannot be loaded",
+        ),
+        (["camera.depth_noise=kinec"], "camera.depth_noise: got 'kinec'"),
+        (["camera.depth_noise=no_module:noise"], "there is no module 'no_module'"),
         (["--replay", "none.jsonl"], "none.jsonl: cannot read this sample"),
         (["--csv", "no/such/folder/x.csv"], "no/such/folder"),
         (["evaluate.policies=ppo", "evaluate.scenarios=pile"], "allowed with it are"),

@@ -633,7 +633,7 @@ def test_life_cycle_errors(make):
         ({"observations": ["state", "state"]}, r"env\.observations.*repeated"),
         ({"observations": ["stat"]}, r"env\.observations.*did you mean state"),
         ({"observations": ["grasp_goal"]}, r"env\.observations.*'grasp_goal'"),
-        ({"reward": "dence"}, r"env\.reward.*dense, module:function, sparse.*did you mean dense"),
+        ({"reward": "dence"}, r"env\.reward: got 'dence'.*did you mean dense"),
         ({"reward": "no_such_module:reward"}, r"env\.reward.*no_such_module"),
         ({"resolution": 8}, r"env\.resolution.*16"),
         ({"max_steps": 0}, r"env\.max_steps"),

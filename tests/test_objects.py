@@ -342,7 +342,7 @@ def test_an_empty_folder_names_the_suffixes(tmp_path):
 def plug_in(tmp_path, monkeypatch):
     """Writes the module `my_objects` into the current folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))  # loading a plug-in adds the folder
+    monkeypatch.syspath_prepend(tmp_path)
 
     def write(text: str) -> None:
         sys.modules.pop("my_objects", None)

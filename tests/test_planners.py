@@ -200,7 +200,7 @@ def test_the_planner_of_the_docs_runs_without_a_simulator(tmp_path, monkeypatch)
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["[0.5", "0.", "0.037]", "0", "degrees"]
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     frame = boxes_frame([((0.04, 0.10, 0.05), 0.4, (0.5, 0.0))])
     best = planner("top_object:TopObject")(frame)[0]
     assert np.rad2deg(angle_difference(best.angle, 0.4)) < 3

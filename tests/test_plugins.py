@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
+from utils.config import run_script
 from utils.errors import UserError
 from utils.plugins import is_import_path, load_plugin
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))  # loading a plug-in adds the folder
+    monkeypatch.syspath_prepend(tmp_path)
     return tmp_path
 
 
@@ -23,9 +23,22 @@ def test_functions_methods_and_modules_in_packages_are_found():
     assert load_plugin("math:pi", "x", must_be_callable=False) == math.pi
 
 
-def test_a_module_of_the_current_folder_is_found(folder):
-    (folder / "plugin_of_the_folder.py").write_text("def plan(frame):\n    return [frame]\n")
-    assert load_plugin("plugin_of_the_folder:plan", "planner")(3) == [3]
+def test_a_script_finds_modules_of_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "plugin_of_the_folder.py").write_text("def plan(frame):\n    return [frame]\n")
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(UserError, match="no module"):
+        load_plugin("plugin_of_the_folder:plan", "planner")
+    assert sys.path == before, "a library leaves the path alone"
+
+    def main(argv):
+        assert load_plugin("plugin_of_the_folder:plan", "planner")(3) == [3]
+        return 7
+
+    with pytest.raises(SystemExit) as end:
+        run_script(main)
+    assert end.value.code == 7
 
 
 def test_only_module_and_name_make_an_import_path():

@@ -44,6 +44,10 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("train.backbone=vgg", "train.backbone: got 'vgg', expected one of .*grconvnet"),
         ("env.reward=dens", "env.reward: got 'dens', .* did you mean dense?"),
         ("evaluate.object_sets=random_urdf", "an existing folder or .* did you mean random_urdfs?"),
+        ("env.reward={succes: 1}", "env.reward, a term: got 'succes', .* did you mean success?"),
+        ("env.control=eee", "env.control: got 'eee', expected one of ee, ee_planar, joint"),
+        ("rl.activation=gelu", "rl.activation: got 'gelu', .*elu"),
+        ("camera.depth_noise=kinec", "camera.depth_noise: got 'kinec', .* did you mean kinect?"),
         ("env.objects=bx", "env.objects: got 'bx', expected one of box, .* did you mean box?"),
         ("data.object_sets=no_module:sets", "data.object_sets: .* there is no module 'no_module'"),
         ("transfer.columns=mujcoo", "transfer.columns: got 'mujcoo', .* did you mean mujoco?"),
@@ -57,5 +61,21 @@ def test_an_unknown_name_is_answered_by_the_known_ones(override, message):
     assert "\n" not in str(error.value)
 
 
-def test_an_object_set_may_be_a_folder_or_an_import_path(tmp_path):
-    check_names(load_config(None, [f"evaluate.object_sets=[box, {tmp_path}, math:pi]"]))
+def test_an_object_set_may_be_a_folder_or_an_import_path(tmp_path, monkeypatch):
+    (tmp_path / "sets_to_check.py").write_text(f"folder = {str(tmp_path)!r}\nmissing = 'none'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    named = [tmp_path, "envs.objects:BoxSet", "sets_to_check:folder"]
+    for name in named:
+        check_names(load_config(None, [f"evaluate.object_sets=[box, {name}]"]))
+    for name in ("math:pi", "sets_to_check:missing"):
+        with pytest.raises(
+            UserError, match="^env.objects: '.*' gives .*, expected an envs.objects"
+        ):
+            check_names(load_config(None, [f"env.objects={name}"]))
+
+
+def test_a_config_that_names_a_missing_plug_in_can_be_loaded():
+    for override in ("camera.depth_noise=no_module:noise", "env.reward=no_module:reward"):
+        config = load_config(None, [override])
+        with pytest.raises(UserError, match="there is no module 'no_module'"):
+            check_names(config)

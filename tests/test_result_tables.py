@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 
 from benchmarks import results
-from benchmarks.result_tables import PAGES, TABLES, rate, with_tables
+from benchmarks.result_tables import PAGES, TABLES, rate, with_tables, write_tables
 from benchmarks.results import PARTS, chosen_parts, main
-from utils.config import load_config
+from tests.helpers.records import CONFIG, ROUNDS
+from utils.config import dump_config, load_config
 from utils.errors import UserError
+from utils.result_records import append_round, read_sample
 
 
-def row(policy: str, successes: int, attempts: int, objects: str = "random_urdfs") -> dict:
+def row(
+    policy: str, successes: int, attempts: int, objects: str = "random_urdfs", rounds: int = 100
+) -> dict:
     return {
         "policy": policy, "scenario": "pile", "objects": objects, "controller": "open_loop",
         "successes": successes, "attempts": attempts, "objects_cleared": successes,
-        "objects_total": 500, "plan_ms_median": 24.4, "picks_per_hour": 536.2,
+        "objects_total": 500, "plan_ms_median": 24.4, "picks_per_hour": 536.2, "rounds": rounds,
     }  # fmt: skip
 
 
@@ -45,16 +50,23 @@ def test_a_table_is_written_between_its_marks_with_commit_seed_and_command(tmp_p
     assert written.endswith("<!-- /results -->\nafter\n") and "old" not in written
     cells = "| `heuristic` | 31 % [26, 37] (81/263) | 16 % [13, 20] (81/500) | 24 ms | 536 |"
     assert cells in written.splitlines()
-    assert "commit `aaaaaaaaaa` (2026-11-22), seed 2027: `python evaluate.py seed=2027`" in written
+    command = "`python evaluate.py seed=2027` (100 rounds a row)"
+    assert f"commit `aaaaaaaaaa` (2026-11-22), seed 2027: {command}" in written
     assert with_tables(written, tmp_path) == written
 
 
 def test_both_languages_have_the_same_figures(tmp_path):
-    rows = [row("heuristic", 400, 500), row("graspnet", 450, 500)]
-    for part in ("scoreboard", "clutter15"):
+    for part, rounds in (("scoreboard", 100), ("clutter15", 30)):
+        rows = [
+            row(name, 400 + k, 500, rounds=rounds)
+            for k, name in ((0, "heuristic"), (50, "graspnet"))
+        ]
         figures(tmp_path, part, rows)
     page = "<!-- results:planners -->\n<!-- /results -->\n"
     english, chinese = with_tables(page, tmp_path), with_tables(page, tmp_path, chinese=True)
+    few = "5 objects: measured at commit `aaaaaaaaaa`, seed 2027 (100 rounds a row)"
+    many = "15 objects: measured at commit `aaaaaaaaaa`, seed 2027 (30 rounds a row)"
+    assert f"<sub>{few}; {many};" in english and "每行 30 轮" in chinese
     assert "is +1.5 [-0.2, +3.1] points" in english and "规划器" in chinese
     assert "| `graspnet` | 90 % [87, 92] (450/500) |" in english
     assert [line for line in english.splitlines() if "`" in line and "|" in line] == [
@@ -107,10 +119,76 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     (part,) = chosen_parts("ppo")
     with pytest.raises(KeyboardInterrupt):
         results.measure(part, "c0ffee", 0.1, None)
-    assert not (results.FIGURES / "ppo.json").exists()
     results.measure(part, "c0ffee", 0.1, None)
     assert len(lines) == 4 and lines[2] == lines[3]
+    assert not results.FIGURES.exists(), "measuring alone writes no docs"
+    results.publish(part, "c0ffee", 0.1)
     content = json.loads((results.FIGURES / "ppo.json").read_text())
     assert (content["commit"], content["seed"]) == ("c0ffee", 2027)
     assert list(content["commands"]) == ["box", "random_urdfs", "primitives"]
     assert results.is_finished(part, "c0ffee", 0.1) and not results.is_finished(part, "dead", 0.1)
+
+
+@pytest.fixture
+def two_parts(tmp_path, monkeypatch):
+    """`main` in an empty folder: commands play nothing, a page stands for the docs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").mkdir()
+    blocks = [f"<!-- results:{name} -->\n<!-- /results -->\n" for name in ("clutter15", "mujoco")]
+    (tmp_path / "docs" / "results.md").write_text("".join(blocks))
+
+    def run_command(part, command, scale, commit, cornell):
+        rounds = command.scaled(scale)
+        figures = {"command": command.line(rounds), "rounds": rounds, "date": "2026-01-02"}
+        return figures | {"rows": [row("heuristic", 3, 4, rounds=rounds)]}
+
+    monkeypatch.setattr(results, "run_command", run_command)
+    monkeypatch.setattr(results, "code_commit", lambda: 40 * "c")
+    monkeypatch.setattr(results, "_git", lambda *arguments: 40 * "c")
+    page = tmp_path / "docs" / "results.md"
+    monkeypatch.setattr(
+        results, "write_tables", lambda folder: write_tables(folder, ["docs/results.md"])
+    )
+    return page
+
+
+def test_a_trial_leaves_the_docs_alone(two_parts, capsys):
+    before = two_parts.read_text()
+    assert main(["--parts", "mujoco", "--scale", "0.1"]) == 0
+    assert "the docs stay as they are" in capsys.readouterr().out
+    assert two_parts.read_text() == before and not results.FIGURES.exists()
+    assert main(["--parts", "mujoco", "--scale", "0.1", "--write-docs"]) == 0
+    assert "(5 rounds a row)" in two_parts.read_text()
+
+
+def test_each_part_has_its_own_scale_and_the_date_of_its_measuring(two_parts):
+    assert main(["--parts", "mujoco"]) == 0
+    assert main(["--parts", "clutter15", "--scale", "0.5", "--write-docs"]) == 0
+    page = two_parts.read_text()
+    assert "(50 rounds a row)" in page and "(30 rounds a row)" in page
+    assert "`cccccccccc` (2026-01-02)" in page
+    content = json.loads((results.FIGURES / "clutter15.json").read_text())
+    assert (content["scale"], content["date"]) == (0.5, "2026-01-02")
+
+
+def test_what_was_measured_by_an_older_version_is_written(two_parts, tmp_path, capsys):
+    """Its file has no date, its run folder lies below runs/evaluate."""
+    run = tmp_path / "runs" / "evaluate" / "20260102-030405-old"
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(dump_config(CONFIG))
+    facts = {"commit": 40 * "c", "python": "3.11", "packages": {"numpy": "2.0"}}
+    (run / "environment.json").write_text(json.dumps(facts))
+    for record in ROUNDS:
+        append_round(run / "rounds.jsonl", record)
+    (part,) = chosen_parts("clutter15")
+    file = results.finished_file(part, part.commands[0], 40 * "c", 0.5)
+    file.parent.mkdir(parents=True)
+    old = {"command": "python evaluate.py", "rounds": 30, "rows": [row("heuristic", 3, 4)]}
+    file.write_text(json.dumps(old | {"run": str(run.relative_to(tmp_path))}))
+    os.utime(file, (1_767_441_845,) * 2)  # 2026-01-03, at noon in UTC
+    assert main(["--parts", "clutter15", "--scale", "0.5", "--commit", "cccccc"]) == 0
+    content = json.loads((results.FIGURES / "clutter15.json").read_text())
+    assert content["date"] == content["commands"]["clutter15"]["date"] == "2026-01-03"
+    assert len(read_sample(results.FIGURES / "clutter15-clutter15.jsonl").rounds) == len(ROUNDS)
+    assert main(["--parts", "clutter15", "--scale", "0.25", "--commit", "cccccc"]) == 0
+    assert "clutter15: skipped, because" in capsys.readouterr().out

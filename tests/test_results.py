@@ -134,8 +134,13 @@ def test_runs_of_different_policies_are_compared_in_every_pair(tmp_path):
 def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):
     before = a_run(tmp_path / "before", ROUNDS)
     crowded = load_config(None, ["scene.count=15"])
-    with pytest.raises(UserError, match="section scene of their configs differs"):
+    with pytest.raises(UserError, match="because scene differs in their configs"):
         compare_runs(before, a_run(tmp_path / "crowded", ROUNDS, crowded))
+    finer = load_config(None, ["sim.frequency=480"])
+    with pytest.raises(UserError, match="because sim.frequency differs in their configs"):
+        compare_runs(before, a_run(tmp_path / "finer", ROUNDS, finer))
+    drawn = load_config(None, ["sim.renderer=tiny"])
+    assert compare_runs(before, a_run(tmp_path / "drawn", ROUNDS, drawn)), "the same scenes"
     later = [replace(record, seed=record.seed + 100_000) for record in ROUNDS]
     with pytest.raises(UserError, match="no scene in common"):
         compare_runs(before, a_run(tmp_path / "later", later))

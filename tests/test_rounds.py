@@ -1,5 +1,7 @@
 """A round: when it ends, which grasps are tried, and planners that fail."""
 
+import time
+
 import numpy as np
 import pybullet
 import pytest
@@ -156,6 +158,23 @@ def test_a_planner_that_raises_ends_its_round_alone(cell, box_set):
     assert attempt.reason == "planner_error" and rounds[1].executed == 0
     assert "mine:plan raised RuntimeError: no idea" in attempt.detail
     assert "test_rounds.py, line" in attempt.detail
+
+
+def test_a_call_that_raises_is_timed_itself(cell, box_set):
+    """The first call takes long and its grasp fails, the second raises at once."""
+    calls = []
+
+    def plan(frame):
+        calls.append(frame)
+        if len(calls) == 2:
+            raise RuntimeError("no idea")
+        time.sleep(0.3)
+        return [cube_grasp(offset=(0.13, 0, 0))]
+
+    record = run_round(cell, cube_scene(box_set), plan, policy="x", objects="b", max_failures=3)
+    first, second = record.attempts
+    assert first.plan_seconds >= 0.3 and second.reason == "planner_error"
+    assert 0 < second.plan_seconds < 0.1
 
 
 @pytest.mark.parametrize("result", [None, 3, [(0.5, 0.0, 0.1)], np.zeros((2, 3))])

@@ -97,6 +97,13 @@ def test_a_file_that_is_none_is_refused(tmp_path):
         load_sb3(tmp_path / "other.zip")
 
 
+def test_a_policy_with_discrete_actions_is_refused(tmp_path):
+    env = gymnasium.make("CartPole-v1")
+    stable_baselines3.DQN("MlpPolicy", env, device="cpu", buffer_size=8).save(tmp_path / "dqn.zip")
+    with pytest.raises(UserError, match="dqn.policies, which has no continuous actions; train"):
+        load_sb3(tmp_path / "dqn.zip")
+
+
 def test_without_the_package_one_sentence_says_so(tmp_path, monkeypatch):
     def without(name, *rest, imported=builtins.__import__):
         if name == "stable_baselines3":

@@ -31,13 +31,48 @@ def test_history_holds_every_step_and_draws_itself(servo, tmp_path):
     }
 
 
+def test_every_panel_has_its_curves_with_labels_and_units():
+    history = LAWS[0].simulate(SQUARE, START, GOAL, max_iterations=10)
+    figure = history.plot()
+    panels = {(axes.get_xlabel(), axes.get_ylabel()): axes for axes in figure.axes}
+    time = "time (s)"
+    velocities = {
+        ("linear velocity (m/s)", "vx vy vz"): slice(0, 3),
+        ("angular velocity (rad/s)", "ωx ωy ωz"): slice(3, 6),
+    }
+    for (label, names), part in velocities.items():
+        axes = panels[time, label]
+        assert [line.get_label() for line in axes.get_lines()] == names.split()
+        for line, values in zip(axes.get_lines(), history.velocities.T[part]):
+            np.testing.assert_array_equal(line.get_xdata(), history.times)
+            np.testing.assert_array_equal(line.get_ydata(), values)
+    errors = panels[time, "error, each component"].get_lines()
+    np.testing.assert_array_equal(np.array([line.get_ydata() for line in errors]), history.errors.T)
+    (condition,) = panels[time, "condition number"].get_lines()
+    np.testing.assert_array_equal(condition.get_ydata(), history.condition_numbers)
+    image = panels["u (px)", "v (px)"]
+    named = [line.get_label() for line in image.get_lines()][-3:]
+    assert named == ["start", "end", "goal"] and image.yaxis_inverted()
+    assert panels["x (m)", "y (m)"].get_zlabel() == "z (m)"
+
+
 def test_history_without_poses_or_points_still_draws(tmp_path):
     by_image = LAWS[0].run(
         lambda: ServoView(CORNERS + 5, 1.0), lambda v: None, ServoView(CORNERS, 1.0), 3
     )
     by_pose = LAWS[1].run(lambda: ServoView(T_CO=START), lambda v: None, ServoView(T_CO=GOAL), 3)
-    for history in by_image, by_pose:
-        history.plot(tmp_path / "servo.png")
+    for name, history in {"image": by_image, "pose": by_pose}.items():
+        figure = history.plot(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 20_000
+        panels = {axes.get_xlabel() + axes.get_ylabel(): axes for axes in figure.axes}
+        assert len(panels["time (s)linear velocity (m/s)"].get_lines()) == 3
+        image, path = panels["u (px)v (px)"], panels["x (m)y (m)"]
+        if name == "image":
+            assert path.get_title() == "camera path unknown: no poses" and not path.get_lines()
+            assert len(image.get_lines()) == len(CORNERS) + 3
+        else:
+            assert [text.get_text() for text in image.texts] == ["the views hold no points"]
+            assert len(path.get_lines()) > 1 and not image.get_lines()
 
 
 def test_runs_are_compared_in_one_picture(tmp_path):

@@ -170,7 +170,7 @@ def changed_keys(config: Config) -> list[str]:
 
     def changes(values: dict[str, Any], below: dict[str, Any], prefix: str) -> Iterator[str]:
         for name, value in values.items():
-            if isinstance(value, dict) and below[name]:  # an empty one takes keys of any name
+            if "properties" in (schema_at(f"{prefix}{name}") or {}):  # a section
                 yield from changes(value, below[name], f"{prefix}{name}.")
             elif value != below[name]:
                 yield f"{prefix}{name}={json.dumps(value, ensure_ascii=False)}"  # JSON is YAML
@@ -304,9 +304,13 @@ def parse_args(
 def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     """Run `main(argv)` and exit with its status (None is 0).
 
+    The current folder becomes importable for plug-ins (`utils.plugins`), here and in the processes
+    that the script starts: by itself Python adds the script's own folder only.
     A user error becomes one line on stderr and status 2; Ctrl-C ends with status 130.
     Any other exception is a bug and keeps its traceback.
     """
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
     try:
         status = main(sys.argv[1:])
     except UserError as error:
@@ -361,6 +365,8 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 def allowed(schema: dict[str, Any]) -> str:
     """What a key takes, in words: 'a whole number >= 1, or null'."""
     if "anyOf" in schema:
+        if "description" in schema:
+            return schema["description"]
         return ", or ".join(allowed(part) for part in schema["anyOf"])
     if "properties" in schema:
         return f"a section with the keys {', '.join(schema['properties'])}"

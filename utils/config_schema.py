@@ -3,8 +3,8 @@
 `configs/default.yaml` holds defaults, units and meanings. A new key is a field of a section here
 and a line there; a new section is a `Section` here, a field of `Config`, and its keys there. Types
 that several sections share and the section of randomisation are in `utils.config_types`. Keys that
-name an entry of a registry of `envs` or `models` are plain names here; `envs.registries` checks
-them. This module reads no files and writes no error messages (`utils.config` does).
+name an entry of a registry or a plug-in are plain names here; `envs.registries` checks them. This
+module reads no files and writes no error messages (`utils.config` does).
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ from utils.config_types import (
     Section,
     Several,
     Share,
+    TermScales,
     Vector2,
     Vector3,
     no_repeats,
 )
-from utils.depth import DEPTH_NOISES, DepthNoise, make_depth_noise
+from utils.depth import DepthNoise, make_depth_noise
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.transforms import look_at
@@ -71,10 +72,7 @@ class CameraConfig(Section):
     up: Vector3
     near: Positive
     far: Positive
-    depth_noise: Annotated[
-        str,
-        Field(description=f"one of none, {', '.join(DEPTH_NOISES)}, or an import path module:name"),
-    ]
+    depth_noise: Name
     depth_noise_args: Annotated[
         KeywordArguments, Field(description="the noise's parameters, such as {noise: 0.3}")
     ]
@@ -86,7 +84,6 @@ class CameraConfig(Section):
         if self.near >= self.far:
             raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
         look_at(self.position, self.target, self.up)  # raises ValueError where that is undefined
-        self.make_noise(float(self.height))  # as well
         return self
 
     def make_noise(self, image_focal: float) -> DepthNoise | None:
@@ -277,14 +274,20 @@ class AdaptationConfig(Section):
 
 class EnvConfig(Section):
     observations: Names
-    control: Literal["ee", "ee_planar", "joint"]
+    control: Name
     frame: Literal["world", "hand"]
     gripper: Literal["opening", "change"]
     resolution: Pixels
     camera: Mount
     objects: Name
     scenario: Name
-    reward: Name
+    reward: Annotated[
+        Name | TermScales,
+        Field(
+            description="one of dense, sparse, an import path module:function, or scales of terms "
+            "such as {success: 1, progress: 0.5}"
+        ),
+    ]
     goal: Literal["object", "grasp"]
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
@@ -345,7 +348,7 @@ class RLConfig(Section):
     relief: bool
     hidden_dim: Count
     hidden_layers: Count
-    activation: Literal["tanh", "relu", "elu"]
+    activation: Name
     initial: Annotated[Path, Field(strict=False)] | None
     evaluate_every: Count
     evaluation_episodes: Count

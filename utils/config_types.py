@@ -21,13 +21,14 @@ def no_repeats(values: tuple) -> tuple:
 
 
 class Arguments(dict):
-    """Keyword arguments from YAML, hashable as all that a config holds; nobody changes them."""
+    """A mapping of any keys from YAML, hashable as all that a config holds; nobody changes it."""
 
     def __hash__(self) -> int:
         return hash(json.dumps(self, sort_keys=True, default=str))
 
 
 KeywordArguments = Annotated[dict[str, Any], AfterValidator(Arguments)]
+TermScales = Annotated[dict[str, float], Field(min_length=1), AfterValidator(Arguments)]
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, le=1)]

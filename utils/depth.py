@@ -231,16 +231,16 @@ def make_depth_noise(
     if name in DEPTH_NOISES:
         make = DEPTH_NOISES[name]
     elif is_import_path(name):
-        make = load_plugin(name, "depth_noise")
+        make = load_plugin(name, "camera.depth_noise")
     else:
-        raise unknown_choice("depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
+        raise unknown_choice("camera.depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
     try:
         noise = make(image_focal=image_focal, **(arguments or {}))
     except (TypeError, ValueError) as error:
-        raise UserError(f"depth_noise_args: {name!r} does not take them: {error}") from error
+        raise UserError(f"camera.depth_noise_args: {name!r} does not take them: {error}") from error
     if not callable(noise):
         raise UserError(
-            f"depth_noise: {name!r} returned a {type(noise).__name__}, expected a callable "
+            f"camera.depth_noise: {name!r} returned a {type(noise).__name__}, expected a callable "
             "noise(depth, rng)"
         )
     return noise

@@ -1,18 +1,16 @@
 """Plug-ins by import path: `module:name` names an object of a module outside this repository.
 
-Gymnasium names its environments in the same way. A planner, an object set, a depth noise or a
-reward term that is given as `module:name` needs no entry in a registry. The module must be
-importable: from the current folder, from `PYTHONPATH` or as an installed package. This module knows
-nothing about what is loaded.
+Gymnasium names its environments in the same way. A planner, an object set, a depth noise, a reward
+or a term of one that is given as `module:name` needs no entry in a registry. The module must be
+importable: from the folder that a script is started in (`utils.config.run_script`), from
+`PYTHONPATH` or as an installed package. This module knows nothing about what is loaded.
 """
 
 from __future__ import annotations
 
 import importlib
 import re
-import sys
 import traceback
-from pathlib import Path
 from typing import Any
 
 from utils.errors import UserError, did_you_mean
@@ -57,10 +55,6 @@ def load_plugin(path: str, what: str, must_be_callable: bool = True) -> Any:
 
 
 def _import(module_name: str, path: str, what: str) -> Any:
-    # A script's own folder is on sys.path, the folder that it is started from need not be.
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -31,7 +31,6 @@ from utils.statistics import Difference
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
-PRIVILEGED = ("oracle",)  # policies that see the true scene: a bound, not a headline
 FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
 
 
@@ -55,10 +54,12 @@ def write_report(
     videos: Sequence[tuple[Path, str]] = (),
     device: str = "",
     interruption: str | None = None,
+    privileged: Collection[str] = (),
 ) -> None:
     """Write the page to `path`; videos are (gif, mp4 or webm file, caption).
 
     rows, comparisons: the figures of the rounds by `utils.results`. device, interruption: in words.
+    privileged: the planners that see the true scene, whose rows are a bound and no headline.
     Raises UserError on a video file that is missing or of another type.
     """
     templates = Environment(
@@ -71,7 +72,7 @@ def write_report(
     templates.filters |= {"percent": _percent, "number": _number}
     git = git_state()
     page = templates.get_template("report.html.j2").render(
-        groups=_groups(rows),
+        groups=_groups(rows, privileged),
         policies=_in_order(row.policy for row in rows),
         comparisons=_comparisons(comparisons),
         few_rounds=FEW_ROUNDS,
@@ -100,33 +101,36 @@ def _in_order(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _groups(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, Any]]:
     """The rows by (scenario, objects), each with its best row and its stacked outcomes."""
     cells: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         cells.setdefault((row.scenario, row.objects), []).append(row)
-    return [
-        {
-            "scenario": scenario,
-            "objects": Path(objects).name or objects,  # a folder by its last part
-            "rows": cell,
-            "best": _best(cell),
-            "bounds": [row for row in cell if _privileged(row) and row != _best(cell)],
-            "outcomes": [(row, _outcomes(row)) for row in cell],
-        }
-        for (scenario, objects), cell in cells.items()
-    ]
+    groups = []
+    for (scenario, objects), cell in cells.items():
+        bounds = [row for row in cell if _sees_truth(row, privileged)]
+        best = _best([row for row in cell if row not in bounds] or cell)
+        groups.append(
+            {
+                "scenario": scenario,
+                "objects": Path(objects).name or objects,  # a folder by its last part
+                "rows": cell,
+                "best": best,
+                "bounds": [row for row in bounds if row != best],
+                "outcomes": [(row, _outcomes(row)) for row in cell],
+            }
+        )
+    return groups
 
 
-def _privileged(row: Row) -> bool:
-    """Whether its planner, with whatever controller, sees the true scene."""
-    return any(row.policy == policy_name(planner, row.controller) for planner in PRIVILEGED)
+def _sees_truth(row: Row, privileged: Collection[str]) -> bool:
+    """Whether the row's planner, with any controller, is one of the privileged."""
+    return any(row.policy == policy_name(planner, row.controller) for planner in privileged)
 
 
 def _best(rows: Sequence[Row]) -> Row:
-    """The row with the best success rate, of those that work from the camera if there are any."""
-    fair = [row for row in rows if not _privileged(row)] or rows
-    return max(fair, key=lambda row: -1 if row.success_rate is None else row.success_rate)
+    """The row with the best success rate."""
+    return max(rows, key=lambda row: -1 if row.success_rate is None else row.success_rate)
 
 
 def _outcomes(row: Row) -> list[dict[str, Any]]:

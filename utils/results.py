@@ -219,7 +219,9 @@ def _difference(
 
 # --- Two runs -----------------------------------------------------------------------------------
 
-SCENE_SECTIONS = ("scene", "objects", "workspace")  # of the config: what a scene is made from
+# Sections and keys of the config that a scene is made from (`envs.cell_scenes.make_scene`): objects
+# come to rest in PyBullet, so that the steps of the physics count.
+SCENE_KEYS = ("scene", "objects", "workspace", "sim.frequency", "sim.solver_iterations")
 
 
 def compare_runs(first: Path, second: Path) -> list[Comparison]:
@@ -231,12 +233,11 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
     """
     runs = [(folder, *_read_run(folder)) for folder in (first, second)]
     (_, config, before), (_, other, after) = runs
-    for section in SCENE_SECTIONS:
-        a, b = config.get(section, {}), other.get(section, {})
-        if any(a[key] != b[key] for key in a.keys() & b.keys()):  # versions may differ in keys
+    for key in SCENE_KEYS:
+        if _differ(config, other, key):
             raise UserError(
-                f"--compare {first} {second}: their scenes do not match, because the section "
-                f"{section} of their configs differs; compare runs of the same scenes"
+                f"--compare {first} {second}: their scenes do not match, because {key} differs in "
+                "their configs; compare runs of the same scenes"
             )
     if not _scenes(before) & _scenes(after):
         raise UserError(
@@ -254,6 +255,14 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
     ]
     labelled = [(f"{a} ({labels[0]})", f"{b} ({labels[1]})") for a, b in pairs]
     return compare(renamed, config["seed"], labelled)
+
+
+def _differ(config: dict[str, Any], other: dict[str, Any], key: str) -> bool:
+    """Whether a section or key has another value; versions may differ in keys."""
+    section, _, name = key.partition(".")
+    a, b = config.get(section, {}), other.get(section, {})
+    shared = a.keys() & b.keys() & ({name} if name else a.keys())
+    return any(a[one] != b[one] for one in shared)
 
 
 def _read_run(folder: Path) -> tuple[dict[str, Any], list[RoundRecord]]:
