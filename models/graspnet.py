@@ -20,7 +20,10 @@ from models.graspnet_backbones import BACKBONES
 from models.graspnet_decoding import decode_grasps
 from utils.depth import fill_holes
 from utils.errors import UserError, unknown_choice
+from utils.geometry import GripperGeometry
 from utils.transforms import known_depth
+
+PANDA_HAND = GripperGeometry()
 
 # --- From an image to the input ------------------------------------------------------------
 
@@ -170,14 +173,16 @@ class GraspNet(nn.Module):
         K: np.ndarray | None = None,
         T_WC: np.ndarray | None = None,
         depth: np.ndarray | None = None,
+        gripper: GripperGeometry = PANDA_HAND,
         **decoding,
     ) -> dict:
         """Return the best pixel of one image as in the tutorial and, with a camera, metric grasps.
 
         x: (1, C, H, W). The returned dict holds `x` and `y` in fractions of the image, `theta` in
         fractions of 180 degrees (bin k is centred at k / num_angle_bins), `width` in metres and
-        `quality`. With K, T_WC, depth and, in `decoding`, a gripper it also holds `grasps`, the
-        list that `decode_grasps(..., **decoding)` returns, best first.
+        `quality`. With K, T_WC and depth it also holds `grasps`, the list that
+        `decode_grasps(..., gripper, **decoding)` returns, best first; the gripper is the Panda's
+        own hand unless another one is given.
         """
         if len(x) != 1:
             raise ValueError(f"predict_grasp takes one image, got a batch of {len(x)}")
@@ -197,7 +202,9 @@ class GraspNet(nn.Module):
             "quality": float(quality[0, 0, row, column]),
         }
         if K is not None and T_WC is not None and depth is not None:
-            found["grasps"] = decode_grasps(quality, angle, width, K, T_WC, depth, **decoding)
+            found["grasps"] = decode_grasps(
+                quality, angle, width, K, T_WC, depth, gripper, **decoding
+            )
         return found
 
 

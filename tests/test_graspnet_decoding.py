@@ -191,7 +191,7 @@ def test_predict_grasp_keeps_the_tutorials_dict_and_adds_metric_grasps() -> None
         {"x": 0.5, "y": 0.25, "theta": 70 / 180, "width": 0.05, "quality": 0.9}
     )
     assert model.training
-    found = model.predict_grasp(torch.zeros(1, 4, 64, 80), K, T_WC, depth, gripper=HAND)
+    found = model.predict_grasp(torch.zeros(1, 4, 64, 80), K, T_WC, depth)
     (grasp,) = found["grasps"]
     assert project(grasp.position, K, T_WC)[0] == pytest.approx((40, 16), abs=0.5)
     with pytest.raises(ValueError, match="batch of 2"):
