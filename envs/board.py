@@ -16,7 +16,6 @@ Knows neither robot nor servo.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import cv2
@@ -35,7 +34,6 @@ _BLACK_HEIGHT = 1e-4  # m by which the black stands out of the white, so that it
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # its corners' columns and rows, clockwise
 _OUTERMOST = _MARGIN + (_CELLS - 2 * _MARGIN) * _SQUARE  # corners of the markers
 WHITE, BLACK = (0.95, 0.95, 0.95, 1.0), (0.03, 0.03, 0.03, 1.0)
-CARRIED_MASS = 0.05  # kg, of a board that is carried
 _ALIGNED = 0.9  # least correlation of the board's image with its pattern; a free view has 0.98
 
 
@@ -54,11 +52,6 @@ class Board:
     def size(self) -> float:
         """Side in metres."""
         return _SIDE * self.cell
-
-    @property
-    def outline(self) -> np.ndarray:
-        """(4, 3) the board's own corners in O, metres, clockwise from the top left."""
-        return self.size / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
 
     @property
     def points(self) -> np.ndarray:
@@ -119,16 +112,6 @@ class Board:
         vertices = self._place((black[:, None] + _SQUARE[::-1]).reshape(-1, 2))
         first = 4 * np.arange(len(black))[:, None]
         return vertices.tolist(), (first + [0, 1, 2, 0, 2, 3]).ravel().tolist()
-
-
-class CarriedBoard(ABC):
-    """A board screwed to the hand. corners_E: (4, 3) its corners in E, metres."""
-
-    corners_E: np.ndarray
-
-    @abstractmethod
-    def contact_force(self) -> float:
-        """Sum of the normal forces on the board in newtons."""
 
 
 def _marker_places() -> np.ndarray:

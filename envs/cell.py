@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from envs.board import Board, CarriedBoard
+from envs.board import Board
 from envs.cell_layout import EMPTY, Scene, on_table
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
@@ -173,13 +173,6 @@ class Cell(ABC):
     def show_board(self, board: Board, T_WO: np.ndarray) -> None:
         """Rebuild the cell without objects, with a board that stays at T_WO (4, 4)."""
         self._rebuild(EMPTY, board, T_WO)
-
-    def attach_board(self, board: Board, T_EO: np.ndarray) -> CarriedBoard:
-        """Screw a board to the hand at T_EO (4, 4); raises UserError where that cannot be done."""
-        raise UserError(
-            f"simulator={self.config.simulator}: a board cannot be attached to the hand there; use "
-            "simulator=pybullet"
-        )
 
     def _rebuild(
         self, scene: Scene, board: Board | None = None, T_WO: np.ndarray | None = None

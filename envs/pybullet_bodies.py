@@ -17,7 +17,7 @@ from typing import ClassVar, Self
 import numpy as np
 import pybullet
 
-from envs.board import BLACK, CARRIED_MASS, WHITE, Board, CarriedBoard
+from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
     BIN_COLOUR,
     GRAVITY,
@@ -33,7 +33,7 @@ from envs.cell_layout import (
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
 from utils.config import Config, SimConfig
-from utils.transforms import inverse_pose, pose_matrix, position_quaternion, transform_points
+from utils.transforms import position_quaternion
 
 # (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more
 # than the root of this. PyBullet's default.
@@ -194,11 +194,8 @@ def _has_texture(path: Path) -> bool:
 # --- Boards ---------------------------------------------------------------------------------
 
 
-def add_board(client: int, board: Board, T_WO: np.ndarray, carried: bool = False) -> int:
-    """Put a board into a client at T_WO (4, 4); its body number.
-
-    The board stays where it is unless it is `carried`, which gives it a mass.
-    """
+def add_board(client: int, board: Board, T_WO: np.ndarray) -> int:
+    """Put a board that stays at T_WO (4, 4) into a client; its body number."""
     half, below = board.white()
     vertices, triangles = board.black()
     position, quaternion = position_quaternion(T_WO)
@@ -217,40 +214,13 @@ def add_board(client: int, board: Board, T_WO: np.ndarray, carried: bool = False
         physicsClientId=client,
     )  # fmt: skip
     return pybullet.createMultiBody(
-        CARRIED_MASS if carried else 0.0, solid, white, position, quaternion,
+        0.0, solid, white, position, quaternion,
         linkMasses=[0.0], linkCollisionShapeIndices=[-1], linkVisualShapeIndices=[black],
         linkPositions=[[0, 0, 0]], linkOrientations=[[0, 0, 0, 1]],
         linkInertialFramePositions=[[0, 0, 0]], linkInertialFrameOrientations=[[0, 0, 0, 1]],
         linkParentIndices=[0], linkJointTypes=[pybullet.JOINT_FIXED],
         linkJointAxis=[[0, 0, 1]], physicsClientId=client,
     )  # fmt: skip
-
-
-class PybulletCarriedBoard(CarriedBoard):
-    """A board screwed to a link of the robot: a body with mass that a constraint holds.
-
-    T_WO: (4, 4) where the board is now. T_EO: (4, 4) where it is on the hand.
-    """
-
-    def __init__(
-        self, client: int, robot: int, link: int, board: Board, T_WO: np.ndarray, T_EO: np.ndarray
-    ):
-        self.client = client
-        self.body = add_board(client, board, T_WO, carried=True)
-        # PyBullet gives a constraint's frame in the link's frame of inertia.
-        hand = pybullet.getLinkState(robot, link, physicsClientId=client)
-        position, quaternion = position_quaternion(inverse_pose(pose_matrix(*hand[:2])) @ T_WO)
-        pybullet.createConstraint(
-            robot, link, self.body, -1, pybullet.JOINT_FIXED, [0, 0, 0],
-            position, [0, 0, 0], quaternion, [0, 0, 0, 1], physicsClientId=client,
-        )  # fmt: skip
-        for part in range(-1, pybullet.getNumJoints(robot, physicsClientId=client)):
-            pybullet.setCollisionFilterPair(robot, self.body, part, -1, 0, physicsClientId=client)
-        self.corners_E = transform_points(T_EO, board.outline)
-
-    def contact_force(self) -> float:
-        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
-        return sum(contact[9] for contact in contacts)
 
 
 # --- Rest -----------------------------------------------------------------------------------

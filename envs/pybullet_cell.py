@@ -10,12 +10,11 @@ import math
 import numpy as np
 import pybullet
 
-from envs.board import Board, CarriedBoard
+from envs.board import Board
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
-    PybulletCarriedBoard,
     add_bin,
     add_board,
     add_table,
@@ -27,7 +26,6 @@ from envs.pybullet_camera import PybulletCamera, load_renderer
 from envs.pybullet_files import write_welded_panda
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.pybullet_randomization import PybulletRandomizable
-from envs.robot_kinematics import forward_kinematics
 from utils.config import Config
 from utils.errors import UserError
 from utils.transforms import position_quaternion
@@ -101,10 +99,6 @@ class PybulletCell(Cell):
 
     def _settle(self) -> None:
         settle(self.client, self.bodies, self.config)
-
-    def attach_board(self, board: Board, T_EO: np.ndarray) -> CarriedBoard:
-        T_WO = forward_kinematics(self.robot.q) @ T_EO
-        return PybulletCarriedBoard(self.client, self.robot.body, ARM[-1], board, T_WO, T_EO)
 
     def _advance(self, count: int) -> None:
         while count > 0:

@@ -33,10 +33,9 @@ from envs.robot_kinematics import (
     tip_position,
 )
 from utils.config import RobotConfig, SafetyConfig
-from utils.errors import ServoError, UserError
+from utils.errors import ServoError
 
 _LEAST_SHARE = 0.01  # of a desired velocity: where a limit leaves less, the arm stops
-_FINGERTIPS = ((0.0, 0.0, 0.0),)
 _TOO_FAST = 1.0 + 1e-6  # of a speed limit: what is planned to be at the limit passes unchanged
 _LEAD = 0.001  # m by which a reference may be ahead of an arm that has stopped at the box's edge
 _JOINT_RANGES = list(zip(JOINT_LOWER.tolist(), JOINT_UPPER.tolist()))
@@ -146,18 +145,14 @@ class Verdict:
 class SafetyGate:
     """Checks the desired joint velocities of a loop that follows a camera.
 
-    Keeps the guarded points within the workspace box and under a linear speed, the hand under an
+    Keeps the fingertips within the workspace box and under a linear speed, the hand under an
     angular speed, and the joints within their limits of position, velocity and acceleration. A stop
     is immediate: nothing is sent on contact, or when the image behind it is too old.
     """
 
-    def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float, guarded_E=_FINGERTIPS):
-        """dt: seconds for which a velocity is sent. guarded_E: (n, 3) points in E, metres, such as
-        the corners of something carried."""
+    def __init__(self, safety: SafetyConfig, robot: RobotConfig, dt: float):
+        """dt: seconds for which a velocity is sent."""
         self.safety, self.dt = safety, dt
-        self.guarded_E = np.asarray(guarded_E, dtype=float)
-        if self.guarded_E.ndim != 2 or self.guarded_E.shape[1] != 3 or not len(self.guarded_E):
-            raise UserError(f"guarded_E: expected (n, 3) points, got {self.guarded_E.shape}")
         self._speed = JOINT_VELOCITY * robot.velocity_scale
         self._lower = JOINT_LOWER + safety.joint_margin
         self._upper = JOINT_UPPER - safety.joint_margin
@@ -175,7 +170,7 @@ class SafetyGate:
     ) -> Verdict:
         """The part of the desired joint velocities (7,), rad/s, that may be sent.
 
-        q: (7,) rad, where the joints are. contact_force: N on the arm and what it carries.
+        q: (7,) rad, where the joints are. contact_force: N on the arm.
         perception_age: seconds since the image was taken from which `desired` was computed.
         before: (7,) rad/s, sent last; the change from there stays within the acceleration limits.
         None: no limit on the change.
@@ -186,17 +181,14 @@ class SafetyGate:
         reason = contact_reason(contact_force, self.safety.contact_stop)
         if reason is not None:
             return Verdict(np.zeros(7), reason, contact=True)
-        T_WE, J = forward_kinematics(q), geometric_jacobian(q)
-        arms = self.guarded_E @ T_WE[:3, :3].T
-        twist = J @ desired
-        velocity = desired * self._speed_share(desired, _speeds(twist, arms), twist[3:])
+        tip, J = forward_kinematics(q)[:3, 3], geometric_jacobian(q)
+        velocity = desired * self._speed_share(desired, J @ desired)
         choices = [velocity]
         if before is not None:  # `desired` itself, where braking that gently would leave no room
             change = velocity - before
             choices.insert(0, before + change * self._change_share(change))
         for velocity in choices:
-            speeds = _speeds(J @ velocity, arms)
-            share, reason = self._room_share(velocity, q, T_WE[:3, 3] + arms, speeds)
+            share, reason = self._room_share(velocity, q, tip, (J @ velocity)[:3])
             if share >= _LEAST_SHARE:
                 return Verdict(share * velocity)
         return Verdict(np.zeros(7), reason)
@@ -212,12 +204,13 @@ class SafetyGate:
             )
         return None
 
-    def _speed_share(self, desired, speeds, turn) -> float:
+    def _speed_share(self, desired, twist) -> float:
         """The factor, at most 1, that brings every speed within its limit."""
         excess = max(
             float(np.max(np.abs(desired) / self._speed)),
-            float(np.linalg.norm(speeds, axis=1).max()) / self.safety.linear_speed,
-            float(np.linalg.norm(turn)) / self.safety.angular_speed,
+            # With an axis, numpy rounds each square; without one, the result depends on BLAS.
+            float(np.linalg.norm(twist[:3], axis=0)) / self.safety.linear_speed,
+            float(np.linalg.norm(twist[3:])) / self.safety.angular_speed,
         )
         return 1.0 / max(excess, 1.0)
 
@@ -227,16 +220,15 @@ class SafetyGate:
         excess = float(np.max(np.abs(change) / (self._joint_acceleration * self.dt)))
         return 1.0 / max(excess, 1.0)
 
-    def _room_share(self, velocity, q, points, speeds) -> tuple[float, str]:
+    def _room_share(self, velocity, q, tip, tip_velocity) -> tuple[float, str]:
         """The factor, at most 1, that lets the arm stop before each limit, and the limit that sets
         it."""
         joints = self._shares(velocity, q - self._lower, self._upper - q, self._joint_acceleration)
-        box = self._shares(speeds, points - self._box[0], self._box[1] - points, self._deceleration)
-        joint, place = int(joints.argmin()), np.unravel_index(box.argmin(), box.shape)
-        if joints[joint] <= box[place]:
+        box = self._shares(tip_velocity, tip - self._box[0], self._box[1] - tip, self._deceleration)
+        joint, axis = int(joints.argmin()), int(box.argmin())
+        if joints[joint] <= box[axis]:
             return joints[joint], f"joint {joint + 1} is at its limit ({q[joint]:.3f} rad)"
-        axis = "xyz"[place[1]]
-        return box[place], f"the workspace ends here ({axis} = {points[place]:.3f} m)"
+        return box[axis], f"the workspace ends here ({'xyz'[axis]} = {tip[axis]:.3f} m)"
 
     def _shares(self, speed, room_below, room_above, deceleration) -> np.ndarray:
         """For each speed (...) the share of it that the room in its direction allows, at most 1."""
@@ -245,8 +237,3 @@ class SafetyGate:
         allowed = np.minimum(np.sqrt(2.0 * deceleration * room), room / self.dt)
         size = np.abs(speed)
         return np.divide(allowed, size, out=np.ones_like(size), where=size > allowed)
-
-
-def _speeds(twist: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """(n, 3) m/s in W of points at `arms` (n, 3) from E, which moves with a twist (6,)."""
-    return twist[:3] + np.cross(twist[3:], arms)

@@ -213,7 +213,6 @@ class Scenario:
 
     layout: of the scene (`envs.cell_scenes`). moved: whether objects are displaced during the
     approach. speed: m/s of a conveyor, 0: none. turning: whether the conveyor's path turns.
-    crossing: whether it leads through the middle of the workspace instead of sideways.
     miscalibrated: whether the calibration is wrong. latency: seconds by which images arrive late.
     """
 
@@ -221,7 +220,6 @@ class Scenario:
     moved: bool = False
     speed: float = 0.0
     turning: bool = False
-    crossing: bool = False
     miscalibrated: bool = False
     latency: float = 0.0
 
@@ -234,8 +232,6 @@ class Scenario:
         place = cell.object_position(min(cell.remaining))[:2]
         if self.moved:
             return displacement(rng, place, centre, cell.config.workspace.size / 2)
-        if self.crossing:
-            return crossing(rng, place, centre, self.speed)
         if self.speed > 0.0:
             return conveyor(rng, place, centre, self.speed, self.turning)
         return None
@@ -276,15 +272,6 @@ def conveyor(
     return Conveyor(speed, heading, turn_rate)
 
 
-def crossing(
-    rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float
-) -> Conveyor:
-    """A conveyor towards the middle of the workspace and on, up to 30 degrees askew: towards the
-    robot, away from it or sideways, depending on the object's place."""
-    x, y = centre - place
-    return Conveyor(speed, float(np.arctan2(y, x)) + rng.uniform(-np.pi / 6, np.pi / 6))
-
-
 SCENARIOS = {
     "isolated": Scenario("isolated"),
     "packed": Scenario("packed"),
@@ -295,7 +282,6 @@ SCENARIOS = {
     "moving_10cm": Scenario("isolated", speed=0.10),
     "turning_5cm": Scenario("isolated", speed=0.05, turning=True),
     "turning_10cm": Scenario("isolated", speed=0.10, turning=True),
-    "crossing_5cm": Scenario("isolated", speed=0.05, crossing=True),
     "miscalibrated": Scenario("isolated", miscalibrated=True),
     "latency": Scenario("isolated", speed=0.05, latency=0.1),
 }

@@ -71,11 +71,6 @@ def _state_in_words(env: RobotGraspingEnv, info: dict[str, Any]) -> str:
     )
 
 
-def scripted_action(env: RobotGraspingEnv, info: dict[str, Any]) -> np.ndarray:
-    """(5,) `ee_planar` action of a simple pick of the nearest object."""
-    return scripted_pick(env, info)[1]
-
-
 def scripted_pick(env: RobotGraspingEnv, info: dict[str, Any]) -> tuple[str, np.ndarray]:
     """The phase of PHASES that a pick of the nearest object is in, and its (5,) `ee_planar`
     action."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.board import CarriedBoard
 from envs.cell import Cell
 from envs.robot_safety import ArmStoppedError, SafetyGate
 from utils.config import SafetyConfig
@@ -25,20 +24,10 @@ def image_period(cell: Cell) -> int:
 class ServoArm:
     """Sends joint velocities to the cell's arm, one physics step at a time, through the gate."""
 
-    def __init__(
-        self,
-        cell: Cell,
-        carried: CarriedBoard | None = None,
-        safety: SafetyConfig | None = None,
-    ):
-        """carried: a board on the hand, which the gate guards too. safety: the gate's limits; None
-        takes those of the cell's config."""
-        self.cell, self.robot, self.carried = cell, cell.robot, carried
-        guarded = np.zeros((1, 3))
-        if carried is not None:
-            guarded = np.vstack([guarded, carried.corners_E])
-        safety = safety or cell.config.safety
-        self.gate = SafetyGate(safety, cell.config.robot, cell.dt, guarded)
+    def __init__(self, cell: Cell, safety: SafetyConfig | None = None):
+        """safety: the gate's limits; None takes those of the cell's config."""
+        self.cell, self.robot = cell, cell.robot
+        self.gate = SafetyGate(safety or cell.config.safety, cell.config.robot, cell.dt)
         self._reference, self._velocity = cell.robot.q, np.zeros(7)  # of the last command
 
     def move(self, desired: np.ndarray, perception_age: float) -> None:
@@ -49,10 +38,9 @@ class ServoArm:
         gate allows nothing, the motors hold the arm and ArmStoppedError is raised.
         """
         q = self.robot.q
-        force = self.robot.contact_force()
-        if self.carried is not None:
-            force += self.carried.contact_force()
-        verdict = self.gate.check(desired, q, force, perception_age, self._velocity)
+        verdict = self.gate.check(
+            desired, q, self.robot.contact_force(), perception_age, self._velocity
+        )
         if verdict.reason is not None:
             self._hold()
             raise ArmStoppedError(verdict.reason, verdict.contact)

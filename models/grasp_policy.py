@@ -176,12 +176,6 @@ class GraspPolicyNetwork(nn.Module):
         """(B,) the critic's estimate of the return. privileged: (B, P), P may be 0."""
         return self._value(self.features(image, state), privileged)
 
-    def policy_and_value(
-        self, image: torch.Tensor | None, state: torch.Tensor, privileged: torch.Tensor
-    ) -> tuple[ActionDistribution, torch.Tensor]:
-        """Policy and value from one encoding of the image."""
-        return self.policy_and_value_of(self.features(image, state), privileged)
-
     def policy_and_value_of(
         self, features: torch.Tensor, privileged: torch.Tensor
     ) -> tuple[ActionDistribution, torch.Tensor]:

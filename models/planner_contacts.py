@@ -127,16 +127,11 @@ def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
     """(M,) share of each object's plan view that another object covers."""
     seen = np.bincount(heights.label[heights.label >= 0], minlength=len(scene.objects))
     whole = np.empty(len(scene.objects))
-    workspace, margin = _square_of(heights)
+    side = heights.cell * (heights.height.shape[0] - 1)
+    workspace = Workspace(tuple(heights.origin + side / 2), side, heights.table_height)
     for number, item in enumerate(scene.objects):
         alone = SceneGeometry((item,), scene.table_height)
         whole[number] = (
-            height_map_from_scene(alone, workspace, 2 * heights.cell, margin).label >= 0
+            height_map_from_scene(alone, workspace, 2 * heights.cell, 0.0).label >= 0
         ).sum()
     return np.clip(1 - seen / np.maximum(4 * whole, 1), 0, 1)
-
-
-def _square_of(heights: HeightMap) -> tuple[Workspace, float]:
-    """The workspace (and zero margin) that a square height map covers."""
-    side = heights.cell * (heights.height.shape[0] - 1)
-    return Workspace(tuple(heights.origin + side / 2), side, heights.table_height), 0.0

@@ -7,11 +7,11 @@ import numpy as np
 import pybullet
 import pytest
 
-from benchmarks.bench_servo_cell import pose
 from envs.board import Board
 from envs.cell import Intrinsics
 from envs.pybullet_bodies import add_board, static_box
 from envs.pybullet_camera import PybulletCamera
+from tests.helpers.poses import pose
 from utils.errors import TargetLostError
 from utils.transforms import inverse_pose, project
 

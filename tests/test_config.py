@@ -294,6 +294,7 @@ def test_unknown_choice():
             "randomization.adaptive.enabled=true",
             "randomization.adaptive.enabled: this key was removed (command line); write the ranges",
         ),
+        ("servo.seconds=5", "servo.seconds: this key was removed (command line); leave it out"),
     ],
 )
 def test_an_old_key_is_answered_by_what_to_write_instead(key, answer):

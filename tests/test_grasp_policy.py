@@ -99,9 +99,10 @@ def test_weights_start_orthogonal():
 def test_only_the_critic_sees_what_is_privileged():
     network = GraspPolicyNetwork(8, 3, 2, 16, privileged_dim=2, conv_channels=[4, 4])
     image, state = torch.rand(1, 4, 16, 16), torch.randn(1, 3)
+    features = network.features(image, state)
     here, there = torch.zeros(1, 2), torch.ones(1, 2)
-    policy, value = network.policy_and_value(image, state, here)
-    other_policy, other_value = network.policy_and_value(image, state, there)
+    policy, value = network.policy_and_value_of(features, here)
+    other_policy, other_value = network.policy_and_value_of(features, there)
     assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
 
 
@@ -113,10 +114,10 @@ def test_the_policy_goes_by_estimates_and_never_by_the_truth():
     network = estimating()
     image, state = torch.rand(5, 4, 16, 16), torch.randn(5, 3)
     network.privileged_norm.update(torch.randn(100, 3) * 4 + 7)
-    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
-    other_policy, other_value = network.policy_and_value(image, state, torch.ones(5, 3))
-    assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
     features = network.features(image, state)
+    policy, value = network.policy_and_value_of(features, torch.zeros(5, 3))
+    other_policy, other_value = network.policy_and_value_of(features, torch.ones(5, 3))
+    assert torch.equal(policy.mean, other_policy.mean) and not torch.equal(value, other_value)
     torch.testing.assert_close(features[:, :2], network.estimate(image, state))
     assert features.shape == (5, 2 + 3) and not features.requires_grad
     scaled = network.privileged_norm(torch.ones(5, 3))[:, :2]
@@ -129,7 +130,7 @@ def test_the_policy_s_loss_leaves_the_estimator_alone_and_its_loss_the_policy():
     estimator = {id(p) for p in network.estimator_parameters()}
     assert 0 < len(estimator) < len(list(network.parameters()))
 
-    policy, value = network.policy_and_value(image, state, torch.zeros(5, 3))
+    policy, value = network.policy_and_value_of(network.features(image, state), torch.zeros(5, 3))
     (policy.log_prob(torch.zeros(5, 2)).sum() + value.sum()).backward()
     assert all((p.grad is None) == (id(p) in estimator) for p in network.parameters())
 

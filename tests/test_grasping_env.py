@@ -24,7 +24,7 @@ from envs.env_rewards import Outline
 from envs.grasping_env import RobotGraspingEnv
 from envs.pybullet_bodies import settle
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
-from envs.scripted_pick import scripted_action
+from envs.scripted_pick import scripted_pick
 from tests.helpers.shapes import cube_corners
 from utils.config import with_settings
 from utils.errors import UserError
@@ -55,7 +55,7 @@ def picked(make):
     env = make(control="ee_planar", hold_seconds=10.0)
     _, info = env.reset(seed=0)
     while not (info["grasped"] and info["object_position"][2] > env.settings.lift_height):
-        *_, info = env.step(scripted_action(env, info))
+        *_, info = env.step(scripted_pick(env, info)[1])
     return env, info
 
 
@@ -377,7 +377,7 @@ def scripted_episode(env) -> Iterator[tuple]:
     _, info = env.reset(seed=1)
     done = False
     while not done:
-        result = env.step(scripted_action(env, info))
+        result = env.step(scripted_pick(env, info)[1])
         *_, terminated, truncated, info = result
         done = terminated or truncated
         yield result
@@ -413,7 +413,7 @@ def test_scripted_pick_succeeds(make, seed, reward):
     _, info = env.reset(seed=seed)
     start, rewards, terminated, truncated = potential(env, info), [], False, False
     while not (terminated or truncated):
-        _, r, terminated, truncated, info = env.step(scripted_action(env, info))
+        _, r, terminated, truncated, info = env.step(scripted_pick(env, info)[1])
         rewards.append(r)
     assert terminated and not truncated and info["is_success"] and info["reason"] == "success"
     assert info["grasped"] and info["object_position"][2] > env.settings.lift_height
@@ -709,7 +709,7 @@ def test_what_the_arm_cannot_reach_is_refused_and_reported(make, control):
         observation, *_, info = env.step(action)
         R = forward_kinematics(observation["state"][:7])[:3, :3]
         tilt = np.degrees(np.arccos(min(-R[2, 2], 1.0)))
-        assert tilt < 10, "the hand tilts, which nobody asked for"
+        assert tilt < 10, "the hand tilts without a command"
         if action is far:
             farthest = info
     assert not farthest["reachable"] and farthest["end_effector_position"][0] < 0.73

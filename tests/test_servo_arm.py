@@ -1,4 +1,4 @@
-"""What the gate does to constant velocities: box, joint limits, contact, and a carried board."""
+"""What the gate does to constant velocities: box, joint limits and contact."""
 
 from __future__ import annotations
 
@@ -6,18 +6,13 @@ import numpy as np
 import pybullet
 import pytest
 
-from benchmarks.bench_servo_cell import make_task
-from envs.board import Board
 from envs.cell_layout import Scene
 from envs.pybullet_bodies import static_box
 from envs.pybullet_cell import PybulletCell
-from envs.robot_kinematics import JOINT_UPPER, forward_kinematics, geometric_jacobian
+from envs.robot_kinematics import JOINT_UPPER, forward_kinematics
 from envs.robot_safety import ArmStoppedError
 from envs.servo_arm import ServoArm
 from utils.config import load_config
-from utils.transforms import transform_points
-
-BOARD = Board()
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +28,9 @@ def empty(cell, *overrides):
     return cell
 
 
-def drive(cell, desired, seconds=3.0, carried=None):
+def drive(cell, desired, seconds=3.0):
     """The reason for which a constant desired (7,) was stopped, and E's path (k, 3)."""
-    arm, path = ServoArm(cell, carried), []
+    arm, path = ServoArm(cell), []
     with pytest.raises(ArmStoppedError) as stopped:
         for _ in range(round(seconds / cell.dt)):
             path.append(forward_kinematics(cell.robot.q)[:3, 3])
@@ -67,22 +62,3 @@ def test_contact_stops_the_arm(cell):
     assert reason.startswith("contact with ")
     nearest = pybullet.getClosestPoints(cell.robot.body, wall, 0.1, physicsClientId=cell.client)
     assert min(point[8] for point in nearest) > -0.002  # it did not go on into the wall
-
-
-def test_what_is_carried_counts_as_the_arm(cell, config):
-    cell.config = config
-    task = make_task(cell, "eye_to_hand", seed=0)
-    height = cell.robot.tip_pose()[2, 3]
-    half = [0.05, 0.05, height / 2 - 0.03]
-    block = static_box(cell.client, half, [0.5, 0, half[2]], (0.5, 0.5, 0.5, 1))
-    down = np.linalg.pinv(geometric_jacobian(cell.robot.q)) @ [0, 0, -0.1, 0, 0, 0]
-    reason, path = drive(cell, down, carried=task.carried)
-    assert reason.startswith("contact with ")
-    near = pybullet.getClosestPoints(task.body, block, 0.1, physicsClientId=cell.client)
-    assert abs(min(point[8] for point in near)) < 0.002 and height - path[-1, 2] > 0.02
-    # Without a block the lowest corner of the target ends at the box, and E well above it.
-    task = make_task(cell, "eye_to_hand", seed=0)
-    reason, path = drive(cell, down, carried=task.carried)
-    assert reason.startswith("the workspace ends here (z = 0.02")
-    corners = transform_points(cell.camera_pose("overhead") @ task.true_pose(), BOARD.outline)
-    assert corners[:, 2].min() == pytest.approx(0.02, abs=1e-3) and path[-1, 2] > 0.022

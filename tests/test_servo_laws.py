@@ -74,10 +74,16 @@ def test_rotation_error_decays_exactly_in_position_based_and_extended_control():
         np.testing.assert_allclose(angles, expected, rtol=1e-9)
 
 
+def path_length(history) -> float:
+    """Metres that the camera travelled relative to the object."""
+    positions = history.camera_poses[:, :3, 3]
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
 def test_position_based_camera_goes_straight():
     history = LAWS[1].simulate(SQUARE, START, GOAL)
     chord = np.linalg.norm(history.camera_poses[0, :3, 3] - history.camera_poses[-1, :3, 3])
-    assert history.path_length == pytest.approx(chord, rel=1e-3)
+    assert path_length(history) == pytest.approx(chord, rel=1e-3)
 
 
 @pytest.mark.parametrize("degrees", [90, 120, 150])
@@ -102,7 +108,7 @@ def test_mean_matrix_turns_in_place(degrees):
     servo = ImageBasedVisualServo(CAMERA, interaction="mean", truncation=1e-6)
     history = servo.simulate(SQUARE, turned(degrees), FACING)
     assert history.converged
-    assert history.path_length < 1e-6
+    assert path_length(history) < 1e-6
 
 
 def test_mean_matrix_at_90_degrees_is_refused_without_truncation():
@@ -116,7 +122,7 @@ def test_mean_matrix_at_90_degrees_is_refused_without_truncation():
 def test_pose_and_extended_control_turn_in_place(servo, degrees):
     history = servo.simulate(SQUARE, turned(degrees), FACING)
     assert history.converged
-    assert history.path_length < 1e-9
+    assert path_length(history) < 1e-9
     # The image error is 0.2828 theta for small theta; it must shrink to 1e-5 as 0.98^k.
     expected = 1 + np.ceil(np.log(0.2828 * np.radians(degrees) / 1e-5) / -np.log(0.98))
     assert iterations_to_tolerance(history) == pytest.approx(expected, abs=1)
@@ -167,13 +173,6 @@ def test_condition_number_is_that_of_the_interaction_matrix():
     history = LAWS[1].simulate(SQUARE, START, GOAL, max_iterations=1)
     turn = rotation_interaction(rotation_log((GOAL @ inverse_pose(START))[:3, :3]))
     assert history.condition_numbers[0] == pytest.approx(np.linalg.cond(turn))
-
-
-def test_estimated_pose_is_the_pose():
-    p = transform_points(START, SQUARE)
-    servo = PositionBasedVisualServo(CAMERA)
-    found = servo.estimate_pose(servo.camera.to_pixels(p[:, :2] / p[:, 2:]), p[:, 2], SQUARE)
-    np.testing.assert_allclose(found, START, atol=1e-12)
 
 
 @pytest.mark.parametrize("depth", [0.0, -0.5, np.nan, np.inf, [1, 1, 1, 0], [1, 1, np.nan, 1]])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from tests.helpers.servo_cases import directions, twists, unit
+from tests.helpers.servo_cases import directions, twists
 from utils.transforms import (
     Grasp,
     ImageGrasp,
@@ -19,7 +19,6 @@ from utils.transforms import (
     inverse_pose,
     look_at,
     pose_exp,
-    pose_log,
     pose_matrix,
     position_quaternion,
     project,
@@ -151,12 +150,6 @@ def twist_matrix(twist):
 def test_exponential_is_the_matrix_exponential(twist, scale):
     twist = twist * scale
     np.testing.assert_allclose(pose_exp(twist), expm(twist_matrix(twist)), atol=1e-13)
-
-
-@given(directions, st.floats(0, np.pi - 1e-6), st.tuples(unit, unit, unit))
-def test_pose_log_undoes_the_exponential(axis, angle, linear):
-    twist = np.array([*linear, *(axis * angle)])
-    np.testing.assert_allclose(pose_log(pose_exp(twist)), twist, atol=1e-9)
 
 
 @given(directions, st.floats(-15, 0).map(lambda power: np.pi - 10**power))

@@ -85,6 +85,10 @@ RENAMED_KEYS = {
 # Removed dotted keys and sections, and what to do instead.
 REMOVED_KEYS = {
     "randomization.adaptive": "write the ranges themselves under randomization.physics",
+    **dict.fromkeys(
+        ("servo.seconds", "servo.settled_distance", "servo.settled_angle", "servo.settled_frames"),
+        "leave it out, the section closed_loop says when an approach ends",
+    ),
 }
 
 

@@ -145,10 +145,6 @@ class ServoConfig(Section):
     rate: Annotated[int, Field(ge=1, le=1000)]
     width: Pixels
     height: Pixels
-    seconds: Positive
-    settled_distance: Positive
-    settled_angle: Positive
-    settled_frames: Count
 
 
 class ClosedLoopConfig(Section):

@@ -67,12 +67,6 @@ class ServoHistory:
         """(k,) metres between camera and object origin."""
         return np.linalg.norm(self.poses[:, :3, 3], axis=1)
 
-    @property
-    def path_length(self) -> float:
-        """Metres that the camera travelled relative to the object."""
-        positions = self.camera_poses[:, :3, 3]
-        return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
     def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
         """(k,) metres and (k,) radians between the camera's pose and its goal."""
         T = self.goal_pose @ self.camera_poses  # T_GC, the camera relative to its goal

@@ -27,7 +27,6 @@ from utils.servo_features import (
     extended_interaction,
     interaction_matrix,
     points_from_depths,
-    pose_from_points,
     rotation_interaction,
 )
 from utils.servo_loop import ServoView, VisualServo
@@ -119,11 +118,6 @@ class PositionBasedVisualServo(VisualServo):
         Raises PointError outside the image and DepthError where the depth is unknown.
         """
         return self.pixel_to_3d(*point, depths_from_image(point, depth_map)[0])
-
-    def estimate_pose(self, points, depths, points_O: np.ndarray) -> np.ndarray:
-        """(4, 4) T_CO from pixels (n, 2), depths (n,) and the object's points (n, 3), metres."""
-        xy = self.camera.normalise(points)
-        return pose_from_points(points_from_depths(xy, check_depths(depths, len(xy))), points_O)
 
     def compute_end_effector_velocity(self, current_pose, target_pose) -> np.ndarray:
         """(6,) v_C from the object's current and desired pose T_CO (4, 4). All six components."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from math import atan2, cos, sin, sqrt
+from math import atan2, sin, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -295,20 +295,6 @@ def pose_exp(twist: Iterable[float]) -> np.ndarray:
     A frame A that moves with v_A (expressed in A) for dt has T_WA <- T_WA @ pose_exp(v_A * dt).
     """
     return _exp(*map(float, twist))
-
-
-def pose_log(T: np.ndarray) -> np.ndarray:
-    """Twist (6,) with pose_exp(twist) = T and a rotation angle in [0, pi]."""
-    w = rotation_log(T[:3, :3])
-    theta = sqrt(w @ w)
-    if theta < SMALL_ANGLE:
-        factor = 1 / 12
-    else:
-        half = 0.5 * theta
-        factor = (1.0 - half * cos(half) / sin(half)) / theta**2
-    W = skew(w)
-    inverse_v = np.eye(3) - 0.5 * W + factor * W @ W
-    return np.concatenate([inverse_v @ T[:3, 3], w])
 
 
 def velocity_transform(T_AB: np.ndarray) -> np.ndarray:
