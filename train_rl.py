@@ -39,7 +39,7 @@ from models.grasp_policy import GraspPPO, make_ppo
 from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
     Curves,
-    Row,
+    ProgressRow,
     load_progress,
     reached,
     row_in_words,
@@ -143,7 +143,9 @@ def updates(config: Config) -> int:
     return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
 
 
-def train(config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[Row]) -> bool:
+def train(
+    config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[ProgressRow]
+) -> bool:
     """Train to the end, to a target, or until Ctrl-C (False); each evaluation adds a row to
     history."""
     processes, settings, watch = ppo.team, config.rl, Stopwatch()
@@ -216,7 +218,9 @@ def begin_episodes(
     ppo.memory.clear()
 
 
-def evaluate(config: Config, envs: TrainingEnvs, ppo: GraspPPO, watch: Stopwatch, step: int) -> Row:
+def evaluate(
+    config: Config, envs: TrainingEnvs, ppo: GraspPPO, watch: Stopwatch, step: int
+) -> ProgressRow:
     """Deterministic episodes on seeds that stay the same and that no training episode has."""
     processes = ppo.team
     seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)

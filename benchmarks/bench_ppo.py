@@ -3,7 +3,7 @@
 Same environments and number of them, same network and hyper-parameters, no normalising; every seed
 of both in a process of its own, one after the other and in turn. The final return is the mean over
 deterministic episodes of the last policy, from seeds that both are given. How fast the environments
-are with nobody learning bounds what any trainer can reach.
+are without any learning bounds what any trainer can reach.
 """
 
 from __future__ import annotations
@@ -115,7 +115,8 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
         Metric(f"{env}_speed_vs_sb3", float(np.median(rate["ours"] / rate["sb3"])), "x",
                at_least=1.3),
         Metric(f"{env}_steps_per_second", float(np.median(rate["ours"])), "1/s"),
-        Metric(f"{env}_steps_per_second_untrained", in_own_process(env, "nobody", 0, steps), "1/s"),
+        Metric(f"{env}_steps_per_second_untrained",
+               in_own_process(env, "untrained", 0, steps), "1/s"),
         Metric(f"{env}_cpu_vs_sb3", float(np.median(cpu["ours"] / cpu["sb3"])), "x"),
         Metric(f"{env}_memory", megabytes["ours"], "MB"),
         Metric(f"{env}_memory_vs_sb3", megabytes["ours"] / megabytes["sb3"], "x"),
@@ -253,7 +254,7 @@ def step_only(env: str, seed: int, steps: int) -> float:
 
 TRAIN = {"ours": train_ours, "sb3": train_sb3}
 RUN = {who: lambda *task, train=train: vars(train(*task)) for who, train in TRAIN.items()}
-RUN["nobody"] = step_only
+RUN["untrained"] = step_only
 
 
 if __name__ == "__main__":

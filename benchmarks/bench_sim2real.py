@@ -23,7 +23,7 @@ from utils.adaptation import (
     TARGET,
     AdaptationSettings,
     DomainAdaptationNetwork,
-    predict,
+    outputs_of,
     train_domain_adaptation,
 )
 from utils.config import Config, load_config, run_script
@@ -121,7 +121,7 @@ def bench_digits(
 ) -> list[Metric]:
     """Mean accuracies over seeds on images that no training saw, in percent.
 
-    source_only uses the source's batch-norm statistics, as somebody who has never seen the target
+    source_only uses the source's batch-norm statistics, as a user without target images
     would have to; own_norms is the same weights with the target's (Li et al. 2016); dann adds the
     adversary. A gain is promised where source_only loses 20 points or more.
     """
@@ -170,7 +170,7 @@ def digits_run(
 
 
 def _right(network, images: torch.Tensor, labels: torch.Tensor, domain: int) -> float:
-    return float((predict(network, images, domain).task.argmax(1) == labels).double().mean())
+    return float((outputs_of(network, images, domain).task.argmax(1) == labels).double().mean())
 
 
 if __name__ == "__main__":

@@ -232,7 +232,7 @@ class GuidedApproach:
             self.loop.record.stage = "near"
             self.loop.record.seconds.append(now)
             self.loop.record.errors.append(step.correction)
-            if self._may_commit(off, step.correction):
+            if self._may_commit(off):
                 return self._pose_at_goal(T_WE, step.correction)
         self.desired = self._joint_velocities(q, T_WE, step.velocity, law, sink)
         if new:
@@ -320,7 +320,7 @@ class GuidedApproach:
         self.height = max(min(self.height, height) - speed * dt, self.lowest)
         return self.height, speed
 
-    def _may_commit(self, off: tuple[float, float, float], correction: np.ndarray) -> bool:
+    def _may_commit(self, off: tuple[float, float, float]) -> bool:
         distance, height, turn = off
         settings = self.settings
         return bool(

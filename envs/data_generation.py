@@ -184,7 +184,7 @@ def _make_shard(folder: Path, split: str, number: int) -> int:
     first = number * SCENES_PER_SHARD
     for scene_number in range(first, first + SCENES_PER_SHARD):
         seed = _FIRST_SEED[split] + scene_number
-        scene, name = draw_scene(_worker_config, split, seed, _worker_sets, _worker_cell)
+        scene, name = draw_scene(_worker_config, split, seed, _worker_sets)
         for frame, more_trials in label_scene(_worker_config, scene, name, _worker_cell):
             frames.append(frame)
             trials += more_trials
@@ -212,11 +212,7 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
 
 
 def draw_scene(
-    config: Config,
-    split: str,
-    seed: int,
-    sets: dict[tuple[str, str], ObjectSet],
-    cell: PybulletCell,
+    config: Config, split: str, seed: int, sets: dict[tuple[str, str], ObjectSet]
 ) -> tuple[Scene, str]:
     """A scene of random layout, object set and number of objects, and the name of its set.
 
@@ -307,7 +303,7 @@ def execute_pairs(
         cell.load(scene)
         try:
             success = execute_grasp(cell, grasp).success
-        except PhysicsError:  # the next pair's scene is a new world
+        except PhysicsError:  # the next pair loads its scene into a rebuilt cell
             success = False
         trials.append(Trial(quality, weight, success))
     return trials

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
-HAND, GRASP_TARGET = "panda_hand", "panda_grasptarget"
-_HAND_LINKS = ("panda_link7", "panda_link8", HAND)  # one link in PyBullet's cell
+HAND_LINK = "panda_hand"
+_HAND_LINKS = ("panda_link7", "panda_link8", HAND_LINK)  # one link in PyBullet's cell
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
 
 
@@ -137,7 +137,7 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     _servo(mujoco, spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, (
         _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
     ), FINGER_FORCE, [0.0, gripper.max_opening])  # fmt: skip
-    for one, other in (("panda_link7", HAND), ("panda_link5", "panda_link7")):
+    for one, other in (("panda_link7", HAND_LINK), ("panda_link5", "panda_link7")):
         exclude = spec.add_exclude()
         exclude.bodyname1, exclude.bodyname2 = one, other
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

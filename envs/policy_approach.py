@@ -28,7 +28,7 @@ from utils.transforms import Grasp, RGBDFrame
 
 KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
-SCENARIOS = ("isolated", "static")  # one object, which stays where it is
+LEARNED_SCENARIOS = ("isolated", "static")  # one object, which stays where it is
 LEARNED = ("ppo", "sb3")  # the word before the colon, followed by a file
 SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"
 
@@ -120,11 +120,11 @@ def check_learned(
     else:
         _check_knowledge(name, policy)
     for scenario in scenarios:
-        if scenario not in SCENARIOS:
+        if scenario not in LEARNED_SCENARIOS:
             raise UserError(
                 f"evaluate.policies: {name} takes one object that stays where it is, so that it "
                 f"cannot play {scenario!r}; allowed with it are evaluate.scenarios="
-                f"{','.join(SCENARIOS)}"
+                f"{','.join(LEARNED_SCENARIOS)}"
             )
     if any(controller != OPEN_LOOP for controller in controllers):
         raise UserError(

@@ -77,16 +77,16 @@ def displaced(T: np.ndarray, rng: np.random.Generator, distance: float, angle: f
     return wrong
 
 
-def level(frame: RGBDFrame, table: float = 0.0) -> RGBDFrame:
-    """The frame with its camera turned in place and lifted, so that its table is level at z =
-    `table`. Horizontal position and heading keep their errors. Without this a planner finds the
-    table two centimetres in the air and plans nothing."""
-    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), table)
+def level(frame: RGBDFrame) -> RGBDFrame:
+    """The frame with its camera turned in place and lifted, so that its table is level at z = 0.
+    Horizontal position and heading keep their errors. Without this a planner finds the table two
+    centimetres in the air and plans nothing."""
+    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), 0.0)
     up = frame.T_WC[:3, :3] @ normal
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
     T_WC = frame.T_WC.copy()
     T_WC[:3, :3] = turn.as_matrix() @ T_WC[:3, :3]
-    T_WC[2, 3] = table + offset
+    T_WC[2, 3] = offset
     return replace(frame, T_WC=T_WC)
 
 

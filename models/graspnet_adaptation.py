@@ -24,7 +24,7 @@ from torch.utils.data import Dataset
 
 from models.graspnet import DEPTH_UNIT, GraspNet, to_input
 from models.graspnet_data import Example, TrainingData
-from models.graspnet_scores import predict
+from models.graspnet_scores import predicted_maps
 from models.graspnet_training import Trainer
 from models.photographs import K, frame_of, from_above
 from models.rectangle_examples import RectangleImages
@@ -331,7 +331,7 @@ def grasp_information(model: GraspNet, images: LabelledImages) -> float:
     model.eval()
     predicted = []
     for index in range(len(images)):
-        quality, angle, _ = predict(model, images[index])
+        quality, angle, _ = predicted_maps(model, images[index])
         rows, columns = (
             slice(round((0.5 - MIDDLE) * n), round((0.5 + MIDDLE) * n), INFORMATION_STEP)
             for n in quality.shape[2:]

@@ -25,7 +25,7 @@ from utils.transforms import angle_difference, known_depth
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-BEST = PeakSettings(threshold=0.0, count=1)  # the highest peak
+_BEST_PEAK = PeakSettings(threshold=0.0, count=1)  # the highest peak
 DRAWN = PeakSettings(threshold=0.3, count=5)  # the peaks in a picture
 NO_CURVES = ("epoch", "step", "images")  # entries of a history row that are no curves
 # Where each entry of a history row comes from, and its unit; "" has none.
@@ -82,7 +82,7 @@ def shows_a_grasp(image: LabelledImage) -> bool:
 
 
 @torch.inference_mode()
-def predict(
+def predicted_maps(
     model: GraspNet, image: LabelledImage, centres: bool = False
 ) -> tuple[torch.Tensor, ...]:
     """Return the network's maps (1, C, H, W) of one labelled image."""
@@ -99,7 +99,7 @@ def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
     for index in range(len(images)):
         image = images[index]
         if shows_a_grasp(image):
-            found = find_peaks(*predict(model, image), BEST)
+            found = find_peaks(*predicted_maps(model, image), _BEST_PEAK)
             rows.append(score_peak(found, image))
     if not rows:
         return LabelScores(0.0, 0.0, np.pi / 2, float("nan"), float("nan"), 0)
@@ -138,7 +138,7 @@ def centre_error(model: GraspNet, images: LabelledImages) -> float:
     for image in (images[index] for index in range(len(images))):
         on_object = image.centre.isfinite().all(dim=0)
         if on_object.any():
-            *_, offset = predict(model, image, centres=True)
+            *_, offset = predicted_maps(model, image, centres=True)
             wrong = offset[0].cpu() - offset_to(image.centre)
             errors.append(float(torch.linalg.norm(wrong[:, on_object], dim=0).median()))
     return float(np.mean(errors))
@@ -208,7 +208,7 @@ def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count:
     model.eval()
     for row, index in zip(axes, chosen):
         image = images[int(index)]
-        quality, angle, width = predict(model, image)
+        quality, angle, width = predicted_maps(model, image)
         depth = image.depth.numpy()
         row[0].imshow(image.rgb.permute(1, 2, 0))
         known = depth[known_depth(depth)]

@@ -368,7 +368,7 @@ def measure(
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
-    near, opening, blind = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
+    near, opening, covered = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
     opening[left_over] = _widest_opening(
         heights.highest_around("height", 1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
         near[left_over], tip[left_over], width[left_over], gripper, settings,
@@ -378,14 +378,14 @@ def measure(
     left_over = left_over[gap >= settings.clearance - tip[left_over]]
     under = gripper.finger_underside(near[left_over] - opening[left_over, None] / 2)
     over = heights.ceiling.take(where[left_over]) - under[:, None]
-    blind[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
+    covered[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
 
     score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
     score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
     score *= 0.4 + 0.6 * cover
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
-    score *= np.exp(-4 * blind)
+    score *= np.exp(-4 * covered)
     score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
     score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # prefers the top of a pile
     feasible = np.zeros(N, bool)

@@ -19,7 +19,7 @@ from models.ppo_rollouts import SIMULATION, Episode
 from utils.config_schema import Config, RLConfig
 from utils.runs import Stopwatch, save_results
 
-Row = dict[str, Any]
+ProgressRow = dict[str, Any]
 
 # Curves whose unit is not evident from their name.
 UNITS = {
@@ -43,12 +43,12 @@ def summary(episodes: Sequence[Episode]) -> dict[str, float]:
     return means | ({"success": float(np.mean(reported))} if reported else {})
 
 
-def score(row: Row) -> tuple[float, float]:
+def score(row: ProgressRow) -> tuple[float, float]:
     """What the best evaluation is chosen by: success first, where it is reported, then return."""
     return row.get("success", 0.0), row["return"]
 
 
-def reached(settings: RLConfig, row: Row) -> bool:
+def reached(settings: RLConfig, row: ProgressRow) -> bool:
     """Whether an evaluation meets one of the targets of the config's section `rl`."""
     success, total = settings.target_success, settings.target_return
     return (success is not None and row.get("success", 0.0) >= success) or (
@@ -82,7 +82,7 @@ class Curves:
 
 
 def save_evaluation(
-    run: Path, config: Config, ppo: GraspPPO, history: list[Row], curves: Curves
+    run: Path, config: Config, ppo: GraspPPO, history: list[ProgressRow], curves: Curves
 ) -> None:
     """Write last.pt, best.pt if the last row of the history is the best, and its curves."""
     if ppo.team.is_main:
@@ -96,12 +96,12 @@ def save_evaluation(
     ppo.team.wait()
 
 
-def load_progress(ppo: GraspPPO, last: Path) -> list[Row]:
+def load_progress(ppo: GraspPPO, last: Path) -> list[ProgressRow]:
     """Continue from a checkpoint, if there is one; returns the history so far."""
     return ppo.load(last)["history"] if last.is_file() else []
 
 
-def save_training(run: Path, history: list[Row], weights: Path | None) -> Row:
+def save_training(run: Path, history: list[ProgressRow], weights: Path | None) -> ProgressRow:
     """Write results.json, and the best policy alone to `weights`; returns the best evaluation."""
     if weights is not None:
         save_policy(weights, load_policy(run / "best.pt"))
@@ -110,7 +110,7 @@ def save_training(run: Path, history: list[Row], weights: Path | None) -> Row:
     return best
 
 
-def row_in_words(row: Row) -> str:
+def row_in_words(row: ProgressRow) -> str:
     return ", ".join(f"{name} {value:.6g}" for name, value in row.items())
 
 

@@ -28,7 +28,7 @@ from utils.runs import save_figure
 from utils.transforms import angle_difference
 
 ANYWHERE = 0.5  # of the examples show any part of the view: its corners hold nothing to grasp
-BEST = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
+HIGHEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
 COLUMNS = 5  # of a picture's grid
 SHOWN = 60  # images in a picture at most; of more images, some evenly spread ones
 MARGIN = 40  # pixels around all rectangles
@@ -170,7 +170,7 @@ def best_rectangle(
     rgb, depth, _ = view.warp(sample)
     device = next(model.parameters()).device
     x = to_input(rgb, depth)[None].to(device, memory_format=torch.channels_last)
-    found = find_peaks(*model(x), BEST)
+    found = find_peaks(*model(x), HIGHEST_PEAK)
     zoom = view.size / view.side
     opening = max(float(found.width[0]) / view.metres_per_pixel, 1e-3)
     there = GraspRectangle(found.pixel[0], float(found.angle[0]), opening, plate_length * zoom)

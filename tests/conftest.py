@@ -52,3 +52,39 @@ def taught_cell(request, config: Config):
     with SIMULATORS[request.param](config) as cell:
         teach(cell)  # empties the cell, the first time
         yield cell
+
+
+@pytest.fixture(scope="module")
+def scene(config: Config, box_set):
+    """The isolated scene of one box."""
+    from envs.cell_scenes import make_scene
+
+    return make_scene("isolated", box_set, 0, config)
+
+
+@pytest.fixture
+def cell(taught_cell, scene):
+    """The cell of either simulator with the scene of one box, loaded; modules that need another
+    cell define their own."""
+    taught_cell.load(scene)
+    return taught_cell
+
+
+@pytest.fixture(scope="module")
+def cells(config: Config):
+    """A PyBullet cell and a MuJoCo cell."""
+    pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
+    from envs.simulators import SIMULATORS
+
+    with SIMULATORS["pybullet"](config) as bullet, SIMULATORS["mujoco"](config) as mujoco:
+        yield bullet, mujoco
+
+
+@pytest.fixture(scope="module")
+def pile(config: Config):
+    """A pile of random_urdfs."""
+    from envs.cell_scenes import make_scene
+    from envs.objects import load_object_set
+
+    objects = load_object_set("random_urdfs", cache_dir=config.cache_folder)
+    return make_scene("pile", objects, 2, config)

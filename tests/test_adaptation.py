@@ -19,8 +19,8 @@ from utils.adaptation import (
     DomainBatchNorm,
     choose_check,
     mutual_information,
+    outputs_of,
     per_domain_norms,
-    predict,
     reversal_weight,
     reverse_gradient,
     select_domain,
@@ -176,12 +176,12 @@ def test_training_undoes_a_shift(blobs):
     source, (images, labels) = blobs
     network = blob_network()
     history = train_domain_adaptation(source, images, network, QUICK)
-    right = float((predict(network, images).task.argmax(1) == labels).double().mean())
+    right = float((outputs_of(network, images).task.argmax(1) == labels).double().mean())
     plain = blob_network()
     train_domain_adaptation(
         source, images, plain, AdaptationSettings(steps=150, batch_size=32, adversarial=0)
     )
-    alone = float((predict(plain, images, SOURCE).task.argmax(1) == labels).double().mean())
+    alone = float((outputs_of(plain, images, SOURCE).task.argmax(1) == labels).double().mean())
     assert alone < 0.7 and right > alone + 0.2
     assert [check.step for check in history.checks] == [30, 60, 90, 120, 150]
     assert history.chosen in history.checks and not network.training
@@ -193,7 +193,7 @@ def test_training_is_repeatable_and_leaves_the_best_weights(blobs):
     for _ in range(2):
         network = blob_network()
         history = train_domain_adaptation(source, images, network, QUICK, on_check=seen.append)
-        results.append(predict(network, images).task)
+        results.append(outputs_of(network, images).task)
     assert torch.equal(results[0], results[1])
     assert seen[:5] == seen[5:] == history.checks
 
@@ -228,11 +228,11 @@ def test_dense_tasks_have_their_own_loss():
         (images, labels), torch.randn(40, 3, 8, 8), network, short,
         task_loss=F.cross_entropy, source_score=lambda out, labels: -F.cross_entropy(out, labels),
     )  # fmt: skip
-    assert predict(network, images).task.shape == (40, 2, 8, 8)
+    assert outputs_of(network, images).task.shape == (40, 2, 8, 8)
     assert all(check.source_score < 0 for check in history.checks)
 
 
-def test_wrong_settings_and_data_are_told():
+def test_wrong_settings_and_data_are_refused():
     network = blob_network()
     few = torch.randn(20, 3, 1, 1)
     with pytest.raises(UserError, match="the source has 20 images, too few for batches of 64"):

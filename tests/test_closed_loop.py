@@ -11,7 +11,6 @@ import pytest
 
 import evaluate
 from envs import closed_loop_tracker
-from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
@@ -20,28 +19,11 @@ from envs.robot_kinematics import forward_kinematics, geometric_jacobian
 from envs.rounds import run_round
 from envs.scenarios import teach, true_calibration, wrong_calibration
 from envs.servo_arm import ServoArm
-from tests.helpers.box_rounds import grasp_of_box, round_with_a_box
+from tests.helpers.box_rounds import grasp_of_box, loop, round_with_a_box
 from utils.config import load_config
 
 IN_PYBULLET = pytest.mark.parametrize("taught_cell", ["pybullet"], indirect=True, scope="module")
 CLOSED = ("pbvs", "ibvs", "hybrid")
-
-
-@pytest.fixture(scope="module")
-def scene(config, box_set):
-    return make_scene("isolated", box_set, 0, config)
-
-
-@pytest.fixture
-def cell(taught_cell, scene):
-    """The cell of either simulator with the scene of one box, loaded."""
-    taught_cell.load(scene)
-    return taught_cell
-
-
-def loop(cell, controller, latency=0.0, camera=None):
-    calibration = true_calibration(cell)
-    return ClosedLoop(cell, controller, cell.frame(), calibration, teach(cell), latency, camera)
 
 
 @pytest.mark.parametrize("controller", CLOSED)

@@ -3,33 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from envs.cell_scenes import make_scene
-from envs.closed_loop import ClosedLoop, GuidedApproach
+from envs.closed_loop import GuidedApproach
 from envs.closed_loop_tracker import WristCamera
-from envs.scenarios import teach, true_calibration
 from envs.servo_arm import ServoArm
-from tests.helpers.box_rounds import grasp_of_box
+from tests.helpers.box_rounds import grasp_of_box, loop
 from utils.config import load_config
 from utils.transforms import planar_part
-
-
-@pytest.fixture(scope="module")
-def scene(config, box_set):
-    return make_scene("isolated", box_set, 0, config)
-
-
-@pytest.fixture
-def cell(taught_cell, scene):
-    """The cell of either simulator with the scene of one box, loaded."""
-    taught_cell.load(scene)
-    return taught_cell
-
-
-def loop(cell, controller, latency=0.0, camera=None):
-    calibration = true_calibration(cell)
-    return ClosedLoop(cell, controller, cell.frame(), calibration, teach(cell), latency, camera)
 
 
 def test_images_arrive_late(cell):

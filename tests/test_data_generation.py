@@ -142,17 +142,14 @@ def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch
     assert len(begun) < 5
 
 
-def test_scenes_that_cannot_be_made_are_told(config, monkeypatch):
+def test_scenes_that_cannot_be_made_are_refused(config, monkeypatch):
     def none(*_):
         raise SceneError("too many")
 
     monkeypatch.setattr(data_generation, "make_scene", none)
     given = load_config(None, ["data.object_sets=primitives"])
-    with (
-        PybulletCell(config) as cell,
-        pytest.raises(UserError, match="none of 100 .*data.max_objects"),
-    ):
-        draw_scene(given, "train", 1, object_sets(given), cell)
+    with pytest.raises(UserError, match="none of 100 .*data.max_objects"):
+        draw_scene(given, "train", 1, object_sets(given))
 
 
 def test_generated_frames_are_whole(tiny_data):
@@ -199,13 +196,12 @@ def test_validation_keeps_every_tenth_training_object_and_no_test_object(config)
         ("primitives", "validation"): 90,
         ("primitives", "train"): 810,
     }
-    with PybulletCell(config) as cell:
-        for split, kept in (("train", False), ("validation", True)):
-            for seed in range(4):
-                scene, _ = draw_scene(given, split, seed, parts, cell)
-                for placed in scene.placements:
-                    number = int(placed.model.name[-4:])  # 900 and above are for testing
-                    assert number < 900 and (number % 10 == 0) is kept
+    for split, kept in (("train", False), ("validation", True)):
+        for seed in range(4):
+            scene, _ = draw_scene(given, split, seed, parts)
+            for placed in scene.placements:
+                number = int(placed.model.name[-4:])  # 900 and above are for testing
+                assert number < 900 and (number % 10 == 0) is kept
 
 
 # --- Appearance and physics ------------------------------------------------------------------
@@ -215,7 +211,7 @@ def test_validation_keeps_every_tenth_training_object_and_no_test_object(config)
 def cell_with_scene(tiny_data):
     config = load_config(None, tiny_data[1])
     with PybulletCell(config) as cell:
-        scene, _ = draw_scene(config, "train", 3, object_sets(config), cell)
+        scene, _ = draw_scene(config, "train", 3, object_sets(config))
         cell.load(scene)
         yield cell, scene
 

@@ -180,7 +180,7 @@ def test_samples_of_another_scene_or_version_are_refused(cell):
         randomizer.replay(sample | {"textures": sample["textures"][:2]})
 
 
-def test_the_sample_tells_every_parameter(cell):
+def test_the_sample_holds_every_parameter(cell):
     sample = randomizer_of(cell).randomize(3)
     assert set(sample["physics"]) == set(PHYSICS) and set(sample["vision"]) == set(VISION)
     assert len(sample["physics"]["object_mass"][1]) == 5  # one for each object

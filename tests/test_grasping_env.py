@@ -516,7 +516,7 @@ def test_moves_along_the_axes_of_the_hand(make):
     assert math.atan2(way[1], way[0]) == pytest.approx(-0.3, abs=0.03), "x turns with the hand"
 
 
-def test_the_gripper_can_be_told_changes(make):
+def test_the_gripper_accepts_changes(make):
     env = make(control="ee_planar", gripper="change", gripper_step=0.01)
     _, info = env.reset(seed=0)
     np.testing.assert_allclose(info["gripper"], 0.08, atol=1e-3)

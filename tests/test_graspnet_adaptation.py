@@ -234,7 +234,7 @@ def rewrite_depths(folder: Path, change) -> None:
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory) -> Path:
-    """Six pairs in Cornell's names whose labels nobody could read."""
+    """Six pairs in Cornell's names whose labels cannot be read."""
     folder = write_cornell(tmp_path_factory.mktemp("target"), 6, shape=KINECT)
     rewrite_depths(folder, lambda depth: distances(depth, K))
     for labels in folder.glob("*.txt"):
@@ -490,7 +490,7 @@ def test_an_interrupted_adaptation_goes_on_bit_for_bit(finished, tmp_path, monke
         train_graspnet.main(["--resume", str(run), "adaptation.weight=0.5"])
 
 
-def test_mistakes_are_told_before_any_work(tiny_data, tmp_path, monkeypatch):
+def test_mistakes_are_refused_before_any_work(tiny_data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match="adaptation.target: no folder"):
         train_graspnet.main([*tiny_data[1], "adaptation.target=nowhere"])

@@ -110,7 +110,7 @@ def test_a_loss_that_is_no_number_changes_no_weight():
     assert same(moments, {k: v["exp_avg"] for k, v in after.items()})
 
 
-def test_checkpoints_that_do_not_fit_are_told(tmp_path, config):
+def test_checkpoints_that_do_not_fit_are_refused(tmp_path, config):
     trainer = trainer_of()
     save_graspnet(tmp_path / "graspnet.pt", trainer.model, 0.002)
     with pytest.raises(UserError, match="weights only"):

@@ -7,24 +7,8 @@ from scipy import ndimage
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Intrinsics
-from envs.cell_scenes import make_scene
 from envs.mujoco_camera import camera_of
-from envs.mujoco_cell import MujocoCell
-from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
 from utils.transforms import look_at
-
-
-@pytest.fixture(scope="module")
-def cells(config):
-    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
-        yield bullet, mujoco
-
-
-@pytest.fixture(scope="module")
-def pile(config):
-    objects = load_object_set("random_urdfs", cache_dir=config.cache_folder)
-    return make_scene("pile", objects, 2, config)
 
 
 def away_from_edges(depth: np.ndarray) -> np.ndarray:

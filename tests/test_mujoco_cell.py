@@ -12,25 +12,12 @@ from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from models.planners import make_planner
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import position_quaternion
-
-
-@pytest.fixture(scope="module")
-def cells(config):
-    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
-        yield bullet, mujoco
-
-
-@pytest.fixture(scope="module")
-def pile(config):
-    objects = load_object_set("random_urdfs", cache_dir=config.cache_folder)
-    return make_scene("pile", objects, 2, config)
 
 
 def test_settled_objects_stay_where_pybullet_has_them(cells, pile):

@@ -7,12 +7,14 @@ import pytest
 
 pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
-from envs.mujoco_panda import GRASP_TARGET, HAND, INERTIALS, MujocoPanda, panda_spec
+from envs.mujoco_panda import HAND_LINK, INERTIALS, MujocoPanda, panda_spec
 from envs.pybullet_files import FINGER_JOINTS
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
 from envs.robot_safety import ArmGate
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+
+GRASP_TARGET = "panda_grasptarget"  # the link at E
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def stock():
             pybullet.getLinkState(
                 body, links[name], computeForwardKinematics=True, physicsClientId=client
             )
-            for name in (HAND, GRASP_TARGET)
+            for name in (HAND_LINK, GRASP_TARGET)
         ]
         return [(np.array(s[4]), np.array(s[5])) for s in states]
 
@@ -53,7 +55,7 @@ def stock():
 
 def test_the_hand_where_franka_and_pybullet_have_it(panda):
     panda.place(READY)
-    np.testing.assert_allclose(panda.pose(HAND)[:3, 3], [0.306891, 0, 0.590282], atol=1e-6)
+    np.testing.assert_allclose(panda.pose(HAND_LINK)[:3, 3], [0.306891, 0, 0.590282], atol=1e-6)
     np.testing.assert_allclose(panda.pose(GRASP_TARGET)[:3, 3], [0.306891, 0, 0.485282], atol=1e-6)
 
 
@@ -61,7 +63,7 @@ def test_forward_kinematics_agree_with_pybullet_and_with_ours(panda, stock):
     rng = np.random.default_rng(0)
     for q in rng.uniform(JOINT_LOWER, JOINT_UPPER, (50, 7)):
         panda.place(q)
-        for name, (position, (x, y, z, w)) in zip((HAND, GRASP_TARGET), stock(q)):
+        for name, (position, (x, y, z, w)) in zip((HAND_LINK, GRASP_TARGET), stock(q)):
             T = panda.pose(name)
             np.testing.assert_allclose(T[:3, 3], position, atol=1e-6)
             quaternion = panda.data.body(name).xquat

@@ -150,7 +150,7 @@ def test_a_mesh_turned_inside_out_is_turned_back(tmp_path):
     assert load_mesh(tmp_path / "box.stl").volume == pytest.approx(1.0)
 
 
-def test_a_damaged_byte_anywhere_in_the_cache_is_told_or_harmless(tmp_path):
+def test_a_damaged_byte_anywhere_in_the_cache_is_refused_or_harmless(tmp_path):
     bracket = trimesh.util.concatenate(
         [trimesh.creation.box([1, 1, 4]), trimesh.creation.box([3, 1, 1])]
     )

@@ -5,7 +5,7 @@ import pytest
 
 from models import photographs
 from models.graspnet_io import SavedGraspNet
-from models.photographs import HAND, SHRUNK, WORKSPACE, frame_of, judge_photographs
+from models.photographs import PANDA_HAND, SHRUNK, WORKSPACE, frame_of, judge_photographs
 from models.planner_graspnet import GraspNetPlanner
 from tests.helpers.fixed_maps import FixedMaps
 from tests.helpers.photographs import BOX, T_WC, photographed
@@ -78,7 +78,7 @@ def test_a_network_s_best_pixel_becomes_a_grasp_of_the_photograph():
 
 
 def test_the_hand_opens_as_wide_as_the_tutorial_s_network_can_tell():
-    assert SHRUNK * HAND.max_opening == pytest.approx(0.15)
+    assert SHRUNK * PANDA_HAND.max_opening == pytest.approx(0.15)
 
 
 def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monkeypatch):
@@ -88,7 +88,9 @@ def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monke
     sample, _ = photographed(labels=(label,))
     network = SavedGraspNet(FixedMaps((285, 227), radius=0.5), 0.002, {}, {})
     monkeypatch.setattr(
-        photographs, "make_planner", lambda *_: GraspNetPlanner(HAND, WORKSPACE, network=network)
+        photographs,
+        "make_planner",
+        lambda *_: GraspNetPlanner(PANDA_HAND, WORKSPACE, network=network),
     )
     (found,) = photographs.judge_as_taken("network.pt", [sample], seed=0)
     right, down = 400 / 456 * (np.array([285, 227]) - 455 / 2)
@@ -97,7 +99,7 @@ def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monke
     assert found.rectangle.height == pytest.approx(found.rectangle.width / 2)
 
 
-def test_whoever_cannot_see_photographs_is_not_judged_by_them():
+def test_a_planner_that_cannot_see_photographs_is_not_judged_by_them():
     sample, _ = photographed()
     assert judge_photographs("oracle", [sample], seed=0) is None
     assert judge_photographs("heuristic", [], seed=0) == []

@@ -55,7 +55,7 @@ def test_operations():
         ("0,1", "low, high"),
     ],
 )
-def test_wrong_ranges_are_told(value, words):
+def test_wrong_ranges_are_refused(value, words):
     with pytest.raises(ConfigError, match=r"randomization.physics.gravity") as caught:
         load_config(None, [f"randomization.physics.gravity={value}"])
     assert words in str(caught.value)

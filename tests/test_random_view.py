@@ -57,7 +57,7 @@ def test_picture_factors(pictures):
     np.testing.assert_allclose(seen, expected)
 
 
-def test_wrong_textures_are_told(tmp_path):
+def test_wrong_textures_are_refused(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         TextureRandomizer(tmp_path / "none")
     with pytest.raises(UserError, match="no picture"):

@@ -42,9 +42,6 @@ def write_jacquard(folder: Path, grasps="10.5;8.0;-30.0;12.0;4.0\n", name=JACQUA
     depth = np.full((24, 32), 1.5, np.float32)
     depth[3, 4] = -1
     Image.fromarray(depth).save(folder / f"{name}_stereo_depth.tiff")
-    mask = np.zeros((24, 32), np.uint8)
-    mask[5:9, 10:20] = 255
-    Image.fromarray(mask).save(folder / f"{name}_mask.png")
     (folder / f"{name}_grasps.txt").write_text(grasps)
     return folder
 
@@ -180,7 +177,7 @@ def test_jacquard_sample(tmp_path):
     assert rectangle.centre == pytest.approx((10.5, 8))
     assert rectangle.angle == pytest.approx(np.radians(150))  # -30 degrees, modulo pi
     assert (rectangle.width, rectangle.height) == (12, 4)
-    assert sample.object_mask.sum() == 40 and sample.negatives == ()
+    assert sample.negatives == ()
     assert np.all(sample.depth == np.float32(1.2))
     assert np.all(JacquardDataset(tmp_path, "stereo")[0].depth == np.float32(1.5))  # hole filled
 

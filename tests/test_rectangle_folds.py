@@ -141,7 +141,7 @@ def test_root_has_to_be_named_and_there(tmp_path, monkeypatch):
     assert not (tmp_path / "runs").exists()
 
 
-def test_half_a_file_is_told_by_its_name(tmp_path, monkeypatch):
+def test_half_a_file_is_refused_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     root = write_cornell(tmp_path / "cornell", 10)
     picture = root / "pcd0103r.png"

@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.cell import wrist_mount
 from envs.cell_layout import GRAVITY
-from envs.cell_scenes import make_scene
 from envs.mujoco_cell import MujocoCell
-from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import inverse_kinematics
 from envs.scenarios import (
     SCENARIOS,
@@ -29,26 +27,6 @@ from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, top_down_pose
 
 IN_MUJOCO = pytest.mark.parametrize("taught_cell", ["mujoco"], indirect=True, scope="module")
-
-
-@pytest.fixture(scope="module")
-def scene(config, box_set):
-    return make_scene("isolated", box_set, 0, config)
-
-
-@pytest.fixture(scope="module")
-def cells(config):
-    """The cells of both simulators, to be compared."""
-    pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
-        yield bullet, mujoco
-
-
-@pytest.fixture
-def cell(taught_cell, scene):
-    """The cell of either simulator with the scene of one box, loaded."""
-    taught_cell.load(scene)
-    return taught_cell
 
 
 def turn_between(before, after) -> float:

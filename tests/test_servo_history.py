@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.servo_cases import CORNERS, LAW_NAMES, LAWS
-from utils.servo_history import compare
+from utils.servo_history import plot_histories
 from utils.servo_laws import PositionBasedVisualServo
 from utils.servo_loop import ServoView
 from utils.servo_reference import CAMERA, GOAL, SQUARE, START
@@ -80,7 +80,7 @@ def test_runs_are_compared_in_one_picture(tmp_path):
         f"gain {gain}": PositionBasedVisualServo(CAMERA, gain).simulate(SQUARE, START, GOAL)
         for gain in (1.0, 2.0)
     }
-    figure = compare(runs, tmp_path / "gains.png")
+    figure = plot_histories(runs, tmp_path / "gains.png")
     assert (tmp_path / "gains.png").stat().st_size > 20_000
     # The angle shrinks by 1 - gain dt a step.
     last = [line.get_ydata()[50] for line in figure.axes[1].get_lines()]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from utils.servo_features import interaction_matrix
-from utils.servo_reference import FOCAL, SQUARE, Row, main, rows
+from utils.servo_reference import FOCAL, SQUARE, KnownResult, known_results, main
 
 
 @pytest.fixture(scope="module")
-def table() -> dict[str, Row]:
-    return {row.name: row for row in rows()}
+def table() -> dict[str, KnownResult]:
+    return {row.name: row for row in known_results()}
 
 
 @pytest.mark.slow
@@ -21,7 +21,7 @@ def test_every_row_of_the_reference_table_holds(table):
 
 
 def test_a_row_can_fail():
-    assert not Row("", 1.2, 1.0, 0.1).holds
+    assert not KnownResult("", 1.2, 1.0, 0.1).holds
 
 
 @pytest.mark.slow
@@ -39,8 +39,8 @@ def test_noise_is_what_a_linear_filter_leaves(table):
 
 @pytest.mark.slow
 def test_demo_prints_the_table_and_draws(tmp_path, capsys, monkeypatch):
-    some = [Row("right", 1.0, 1.0, 0.01), Row("wrong", 2.0, 1.0, 0.01)]
-    monkeypatch.setattr("utils.servo_reference.rows", lambda: some)
+    some = [KnownResult("right", 1.0, 1.0, 0.01), KnownResult("wrong", 2.0, 1.0, 0.01)]
+    monkeypatch.setattr("utils.servo_reference.known_results", lambda: some)
     main(["--folder", str(tmp_path)])
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["right", "1", "1", "yes"]

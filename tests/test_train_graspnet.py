@@ -164,7 +164,9 @@ def test_another_config_is_not_resumed(finished, changes, message):
         train_graspnet.main(["--resume", str(finished[0]), *changes])
 
 
-def test_mistakes_are_told_before_a_run_folder_is_made(tiny_data, finished, tmp_path, monkeypatch):
+def test_mistakes_are_refused_before_a_run_folder_is_made(
+    tiny_data, finished, tmp_path, monkeypatch
+):
     run, _ = finished
     monkeypatch.chdir(tmp_path)
     empty = tmp_path / "empty"

@@ -69,7 +69,7 @@ def test_columns_agree_as_far_as_they_do(lines):
 
 
 def test_policies_are_compared_on_the_same_scenes_alone(lines):
-    """One more policy, on other scenes, has nobody to be compared with; two more have."""
+    """One more policy, on other scenes, has no policy to be compared with; two more have."""
 
     def boxes(name, *rates):
         scores = {column: Score(n, 100) for column, n in zip(("pybullet", "mujoco"), rates)}

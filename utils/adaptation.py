@@ -351,7 +351,7 @@ def mutual_information(logits: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def predict(
+def outputs_of(
     model: DomainAdaptationNetwork, images: torch.Tensor, domain: int = TARGET, batch: int = 512
 ) -> Outputs:
     """Return the network's outputs in evaluation mode for images (N, ...) of one domain."""
@@ -367,7 +367,7 @@ def _check(
     target: torch.Tensor, score: Loss,
 ) -> Check:  # fmt: skip
     """Score the network on held-out images, labels and target images."""
-    on_source, on_target = predict(model, images, SOURCE), predict(model, target, TARGET)
+    on_source, on_target = outputs_of(model, images, SOURCE), outputs_of(model, target, TARGET)
     correct = torch.cat([on_source.domain <= 0, on_target.domain > 0]).double()
     # Both domains count alike, however many images are held out.
     sizes = len(on_source.domain), len(on_target.domain)

@@ -18,7 +18,7 @@ from torchvision import tv_tensors
 from torchvision.transforms.v2 import InterpolationMode
 from torchvision.transforms.v2 import functional as F
 
-DepthNoise = Callable[[torch.Tensor, np.random.Generator], torch.Tensor]
+TensorNoise = Callable[[torch.Tensor, np.random.Generator], torch.Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +227,7 @@ class Augmentation:
     scale: tuple[float, float] = (0.8, 1.25)
     mirror: float = 0.5
     colour: ColourJitter | None = ColourJitter()
-    depth_noise: DepthNoise | None = None
+    depth_noise: TensorNoise | None = None
 
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, int], zoom: float = 1.0

@@ -21,7 +21,7 @@ def no_repeats(values: tuple) -> tuple:
 
 
 class Arguments(dict):
-    """A mapping of any keys from YAML, hashable as all that a config holds; nobody changes it."""
+    """A mapping of any keys from YAML, hashable as all that a config holds; nothing changes it."""
 
     def __hash__(self) -> int:
         return hash(json.dumps(self, sort_keys=True, default=str))

@@ -1,10 +1,7 @@
-"""Errors that are the user's to fix, each one sentence.
+"""The errors that a user can repair, each a class, and the wording that several messages share.
 
-This module knows nothing about what went wrong; it only fixes how it is said.
-
-What can be wrong with a servo's input, each by its own name.
-
-A servo never answers bad input with a velocity, least of all a zero one that looks like success.
+`UserError` is the base. A visual servo raises one subclass for each fault of its input, and never
+returns a velocity for a faulty input: a zero velocity would be taken for success.
 """
 
 from __future__ import annotations
@@ -43,11 +40,11 @@ class CameraMatrixError(ServoError):
 
 
 class FeatureCountError(ServoError):
-    """Fewer than three points, or as many as on the other side are not there."""
+    """There are fewer than three points, or the current and desired points differ in number."""
 
 
 class TargetLostError(ServoError):
-    """What is servoed to, or so much of it that its place is unsure, is not in the image."""
+    """The image shows too little of the target to determine its pose."""
 
 
 class PointError(ServoError):
@@ -55,7 +52,7 @@ class PointError(ServoError):
 
 
 class CollinearPointsError(ServoError):
-    """All points lie on one line, so that the motion about it cannot be seen."""
+    """All points lie on one line, so that they do not determine the rotation about it."""
 
 
 class DepthError(ServoError):

@@ -116,7 +116,7 @@ class CornellDataset(RealDataset):
 
 
 class JacquardDataset(RealDataset):
-    """The Jacquard dataset: `<id>` + _RGB.png, _<kind>_depth.tiff, _grasps.txt, _mask.png.
+    """The Jacquard dataset: `<id>` + _RGB.png, _<kind>_depth.tiff, _grasps.txt.
 
     depth: "perfect" (rendered) or "stereo" (with a simulated sensor's holes). An id is
     `<view>_<object>`: the views of one object share its part after the first underscore.
@@ -127,12 +127,10 @@ class JacquardDataset(RealDataset):
             raise unknown_choice("data.depth", depth, ("perfect", "stereo"))
         root = existing_folder(root)
         self.depth_file = f"_{depth}_depth.tiff"
-        files = group_files(
-            root, r"(.+?)(_RGB\.png|_(?:perfect|stereo)_depth\.tiff|_grasps\.txt|_mask\.png)"
-        )
+        files = group_files(root, r"(.+?)(_RGB\.png|_(?:perfect|stereo)_depth\.tiff|_grasps\.txt)")
         if not files:
             raise UserError(f"{root}: no Jacquard files <id>_RGB.png found here or in subfolders")
-        check_complete(root, files, ("_RGB.png", self.depth_file, "_grasps.txt", "_mask.png"))
+        check_complete(root, files, ("_RGB.png", self.depth_file, "_grasps.txt"))
         super().__init__(
             root, [Record(n, n.split("_", 1)[-1], f) for n, f in sorted(files.items())]
         )
@@ -140,11 +138,7 @@ class JacquardDataset(RealDataset):
     def read(self, record: Record) -> RealSample:
         positives = _read_jacquard_rectangles(record.files["_grasps.txt"])
         rgb, depth = read_rgbd(record.files["_RGB.png"], record.files[self.depth_file])
-        mask_file = record.files["_mask.png"]
-        mask = np.asarray(open_image(mask_file).convert("L")) > 0
-        if mask.shape != depth.shape:
-            raise UserError(f"{mask_file}: {_size(mask)}, but the colour image is {_size(rgb)}")
-        return RealSample(record.name, record.object_id, rgb, depth, positives, object_mask=mask)
+        return RealSample(record.name, record.object_id, rgb, depth, positives)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ class RealSample:
     name: the image's id. object_id: images with the same id show the same object.
     rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis, holes filled.
     positives, negatives: rectangles in pixels of this image; Jacquard has no negatives.
-    object_mask: (H, W) bool, the object's pixels, or None where the format has none.
     skipped: rectangles left out because a corner is NaN.
     """
 
@@ -35,7 +34,6 @@ class RealSample:
     depth: np.ndarray
     positives: tuple[GraspRectangle, ...]
     negatives: tuple[GraspRectangle, ...] = ()
-    object_mask: np.ndarray | None = None
     skipped: int = 0
 
 

@@ -153,7 +153,7 @@ class ServoHistory:
         axes.legend(loc="upper left", fontsize="small")
 
 
-def compare(histories: Mapping[str, ServoHistory], path: Path | str | None = None) -> Figure:
+def plot_histories(histories: Mapping[str, ServoHistory], path: Path | str | None = None) -> Figure:
     """A figure that compares runs to one goal, each under its name: the distance and the angle
     between camera and goal, and both speeds, over time. Also written to `path`, unless None."""
     figure = Figure(figsize=(11, 6.5), layout="constrained")

@@ -16,7 +16,7 @@ import numpy as np
 
 from utils.errors import ServoError
 from utils.servo_control import AdaptiveGain
-from utils.servo_history import ServoHistory, compare
+from utils.servo_history import ServoHistory, plot_histories
 from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.transforms import rotation_exp
 
@@ -28,7 +28,7 @@ STEADY_AFTER = 200  # iterations, after which the initial error has decayed to 0
 GAINS = (0.5, 1.0, 2.0, AdaptiveGain())  # 1/s, of the comparison
 
 
-class Row(NamedTuple):
+class KnownResult(NamedTuple):
     """A measured figure and its reference; tolerance: allowed relative deviation."""
 
     name: str
@@ -99,49 +99,53 @@ def steady_noise(pixels: float, seeds: Sequence[int] = range(8)) -> tuple[float,
     return metres * 1e3, np.degrees(radians)
 
 
-def rows() -> Iterator[Row]:
-    """The rows of the reference table."""
+def known_results() -> Iterator[KnownResult]:
+    """The measured figures of the reference table."""
 
     def from_start(servo, **options) -> ServoHistory:
         return servo.simulate(SQUARE, START, GOAL, **options)
 
     history = from_start(ImageBasedVisualServo(CAMERA), max_iterations=150, tolerance=0)
     norms = history.error_norms
-    yield Row("error ratio after 150 iterations", norms[-1] / norms[0], 0.0490, 0.005)
+    yield KnownResult("error ratio after 150 iterations", norms[-1] / norms[0], 0.0490, 0.005)
     for interaction, reference in (("current", 534), ("desired", 554), ("mean", 546)):
         history = from_start(ImageBasedVisualServo(CAMERA, interaction=interaction))
-        yield Row(f"iterations, {interaction} L", history.iterations, reference, 0.01)
+        yield KnownResult(f"iterations, {interaction} L", history.iterations, reference, 0.01)
         if interaction == "current":
-            yield Row(
+            yield KnownResult(
                 "final position (mm), current L", history.pose_errors()[0][-1] * 1e3, 0.011, 0.05
             )
         if interaction == "desired":
             turn = np.degrees(history.pose_errors()[1][-1])
-            yield Row("final rotation (deg), desired L", turn, 0.0009, 0.06)
+            yield KnownResult("final rotation (deg), desired L", turn, 0.0009, 0.06)
     adaptive = ImageBasedVisualServo(CAMERA, AdaptiveGain())
-    yield Row("iterations, adaptive gain", from_start(adaptive).iterations, 132, 0.01)
+    yield KnownResult("iterations, adaptive gain", from_start(adaptive).iterations, 132, 0.01)
     smooth = ImageBasedVisualServo(CAMERA, AdaptiveGain(), smooth_start=4.0)
-    yield Row("iterations, adaptive gain, smooth start", from_start(smooth).iterations, 139, 0.01)
+    yield KnownResult(
+        "iterations, adaptive gain, smooth start", from_start(smooth).iterations, 139, 0.01
+    )
     for factor, reference in ((0.2, 2755), (0.5, 1117), (2, 544), (5, 547)):
         history = from_start(ImageBasedVisualServo(CAMERA), depth_factor=factor)
-        yield Row(f"iterations, depths x {factor}", history.iterations, reference, 0.01)
+        yield KnownResult(f"iterations, depths x {factor}", history.iterations, reference, 0.01)
     for pixels, millimetres, degrees in ((0.5, 1.7, 0.13), (1.0, 3.5, 0.26)):
         found = steady_noise(pixels)
-        yield Row(f"steady RMS (mm), noise {pixels} px", found[0], millimetres, 0.1)
-        yield Row(f"steady RMS (deg), noise {pixels} px", found[1], degrees, 0.1)
+        yield KnownResult(f"steady RMS (mm), noise {pixels} px", found[0], millimetres, 0.1)
+        yield KnownResult(f"steady RMS (deg), noise {pixels} px", found[1], degrees, 0.1)
     for degrees, reference in ((90, 0.42), (120, 1.03), (150, 2.98), (170, 11.6)):
         history = ImageBasedVisualServo(CAMERA).simulate(SQUARE, turned(degrees), FACING)
         retreat = history.poses[:, 2, 3].max() - 1.0
-        yield Row(f"retreat (m), current L, {degrees} deg", retreat, reference, 0.013)
+        yield KnownResult(f"retreat (m), current L, {degrees} deg", retreat, reference, 0.013)
     desired = ImageBasedVisualServo(CAMERA, interaction="desired")
     nearest = desired.simulate(SQUARE, turned(90), FACING).poses[:, 2, 3].min()
-    yield Row("nearest (m), desired L, 90 deg", nearest, 0.67, 0.0075)
+    yield KnownResult("nearest (m), desired L, 90 deg", nearest, 0.67, 0.0075)
     for name, servo in (
         ("position-based", PositionBasedVisualServo(CAMERA)),
         ("2 1/2-D", HybridVisualServo(CAMERA, scheme="2.5d")),
     ):
         history = servo.simulate(SQUARE, turned(180), FACING)
-        yield Row(f"iterations, {name}, 180 deg", iterations_to_tolerance(history), 566, 0.01)
+        yield KnownResult(
+            f"iterations, {name}, 180 deg", iterations_to_tolerance(history), 566, 0.01
+        )
 
 
 def gain_runs() -> dict[str, ServoHistory]:
@@ -166,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     folder = parser.parse_args(argv).folder
     print(f"{'what':40} {'value':>10} {'reference':>10}  holds")
-    for row in rows():
+    for row in known_results():
         holds = "yes" if row.holds else "NO"
         print(f"{row.name:40} {row.value:10.4g} {row.reference:10.4g}  {holds}", flush=True)
     print("\nturned by 180 degrees about the optical axis")
@@ -188,5 +192,5 @@ def main(argv: Sequence[str] | None = None) -> None:
         path = folder / f"{name}.png"
         servo.simulate(SQUARE, start, goal).plot(path, title=name.replace("_", " "))
         print(f"wrote {path}")
-    compare(gain_runs(), folder / "gains.png")
+    plot_histories(gain_runs(), folder / "gains.png")
     print(f"wrote {folder / 'gains.png'}")

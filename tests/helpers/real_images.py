@@ -51,7 +51,6 @@ def write_jacquard(folder: Path, objects: int = 3, views: int = 2, side: int = 1
             one, stem = sample(rectangle, (side, side)), folder / f"{view}_object{number}"
             Image.fromarray(one.rgb).save(f"{stem}_RGB.png")
             Image.fromarray(one.depth).save(f"{stem}_perfect_depth.tiff")
-            Image.fromarray((one.rgb[..., 0] < 100).astype(np.uint8) * 255).save(f"{stem}_mask.png")
             degrees = np.degrees(rectangle.angle)
             (folder / f"{stem.name}_grasps.txt").write_text(
                 f"{rectangle.centre[0]};{rectangle.centre[1]};{degrees};30;14\n"
