@@ -19,14 +19,14 @@ import numpy as np
 import torch
 
 from models.graspnet import to_input
-from models.graspnet_decoding import PANDA_HAND, find_peaks, surface_depth, surface_grasps
+from models.graspnet_decoding import find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
 from models.planner_antipodal import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth
 from models.rectangle_examples import HIGHEST_PEAK, Judged, best_rectangle, judged
 from utils.errors import UserError
-from utils.geometry import Workspace
+from utils.geometry import GripperGeometry, Workspace
 from utils.images import overhead_view
 from utils.real_data import FORMATS, existing_folder, open_real_data
 from utils.real_samples import RealSample, View
@@ -37,8 +37,9 @@ from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
 # A first Kinect's colour camera as its driver describes it where it was not calibrated.
 K = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
 SHAPE = (480, 640)  # rows and columns of its images
+HAND = GripperGeometry()
 OPENING = 0.15  # m, of the hand that photographs are judged for: the tutorial's widest
-SHRUNK = OPENING / PANDA_HAND.max_opening  # how many times smaller a photograph's world becomes
+SHRUNK = OPENING / HAND.max_opening  # how many times smaller a photograph's world becomes
 REACH = SearchSettings().reach  # m outside a workspace that the planners' search still grasps
 # With it planners reach 0.30 m of the shrunk world, as large a square as the cell's.
 WORKSPACE = Workspace((0.0, 0.0), 0.30 - 2 * REACH)
@@ -77,7 +78,7 @@ def judge_photographs(
     An entry is None where the planner finds no grasp. The result is None for a planner with an
     attribute `needs_truth` that is true: a photograph has no true scene.
     """
-    planned = make_planner(planner, PANDA_HAND, WORKSPACE, seed, "transfer.policies")
+    planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if needs_truth(planned):
         return None
     found: list[Judged | None] = []
@@ -99,7 +100,7 @@ def judge_as_taken(
     They are levelled and at the network's scale, but neither seen from above nor in a smaller
     world. Returns None for other planners, which need the camera's pose.
     """
-    planned = make_planner(planner, PANDA_HAND, WORKSPACE, seed, "transfer.policies")
+    planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if not isinstance(planned, GraspNetPlanner):
         return None
     model, view = planned.network.model.eval(), _as_taken(planned.network.metres_per_pixel)
@@ -144,7 +145,7 @@ def network_grasp(saved: SavedGraspNet, frame: RGBDFrame) -> Grasp:
     """Return the grasp at the best pixel of a network's view from above, on the surface there."""
     view = from_above(frame, saved.metres_per_pixel)
     maps = saved.model.eval()(to_input(view.rgb, view.depth)[None])
-    (grasp,) = surface_grasps(find_peaks(*maps, HIGHEST_PEAK), view.depth, PANDA_HAND)
+    (grasp,) = surface_grasps(find_peaks(*maps, HIGHEST_PEAK), view.depth, HAND)
     return image_to_grasp(grasp, view.K, view.T_WC)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from models import photographs
 from models.graspnet_io import SavedGraspNet
-from models.photographs import PANDA_HAND, SHRUNK, WORKSPACE, frame_of, judge_photographs
+from models.photographs import HAND, SHRUNK, WORKSPACE, frame_of, judge_photographs
 from models.planner_graspnet import GraspNetPlanner
 from tests.helpers.fixed_maps import FixedMaps
 from tests.helpers.photographs import BOX, T_WC, photographed
@@ -78,7 +78,7 @@ def test_a_network_s_best_pixel_becomes_a_grasp_of_the_photograph():
 
 
 def test_the_hand_opens_as_wide_as_the_tutorial_s_network_can_tell():
-    assert SHRUNK * PANDA_HAND.max_opening == pytest.approx(0.15)
+    assert SHRUNK * HAND.max_opening == pytest.approx(0.15)
 
 
 def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monkeypatch):
@@ -90,7 +90,7 @@ def test_as_taken_a_network_s_best_pixel_lies_on_the_photograph_s_own_grid(monke
     monkeypatch.setattr(
         photographs,
         "make_planner",
-        lambda *_: GraspNetPlanner(PANDA_HAND, WORKSPACE, network=network),
+        lambda *_: GraspNetPlanner(HAND, WORKSPACE, network=network),
     )
     (found,) = photographs.judge_as_taken("network.pt", [sample], seed=0)
     right, down = 400 / 456 * (np.array([285, 227]) - 455 / 2)
