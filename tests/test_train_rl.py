@@ -149,16 +149,17 @@ def test_the_estimator_learns_where_the_goal_is(tmp_path, monkeypatch):
 
 def test_pretraining_teaches_the_estimator_before_anything_is_done(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    settings = [*POINT, *ESTIMATED, "rl.total_steps=32", "rl.pretraining_images=2000",
-                "rl.estimate_memory=500", "rl.estimate_epochs=8"]  # fmt: skip
+    settings = [*POINT, *ESTIMATED, "rl.total_steps=128", "rl.rollout_steps=64",
+                "rl.hidden_dim=32", "rl.pretraining_images=4000", "rl.estimate_memory=500",
+                "rl.estimate_epochs=8"]  # fmt: skip
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     losses = events.Scalars("pretraining/estimate_loss")
-    assert [event.step for event in losses] == list(range(-1984, 1, 64)), "whole turns of 2 x 32"
+    assert [event.step for event in losses] == list(range(-3968, 1, 64)), "whole turns of 2 x 32"
     assert losses[-1].value < losses[0].value / 2, "of images not learned from yet"
     first = events.Scalars("update/estimate_loss")[0].value
-    assert first < 0.75 * losses[0].value, "what was learned is not lost"
+    assert first < losses[0].value / 2, "what was learned is not lost"
 
 
 def test_pretraining_without_anything_to_estimate_is_refused():
