@@ -61,7 +61,7 @@ class PybulletCell(Cell):
         # takes about 8 ms and leaks nothing.
         set_up_physics(self.client, self.config.sim)
         self.table = add_table(self.client)
-        add_bin(self.client)
+        self.bin = add_bin(self.client)
         self.robot = PybulletPanda(
             self.client, self.dt, self._urdf, self.gripper, self.config.robot.grip_force,
             self._new_gate(),
