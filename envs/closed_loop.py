@@ -46,7 +46,6 @@ from utils.errors import CollinearPointsError, FeatureCountError, ServoError, Ta
 from utils.result_records import OPEN_LOOP
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
-from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.servo_loop import ServoView, VisualServo
 from utils.transforms import (
     Grasp,
@@ -57,6 +56,7 @@ from utils.transforms import (
     top_down_pose,
     transform_points,
 )
+from utils.visual_servo import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 
 # By controller: the visual servo of the near stage, and its own arguments. A new entry is a new
 # name for `closed_loop.controller`.

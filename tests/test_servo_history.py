@@ -7,10 +7,10 @@ import pytest
 
 from tests.helpers.servo_cases import CORNERS, LAW_NAMES, LAWS
 from utils.servo_history import plot_histories
-from utils.servo_laws import PositionBasedVisualServo
 from utils.servo_loop import ServoView
 from utils.servo_reference import CAMERA, GOAL, SQUARE, START
 from utils.transforms import pose_exp
+from utils.visual_servo import PositionBasedVisualServo
 
 
 @pytest.mark.parametrize("servo", LAWS, ids=LAW_NAMES)

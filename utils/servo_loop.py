@@ -1,7 +1,7 @@
 """The loop that every visual servo shares: from a view to a twist, until the camera sees its goal.
 
 A control law is a subclass of `VisualServo` that says which displacement of the camera would null
-the error (`utils.servo_laws`). Everything else stands here: gain, smooth start, limits, the loop
+the error (`utils.visual_servo`). Everything else stands here: gain, smooth start, limits, the loop
 around any camera and any robot, and an ideal camera to try a law on. Knows no simulator.
 """
 

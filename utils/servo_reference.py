@@ -17,8 +17,8 @@ import numpy as np
 from utils.errors import ServoError
 from utils.servo_control import AdaptiveGain
 from utils.servo_history import ServoHistory, plot_histories
-from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.transforms import rotation_exp
+from utils.visual_servo import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 
 SQUARE = 0.1 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])  # metres in O
 FOCAL = 840.0  # pixels

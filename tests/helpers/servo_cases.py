@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from utils.servo_laws import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 from utils.servo_reference import CAMERA
+from utils.visual_servo import HybridVisualServo, ImageBasedVisualServo, PositionBasedVisualServo
 
 CORNERS = np.array([[220.0, 140], [420, 140], [420, 340], [220, 340]])  # pixels, a square
 LAWS = (
