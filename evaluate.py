@@ -38,7 +38,7 @@ from envs.transfer_scenes import (
     score_photographs,
 )
 from models.photographs import photographs
-from utils.config import Config, load_config, parse_args, run_script
+from utils.config import Config, load_config
 from utils.errors import UserError
 from utils.evaluation import (
     FREE_TO_CHANGE,
@@ -67,6 +67,8 @@ from utils.runs import (
     check_writable,
     environment,
     new_run_folder,
+    parse_args,
+    run_script,
     save_results,
     write_atomic,
 )

@@ -38,11 +38,10 @@ import numpy as np
 from models.graspnet import check_rgbd
 from models.graspnet_inference import PredictedGrasp, Prediction, predict, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
-from utils.config import run_script
 from utils.errors import UserError
 from utils.image_overlay import is_prediction_panel, prediction_panel
 from utils.images import read_depth, read_intrinsics, read_pose, read_rgb
-from utils.runs import write_atomic
+from utils.runs import run_script, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
 

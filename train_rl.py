@@ -58,10 +58,17 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
-from utils.config import Config, parse_args, run_script
+from utils.config import Config
 from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
-from utils.runs import Stopwatch, check_resume, check_writable, new_run_folder
+from utils.runs import (
+    Stopwatch,
+    check_resume,
+    check_writable,
+    new_run_folder,
+    parse_args,
+    run_script,
+)
 
 FREE_TO_CHANGE = (
     "rl.name",

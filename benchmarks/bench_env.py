@@ -29,7 +29,8 @@ from envs.objects import load_object_set
 from envs.pybullet_bodies import add_table, set_up_physics, spawn
 from envs.pybullet_camera import PybulletCamera, projection_matrix
 from envs.pybullet_cell import PybulletCell
-from utils.config import Config, load_config, run_script, with_settings
+from utils.config import Config, load_config, with_settings
+from utils.runs import run_script
 
 STEPS = 40  # of an environment, between two readings of the clock
 PHYSICS_STEPS = 120

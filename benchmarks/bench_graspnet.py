@@ -35,9 +35,10 @@ from models.graspnet_io import (
 from models.graspnet_scores import score_labels
 from models.planner_graspnet import GraspNetPlanner
 from utils.augmentation import LabelledImage
-from utils.config import load_config, run_script
+from utils.config import load_config
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import GraspLabels, dense_labels
+from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
 LABELLED = 120  # scenes of test objects, both sets and all layouts in turn

@@ -19,7 +19,8 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo_rollouts import FRESH, derived_seeds
-from utils.config import Config, load_config, run_script
+from utils.config import Config, load_config
+from utils.runs import run_script
 from utils.statistics import wilson_interval
 
 

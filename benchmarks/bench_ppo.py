@@ -23,7 +23,8 @@ import psutil
 from scipy.stats import t as student
 
 from benchmarks.metrics import Metric, benchmark_parser, report
-from utils.config import Config, load_config, run_script
+from utils.config import Config, load_config
+from utils.runs import run_script
 
 EPISODES = 100  # deterministic ones at the end
 FIRST_SEED = 900_000  # of these

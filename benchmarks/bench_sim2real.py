@@ -26,8 +26,9 @@ from utils.adaptation import (
     outputs_of,
     train_domain_adaptation,
 )
-from utils.config import Config, load_config, run_script
+from utils.config import Config, load_config
 from utils.depth import KinectNoise
+from utils.runs import run_script
 
 PAIRS = ("mnist:uci", "uci:mnist", "mnist:photo")
 TEST_SHARE = 0.2  # of a domain's images, seen by no training

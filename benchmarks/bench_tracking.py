@@ -23,10 +23,11 @@ from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import UnreachableError, choose_posture, moved
 from models.planners import make_planner
-from utils.config import load_config, run_script
+from utils.config import load_config
 from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
+from utils.runs import run_script
 from utils.transforms import Grasp, inverse_pose, planar, planar_part, position_quaternion
 
 OBJECT_SETS = ("random_urdfs", "primitives")

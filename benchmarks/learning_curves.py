@@ -17,8 +17,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from utils.config import run_script
 from utils.errors import UserError
+from utils.runs import run_script
 
 SMOOTHED = 5000  # steps
 

@@ -34,11 +34,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.result_tables import write_tables
-from utils.config import run_script
 from utils.errors import UserError
 from utils.result_records import read_rounds, write_sample
 from utils.results import compare
-from utils.runs import environment, write_json_atomic
+from utils.runs import environment, run_script, write_json_atomic
 
 SEED = 2027
 REPOSITORY = Path(__file__).resolve().parent.parent

@@ -20,7 +20,7 @@ from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
-from utils.config import parse_args, run_script
+from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
 _SIDE = 320  # pixels of each picture of the camera

@@ -19,7 +19,8 @@ from envs.cell import Cell, Intrinsics
 from envs.robot_kinematics import forward_kinematics
 from utils.depth import NoiseStream, seeded_noise
 from utils.errors import TargetLostError
-from utils.object_tracking import PlanarMotion, TemplateMatcher, grasp_frame, make_template
+from utils.object_motion import PlanarMotion
+from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part
 
 

@@ -27,12 +27,12 @@ from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.pybullet_cell import PybulletCell
 from utils.config import Config, dump_config, with_settings
+from utils.config_types import changed, draw
 from utils.errors import UserError
 from utils.executor import process_pool
 from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
-from utils.random_ranges import changed, draw
 from utils.runs import write_atomic
 
 SPLITS = ("train", "validation")

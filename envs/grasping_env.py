@@ -32,9 +32,10 @@ from envs.robot_kinematics import (
     inverse_kinematics,
 )
 from envs.studio import Studio
-from utils.config import Config, load_config, run_script, with_settings
+from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
+from utils.runs import run_script
 
 STARTS = ("home", "near", "pretraining")
 

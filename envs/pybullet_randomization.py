@@ -12,7 +12,7 @@ import numpy as np
 import pybullet
 
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
-from utils.random_ranges import Change, changed
+from utils.config_types import Change, changed
 from utils.transforms import pose_matrix
 
 # The keyword of `changeDynamics` and the place in `getDynamicsInfo`'s answer of each quantity.

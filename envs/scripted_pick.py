@@ -17,8 +17,8 @@ import numpy as np
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
 from envs.studio import write_film
-from utils.config import parse_args, with_settings
-from utils.runs import new_run_folder
+from utils.config import with_settings
+from utils.runs import new_run_folder, parse_args
 
 PHASES = {
     "approach": "the hand moves over the cube",

@@ -29,8 +29,8 @@ from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.registries import check_names
 from envs.simulators import make_cell
-from utils.config import parse_args, run_script
 from utils.errors import UserError
+from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W

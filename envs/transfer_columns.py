@@ -14,7 +14,7 @@ from models.photographs import judge_as_taken, judge_photographs
 from models.rectangle_examples import Judged
 from utils.config import Config, with_settings
 from utils.errors import unknown_choice
-from utils.real_samples import RealSample
+from utils.rectangles import RealSample
 from utils.transfer import Column
 
 

@@ -19,7 +19,7 @@ from models.rectangle_examples import draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
 from utils.errors import UserError
 from utils.evaluation import policies_of
-from utils.real_samples import RealSample
+from utils.rectangles import RealSample
 from utils.result_records import OPEN_LOOP
 from utils.transfer import Score
 

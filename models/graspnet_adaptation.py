@@ -47,7 +47,7 @@ from utils.config import AdaptationConfig, Config, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.real_data import KEY, UnlabelledImages
-from utils.real_samples import RealSample, View
+from utils.rectangles import RealSample, View
 from utils.runs import write_atomic
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 

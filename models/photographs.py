@@ -21,7 +21,7 @@ import torch
 from models.graspnet import to_input
 from models.graspnet_decoding import find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
-from models.planner_antipodal import SearchSettings
+from models.planner_candidates import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth
 from models.rectangle_examples import HIGHEST_PEAK, Judged, best_rectangle, judged
@@ -29,8 +29,7 @@ from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.images import overhead_view
 from utils.real_data import FORMATS, existing_folder, open_real_data
-from utils.real_samples import RealSample, View
-from utils.rectangles import GraspRectangle
+from utils.rectangles import GraspRectangle, RealSample, View
 from utils.table_plane import find_table_camera
 from utils.transforms import Grasp, RGBDFrame, image_to_grasp, project
 

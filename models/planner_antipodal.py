@@ -3,7 +3,7 @@
 The search has two stages. The dense stage finds, for every angle and height of the fingertips, runs
 of matter along the closing line that fit between the fingers. The second stage poses each of the
 best on the map, measures contacts, clearances and lever arms, centres the grasp and turns it onto
-the faces. `Candidates` holds all grasps column by column, so that each step is one array operation.
+the faces. `models.planner_candidates` has the candidates and the margins of both stages.
 `SearchPlanner` is the base of the planners that search. This module knows height maps only: neither
 the image nor the solids behind them.
 """
@@ -11,122 +11,16 @@ the image nor the solids behind them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
 
+from models.planner_candidates import Candidates, SearchSettings
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_quality import RELAXED, contact_levels, fit_faces
+from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import HeightMap
-from utils.transforms import Grasp, angle_difference
-
-
-@dataclass
-class Candidates:
-    """N candidate grasps, one column for each quantity; metres and radians.
-
-    xy: (N, 2) middle between the fingertips in W. angle: (N,) of the closing line. tip: (N,) height
-    of the fingertips' lowest point in W. width: (N,) of the matter between the fingers. opening:
-    (N,) of the hand before closing. turn: (N,) rotation that would bring the pads flat onto the
-    faces. label: (N,) the object in the height map. score: (N,), 0 for an infeasible grasp.
-    """
-
-    xy: np.ndarray
-    angle: np.ndarray
-    tip: np.ndarray
-    width: np.ndarray
-    opening: np.ndarray
-    turn: np.ndarray
-    label: np.ndarray
-    score: np.ndarray
-
-    @staticmethod
-    def rough(xy, angle, tip, width, score) -> Candidates:
-        """Candidates of the dense stage, which are not measured yet."""
-        return Candidates(
-            xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
-        )
-
-    def __len__(self) -> int:
-        return len(self.angle)
-
-    def take(self, index) -> Candidates:
-        return Candidates(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def best(self, count: int) -> Candidates:
-        """The `count` best feasible candidates, best first."""
-        order = np.argsort(-self.score, kind="stable")[:count]
-        return self.take(order[self.score[order] > 0])
-
-    def replaced(self, index: np.ndarray, others: Candidates) -> Candidates:
-        """All candidates, with `others` in the places `index`."""
-        result = self.take(np.arange(len(self)))
-        for field in fields(self):
-            getattr(result, field.name)[index] = getattr(others, field.name)
-        return result
-
-    def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 2) unit vectors along the closing line and across it."""
-        along = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
-        return along, np.stack([-along[:, 1], along[:, 0]], axis=-1)
-
-    def distinct(self, count: int, distance: float, angle: float) -> Candidates:
-        """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
-        apart = np.linalg.norm(self.xy[:, None] - self.xy, axis=2) >= distance
-        apart |= angle_difference(self.angle[:, None], self.angle) >= angle
-        kept, free = [], np.ones(len(self), bool)
-        while free.any() and len(kept) < count:
-            kept.append(int(free.argmax()))
-            free &= apart[kept[-1]]
-            free[kept[-1]] = False
-        return self.take(kept)
-
-    def grasps(self, gripper: GripperGeometry) -> list[Grasp]:
-        """The candidates as grasps, in the same order."""
-        height = self.tip + gripper.tip_below_centre
-        return [
-            Grasp(np.array([x, y, z]), angle, opening, score)
-            for (x, y), z, angle, opening, score in zip(
-                self.xy, height, self.angle, self.opening.tolist(), self.score.tolist()
-            )
-        ]
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """Margins and preferences of the search; metres and radians unless said."""
-
-    angles: int = 18  # bin k is centred at k * 180 / angles degrees
-    level_step: float = 0.006  # between the heights of the fingertips that are tried
-    table_clearance: float = 0.004  # under the fingertips
-    clearance: float = 0.003  # over all matter under fingers and palm
-    rooms: tuple[float, ...] = (0.004, 0.006, 0.008, 0.012)  # room beside each contact when open
-    inner_margin: float = 0.0015  # part of that room that has to be free of matter
-    min_engagement: float = 0.006  # the object must rise this far over the fingertips
-    good_engagement: float = 0.022  # and gains nothing beyond this
-    max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
-    min_facing: float = 0.75  # cosine of an edge's gradient against the closing line, dense stage
-    reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
-    shortlist: int = 1000  # survivors of the dense stage that are measured
-    finalists: int = 250  # of these, turned onto the faces and measured again
-    split_factor: float = 0.5  # on the score of a grasp whose ends lie on different objects
-    returned: int = 20  # grasps at most
-    distinct_distance: float = 0.01  # no two returned grasps are both closer than this
-    distinct_turn: float = np.deg2rad(20)  # and turned by less than this
-
-    def relaxed(self) -> SearchSettings:
-        """Settings whose margins are at most the `RELAXED` ones."""
-        return replace(
-            self,
-            table_clearance=min(self.table_clearance, RELAXED.table_clearance),
-            clearance=min(self.clearance, RELAXED.clearance),
-            rooms=(min(self.rooms[0], RELAXED.room), *self.rooms),
-            inner_margin=0.0,
-            min_engagement=min(self.min_engagement, RELAXED.min_engagement),
-            max_wedge=max(self.max_wedge, RELAXED.max_wedge),
-            min_facing=min(self.min_facing, 0.6),
-        )
+from utils.transforms import Grasp
 
 
 class SearchPlanner:
@@ -141,9 +35,10 @@ class SearchPlanner:
         gripper: GripperGeometry,
         workspace: Workspace,
         seed: int = 0,
-        settings: SearchSettings = SearchSettings(),
+        settings: SearchSettings | None = None,
     ):
-        self.gripper, self.workspace, self.settings = gripper, workspace, settings
+        self.gripper, self.workspace = gripper, workspace
+        self.settings = settings or SearchSettings()
 
     def search(
         self, heights: HeightMap, value: Callable[[Candidates], np.ndarray] | None = None

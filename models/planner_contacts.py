@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.planner_antipodal import Candidates
+from models.planner_candidates import Candidates
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace, intersect_lines
 from utils.height_map import HeightMap, height_map_from_scene
 

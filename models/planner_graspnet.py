@@ -24,7 +24,8 @@ import torch
 
 from models.graspnet_inference import scaled_maps
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
-from models.planner_antipodal import Candidates, SearchPlanner, SearchSettings
+from models.planner_antipodal import SearchPlanner
+from models.planner_candidates import Candidates, SearchSettings
 from utils.depth import table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, local_maxima

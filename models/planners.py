@@ -15,7 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from models.planner_antipodal import SearchPlanner, SearchSettings
+from models.planner_antipodal import SearchPlanner
+from models.planner_candidates import SearchSettings
 from models.planner_contacts import buried_share, exact_quality
 from models.planner_graspnet import GraspNetPlanner
 from utils.errors import UserError, unknown_choice

@@ -22,8 +22,14 @@ from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_inpu
 from models.graspnet_data import Example
 from models.graspnet_decoding import PeakSettings, find_peaks
 from utils.augmentation import Augmentation, LabelledImage
-from utils.real_samples import RealSample, View
-from utils.rectangles import GraspRectangle, intersection_over_union, rasterise, rectangle_match
+from utils.rectangles import (
+    GraspRectangle,
+    RealSample,
+    View,
+    intersection_over_union,
+    rasterise,
+    rectangle_match,
+)
 from utils.runs import save_figure
 from utils.transforms import angle_difference
 

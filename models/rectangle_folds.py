@@ -30,7 +30,7 @@ from utils.augmentation import Augmentation, ColourJitter
 from utils.config import Config
 from utils.errors import UserError
 from utils.real_data import FORMATS, open_real_data
-from utils.real_samples import RealSample, View
+from utils.rectangles import RealSample, View
 from utils.statistics import wilson_interval
 
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does

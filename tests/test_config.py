@@ -1,6 +1,5 @@
 """The config: defaults, merging, and one clear sentence for every mistake."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,12 +14,10 @@ from utils.config import (
     dump_config,
     known_keys,
     load_config,
-    parse_args,
-    run_script,
     schema_at,
     with_settings,
 )
-from utils.errors import UserError, unknown_choice
+from utils.errors import unknown_choice
 
 
 def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
@@ -225,56 +222,6 @@ def test_cache_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOT_GRASPING_CACHE", str(tmp_path / "env"))
     assert load_config(None).cache_folder == tmp_path / "env"
     assert load_config(None, ["cache_dir=~/x"]).cache_folder == Path.home() / "x"
-
-
-def test_parse_args(tmp_path):
-    path = write(tmp_path, "seed: 3\n")
-    config, options = parse_args(
-        ["scene.count=2", "--config", str(path), "evaluate.rounds=4", "--results", "r.json"],
-        "a script",
-        lambda parser: parser.add_argument("--results", type=Path),
-    )
-    assert (config.seed, config.scene.count, config.evaluate.rounds) == (3, 2, 4)
-    assert options.results == Path("r.json") and options.resume is None
-
-
-def test_resume_takes_the_run_s_config(tmp_path):
-    write(tmp_path, "seed: 9\n", "config.yaml")
-    config, options = parse_args(["--resume", str(tmp_path), "evaluate.rounds=4"], "a script")
-    assert (config.seed, config.evaluate.rounds, options.resume) == (9, 4, tmp_path)
-    with pytest.raises(ConfigError, match=r"no such folder"):
-        parse_args(["--resume", str(tmp_path / "none")], "a script")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ConfigError, match=r"no config\.yaml"):
-        parse_args(["--resume", str(tmp_path / "empty")], "a script")
-
-
-def test_run_script(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", "evaluate.roundz=3"])
-
-    def status(main) -> int:
-        with pytest.raises(SystemExit) as caught:
-            run_script(main)
-        return caught.value.code
-
-    assert status(lambda argv: parse_args(argv, "x") and None) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: evaluate.roundz") and error.count("\n") == 1
-
-    def other(argv):
-        raise UserError("two\nlines")
-
-    assert status(other) == 2
-    assert capsys.readouterr().err == "error: two lines\n"
-    assert status(lambda argv: None) == 0
-    assert status(lambda argv: 3) == 3
-
-    def interrupted(argv):
-        raise KeyboardInterrupt
-
-    assert status(interrupted) == 130
-    with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
-        run_script(lambda argv: 1 / 0)
 
 
 def test_unknown_choice():

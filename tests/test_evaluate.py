@@ -20,9 +20,9 @@ from envs.pybullet_cell import PybulletCell
 from envs.rounds import run_round
 from models.planners import make_planner
 from utils.config import DEFAULTS
-from utils.config import run_script as end_like_a_script
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import read_rounds, write_sample
+from utils.runs import run_script as end_like_a_script
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box"]

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from utils.config import run_script
 from utils.errors import UserError
 from utils.plugins import is_import_path, load_plugin
+from utils.runs import run_script
 
 
 @pytest.fixture

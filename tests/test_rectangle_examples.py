@@ -21,8 +21,7 @@ from tests.helpers.real_images import SHAPE, VIEW, sample, write_cornell
 from utils.augmentation import Similarity
 from utils.config import load_config
 from utils.real_data import FORMATS
-from utils.real_samples import View
-from utils.rectangles import GraspRectangle, rectangle_match
+from utils.rectangles import GraspRectangle, View, rectangle_match
 
 
 class OneGrasp(torch.nn.Module):

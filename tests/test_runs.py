@@ -1,21 +1,25 @@
-"""Run folders, what may change when a run is resumed, and files written whole or not at all."""
+"""Command lines, exit statuses, run folders, resumed runs, files written whole or not at all."""
 
 import json
 import math
 import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from tests.helpers.records import CONFIG
-from utils.config import load_config
+from utils.config import ConfigError, load_config
 from utils.errors import UserError
 from utils.runs import (
     check_resume,
     environment,
     git_state,
     new_run_folder,
+    parse_args,
+    run_script,
     save_results,
     write_json_atomic,
 )
@@ -74,3 +78,54 @@ def test_only_what_may_change_is_changed_when_a_run_is_resumed(tmp_path):
     (run / "fold0").mkdir()
     (run / "fold0" / "last.pt").touch()
     check_resume(CONFIG, run, free, ["last.pt", "fold*/last.pt"])
+
+
+def test_parse_args(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("seed: 3\n")
+    config, options = parse_args(
+        ["scene.count=2", "--config", str(path), "evaluate.rounds=4", "--results", "r.json"],
+        "a script",
+        lambda parser: parser.add_argument("--results", type=Path),
+    )
+    assert (config.seed, config.scene.count, config.evaluate.rounds) == (3, 2, 4)
+    assert options.results == Path("r.json") and options.resume is None
+
+
+def test_resume_takes_the_run_s_config(tmp_path):
+    (tmp_path / "config.yaml").write_text("seed: 9\n")
+    config, options = parse_args(["--resume", str(tmp_path), "evaluate.rounds=4"], "a script")
+    assert (config.seed, config.evaluate.rounds, options.resume) == (9, 4, tmp_path)
+    with pytest.raises(ConfigError, match=r"no such folder"):
+        parse_args(["--resume", str(tmp_path / "none")], "a script")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        parse_args(["--resume", str(tmp_path / "empty")], "a script")
+
+
+def test_run_script(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "evaluate.roundz=3"])
+
+    def status(main) -> int:
+        with pytest.raises(SystemExit) as caught:
+            run_script(main)
+        return caught.value.code
+
+    assert status(lambda argv: parse_args(argv, "x") and None) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: evaluate.roundz") and error.count("\n") == 1
+
+    def other(argv):
+        raise UserError("two\nlines")
+
+    assert status(other) == 2
+    assert capsys.readouterr().err == "error: two lines\n"
+    assert status(lambda argv: None) == 0
+    assert status(lambda argv: 3) == 3
+
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    assert status(interrupted) == 130
+    with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
+        run_script(lambda argv: 1 / 0)

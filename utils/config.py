@@ -1,4 +1,4 @@
-"""The configuration: YAML and command line in, checked and typed objects out.
+"""The configuration: YAML files and overrides in, checked and typed objects out.
 
 `configs/default.yaml` is the one place of defaults, and `utils.config_schema` holds types and
 ranges. A mistake is answered by one sentence: key, value, its source, what is allowed, the nearest
@@ -8,15 +8,13 @@ This module knows neither simulators nor networks.
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import json
 import re
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import yaml
 from pydantic import ValidationError
@@ -65,8 +63,6 @@ __all__ = [
     "changed_keys",
     "dump_config",
     "load_config",
-    "parse_args",
-    "run_script",
     "with_settings",
 ]
 
@@ -265,65 +261,6 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-# --- Scripts --------------------------------------------------------------------------------
-
-
-def parse_args(
-    argv: Sequence[str] | None,
-    description: str,
-    extra: Callable[[argparse.ArgumentParser], None] | None = None,
-) -> tuple[Config, argparse.Namespace]:
-    """A script's command line: --config FILE, --resume RUN and dotted overrides.
-
-    argv: arguments without the program's name; None takes those of the process.
-    extra: adds the script's own options to the parser.
-    With --resume the config of that run is taken (its config.yaml), overrides still apply.
-    Returns the config and the parsed options (config, resume: Path or None, and the extra ones).
-    Raises ConfigError; an unknown option ends the program with status 2, as argparse does.
-    """
-    parser = argparse.ArgumentParser(
-        description=description, epilog=f"All keys, their units and defaults: {DEFAULTS}"
-    )
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument("--config", type=Path, metavar="FILE", help="YAML laid over the defaults")
-    source.add_argument("--resume", type=Path, metavar="RUN", help="folder of a run to go on with")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="evaluate.rounds=50")
-    if extra is not None:
-        extra(parser)
-    options = parser.parse_intermixed_args(argv)
-    path = options.config
-    if options.resume is not None:
-        path = options.resume / "config.yaml"
-        if not path.is_file():
-            lack = "no config.yaml in there" if options.resume.is_dir() else "no such folder"
-            raise ConfigError(
-                f"--resume {options.resume}: {lack}; give the folder of a run, such as "
-                f"runs/{Path(parser.prog).stem}/20250131-120000"
-            )
-    return load_config(path, options.overrides), options
-
-
-def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
-    """Run `main(argv)` and exit with its status (None is 0).
-
-    The current folder becomes importable for plug-ins (`utils.plugins`), here and in the processes
-    that the script starts: by itself Python adds the script's own folder only.
-    A user error becomes one line on stderr and status 2; Ctrl-C ends with status 130.
-    Any other exception is a bug and keeps its traceback.
-    """
-    if str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))
-    try:
-        status = main(sys.argv[1:])
-    except UserError as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
-    sys.exit(status or 0)
 
 
 # --- What is wrong with a config -------------------------------------------------------------

@@ -15,9 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from utils.config import Config
-from utils.config_types import RandomizationConfig, Range
+from utils.config_types import Change, RandomizationConfig, Range, changed, draw, ranges_of
 from utils.errors import UserError
-from utils.random_ranges import Change, changed, draw, ranges_of
 from utils.random_view import RandomView, TextureRandomizer, random_colour
 
 __all__ = ["DomainRandomizer", "Randomizable", "RandomizableCell", "TextureRandomizer"]

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 class UserError(ValueError):
     """Bad input that its author can repair; the message says what, where, and what to do.
 
-    Scripts print it as one line without a traceback, see `utils.config.run_script`.
+    Scripts print it as one line without a traceback, see `utils.runs.run_script`.
     """
 
 

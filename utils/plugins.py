@@ -2,7 +2,7 @@
 
 Gymnasium names its environments in the same way. A planner, an object set, a depth noise, a reward
 or a term of one that is given as `module:name` needs no entry in a registry. The module must be
-importable: from the folder that a script is started in (`utils.config.run_script`), from
+importable: from the folder that a script is started in (`utils.runs.run_script`), from
 `PYTHONPATH` or as an installed package. This module knows nothing about what is loaded.
 """
 

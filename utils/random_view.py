@@ -21,9 +21,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from utils.config_types import Change, changed
 from utils.depth import KinectNoise
 from utils.errors import UserError
-from utils.random_ranges import Change, changed
 from utils.transforms import deproject, known_depth
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")

@@ -19,8 +19,7 @@ from scipy import ndimage
 
 from utils.errors import UserError, unknown_choice
 from utils.images import open_image
-from utils.real_samples import RealSample, View
-from utils.rectangles import GraspRectangle, rectangles_from_corners
+from utils.rectangles import GraspRectangle, RealSample, View, rectangles_from_corners
 from utils.transforms import known_depth
 
 MIN_DEPTH, MAX_DEPTH = 0.3, 10.0  # m: outside, a pixel is a hole; a whole image, a unit error

@@ -1,12 +1,14 @@
-"""What every script leaves behind: run folders, results.json, files written whole or not at all.
+"""A run of a script: its command line and exit status, its folder, and the files that it writes.
 
-A run owns a folder runs/<script>/<time>-<name>/ with its config, the commit and the versions of
-the packages, so that it can be repeated. `Stopwatch` measures where a program spends its time.
-This module knows nothing of what a run computes.
+`parse_args` and `run_script` frame every script. A run owns a folder runs/<script>/<time>-<name>/
+with its config, the commit and the versions of the packages, so that it can be repeated; files are
+written whole or not at all. `Stopwatch` measures where a program spends its time. This module knows
+nothing of what a run computes.
 """
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
@@ -17,14 +19,14 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from utils.config import Config, dump_config, load_config
+from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError
 
 if TYPE_CHECKING:
@@ -42,6 +44,65 @@ class GitState(NamedTuple):
 
     commit: str | None
     dirty: bool | None
+
+
+# --- Command line and exit status -------------------------------------------------------------
+
+
+def parse_args(
+    argv: Sequence[str] | None,
+    description: str,
+    extra: Callable[[argparse.ArgumentParser], None] | None = None,
+) -> tuple[Config, argparse.Namespace]:
+    """A script's command line: --config FILE, --resume RUN and dotted overrides.
+
+    argv: arguments without the program's name; None takes those of the process.
+    extra: adds the script's own options to the parser.
+    With --resume the config of that run is taken (its config.yaml), overrides still apply.
+    Returns the config and the parsed options (config, resume: Path or None, and the extra ones).
+    Raises ConfigError; an unknown option ends the program with status 2, as argparse does.
+    """
+    parser = argparse.ArgumentParser(
+        description=description, epilog=f"All keys, their units and defaults: {DEFAULTS}"
+    )
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--config", type=Path, metavar="FILE", help="YAML laid over the defaults")
+    source.add_argument("--resume", type=Path, metavar="RUN", help="folder of a run to go on with")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="evaluate.rounds=50")
+    if extra is not None:
+        extra(parser)
+    options = parser.parse_intermixed_args(argv)
+    path = options.config
+    if options.resume is not None:
+        path = options.resume / "config.yaml"
+        if not path.is_file():
+            lack = "no config.yaml in there" if options.resume.is_dir() else "no such folder"
+            raise ConfigError(
+                f"--resume {options.resume}: {lack}; give the folder of a run, such as "
+                f"runs/{Path(parser.prog).stem}/20250131-120000"
+            )
+    return load_config(path, options.overrides), options
+
+
+def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
+    """Run `main(argv)` and exit with its status (None is 0).
+
+    The current folder becomes importable for plug-ins (`utils.plugins`), here and in the processes
+    that the script starts: by itself Python adds the script's own folder only.
+    A user error becomes one line on stderr and status 2; Ctrl-C ends with status 130.
+    Any other exception is a bug and keeps its traceback.
+    """
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+    try:
+        status = main(sys.argv[1:])
+    except UserError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(status or 0)
 
 
 # --- Files ------------------------------------------------------------------------------------

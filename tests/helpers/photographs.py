@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from models.photographs import K
-from utils.real_samples import RealSample
-from utils.rectangles import GraspRectangle
+from utils.rectangles import GraspRectangle, RealSample
 from utils.transforms import RGBDFrame, deproject, look_at
 
 # Cornell's camera looks down like this: 0.73 m over the table, 37 degrees from straight down.

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from utils.real_samples import RealSample, View
-from utils.rectangles import GraspRectangle
+from utils.rectangles import GraspRectangle, RealSample, View
 
 SHAPE = (120, 160)  # rows, columns
 VIEW = View(side=100, size=50, metres_per_pixel=0.004)

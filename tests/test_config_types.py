@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from utils.config import ConfigError, load_config
-from utils.config_types import Range
-from utils.random_ranges import changed, draw
+from utils.config_types import Range, changed, draw
 
 
 def spec(low, high, distribution="uniform", operation="add", every="episode") -> Range:
