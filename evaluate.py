@@ -28,15 +28,7 @@ from pathlib import Path
 
 from envs.evaluation_worker import check_everything, privileged_policies, set_up, work
 from envs.registries import check_names
-from envs.transfer_columns import columns_of
-from envs.transfer_scenes import (
-    check_open_loop,
-    check_rows,
-    evaluations_of,
-    is_trained,
-    scenes_of,
-    score_photographs,
-)
+from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
 from utils.config import Config, load_config
 from utils.errors import UserError
@@ -70,16 +62,8 @@ from utils.runs import (
     parse_args,
     run_script,
     save_results,
-    write_atomic,
 )
-from utils.transfer import (
-    TransferLine,
-    draw_transfer,
-    format_transfer,
-    score_of,
-    transfer_content,
-    transfer_notes,
-)
+from utils.transfer import format_transfer, score_of, transfer_notes, write_transfer
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -219,10 +203,8 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     rows, columns = config.transfer.policies, columns_of(config)
     if options.csv is not None or options.latex is not None:
         raise UserError("--csv, --latex: the transfer report has no paired differences; omit them")
-    check_open_loop(config)
     evaluations = evaluations_of(config)
     for evaluation in evaluations:
-        check_rows(evaluation)
         check_everything(evaluation.config, "transfer.policies")
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
@@ -242,16 +224,9 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     for row in rows if samples else []:
         scores[row] |= score_photographs(row, samples, config, run)
 
-    lines = [
-        TransferLine(row, str(scenes_of(row, config)), scores[row], is_trained(row)) for row in rows
-    ]
+    lines, complete = transfer_lines(config, scores), error is None and not interrupted
     print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
-    complete = error is None and not interrupted
-    content = {"complete": complete, "device": device_of(config)}
-    content |= {"config": config.model_dump(mode="json"), **transfer_content(lines, columns)}
-    for path in filter(None, [run / "results.json", options.results]):
-        save_results(path, content)
-    write_atomic(run / "transfer.png", draw_transfer(lines, columns))
+    write_transfer(run, lines, columns, config, device_of(config), complete, options.results)
     print(f"picture: {run / 'transfer.png'}")
     if not complete:
         print(f"interrupted; go on with --resume {run}")

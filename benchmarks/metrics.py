@@ -1,6 +1,6 @@
 """What every benchmark reports, and fair timing: metrics with targets, as a table and as JSON.
 
-Knows nothing of what is measured.
+This module knows nothing of what is measured.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ an alignment of the whole board (Evangelidis and Psarakis, "Parametric image ali
 enhanced correlation coefficient maximization", IEEE T-PAMI 30(10), 2008), which uses every edge of
 the pattern and is several times as precise as looking for each corner by itself.
 
-Knows neither robot nor servo.
+This module knows neither robot nor servo.
 """
 
 from __future__ import annotations

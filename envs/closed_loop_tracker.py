@@ -2,9 +2,9 @@
 
 `WristCamera` gives depth images with the times at which they were taken, perhaps late and perhaps
 with the noise of `camera.depth_noise`; `ObjectTracker` finds the object in them and filters its
-motion. Reads images and encoders, and takes the camera's mount from a calibration. Knows no control
-law and no stage of an approach. Frames: W world, E gripper, C camera, O object on the table below
-its grasp.
+motion. Reads images and encoders, and takes the camera's mount from a calibration. This module
+knows no control law and no stage of an approach. Frames: W world, E gripper, C camera, O object on
+the table below its grasp.
 """
 
 from __future__ import annotations

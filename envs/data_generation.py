@@ -1,7 +1,9 @@
-"""Simulated grasp data: images of seeded scenes with dense labels, some of them executed.
+"""Simulated grasp data: images of seeded scenes with dense labels, some of which are executed.
 
 Every shard is a pure function of the config, the split and its number. Worker processes write the
 shards one by one, so that an interrupted generation continues with those that are missing.
+`envs.cell_appearance` draws how the images look, `utils.grasp_labels` computes the labels, and
+`utils.grasp_data` reads and writes the shards.
 """
 
 from __future__ import annotations
@@ -37,23 +39,27 @@ from utils.runs import write_atomic
 
 SPLITS = ("train", "validation")
 HELD_OUT = 10  # every tenth training object is kept for validation
-FRAMES_PER_SCENE = 4  # the whole scene, then parts of it as they are met on the way to clearing it
+FRAMES_PER_SCENE = 4  # the whole scene, then parts of it, as in a round that clears it
 SCENES_PER_SHARD = 8
-MOST_DRAWS = 100  # of one scene, each of which makes tries of its own
+MOST_DRAWS = 100  # for one scene; each draw tries several times to place its objects
 _LAYOUT_SHARES = {"isolated": 0.15, "packed": 0.35, "pile": 0.5}
-_PHYSICS = ("object_friction", "object_mass")  # what labels and their trials can depend on
-_FIRST_SEED = {"train": 1_000_000_000, "validation": 2_000_000_000}  # never met in evaluation
+_PHYSICS = ("object_friction", "object_mass")  # on which labels and their trials can depend
+_FIRST_SEED = {
+    "train": 1_000_000_000,
+    "validation": 2_000_000_000,
+}  # no evaluation uses these seeds
 
 
 def data_folder(config: Config, root: Path = Path("data")) -> Path:
-    """Where the simulated data of a config lies: named by what its content depends on."""
+    """Return the folder of a config's simulated data, whose name is a hash of all that the data
+    depend on."""
     if config.data.root is not None:
         return config.data.root
     return root / f"simulated-{hashlib.sha256(_content(config).encode()).hexdigest()[:8]}"
 
 
 def _content(config: Config) -> str:
-    """What one shard depends on, as YAML; how many shards there are does not belong to it."""
+    """Return as YAML all that one shard depends on; the number of shards does not belong to it."""
     everything = config.model_dump(mode="json")
     chosen = {key: everything[key] for key in ("seed", "sim", "camera", "workspace", "scene")}
     for key in ("depth_noise", "depth_noise_args"):  # images are stored clean
@@ -82,8 +88,9 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     """Write the shards that the data set of a config still lacks; returns its folder.
 
     rank, ranks: this process makes every ranks-th shard (`torchrun`).
-    Raises UserError if the folder holds data of another config, labels cannot be tried out, or a
-    worker died. Whatever stops it, the shards under way are finished and no others begun.
+    Raises UserError if the folder holds data of another config, if labels cannot be executed, or if
+    a worker died. However the generation ends, it finishes the shards under way and begins no
+    others.
     """
     folder = data_folder(config)
     _claim(folder, config)
@@ -118,15 +125,15 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
                 raise
     except BrokenProcessPool as error:
         raise UserError(
-            f"a worker process died (out of memory?); what is done is safe in {folder}: start "
-            "again, perhaps with data.workers=1"
+            f"a worker process died (out of memory?); the finished shards are safe in {folder}: "
+            "start again, perhaps with data.workers=1"
         ) from error
     return folder
 
 
 def missing_shards(config: Config, folder: Path, rank: int, ranks: int) -> list[tuple[str, int]]:
-    """(split, number) of this process's shards that are not there. Whose a shard is does not depend
-    on what is there, because another process may be writing at this moment."""
+    """Return (split, number) of this process's shards that do not exist yet. The process that makes
+    a shard does not depend on which shards exist, because others may be writing at this moment."""
     everything = [
         (split, number) for split in SPLITS for number in range(shard_count(config, split))
     ]
@@ -134,23 +141,23 @@ def missing_shards(config: Config, folder: Path, rank: int, ranks: int) -> list[
 
 
 def shard_count(config: Config, split: str) -> int:
-    """Shards that hold at least the configured number of frames."""
+    """Return the number of shards that hold at least the configured number of frames."""
     frames = config.data.frames if split == "train" else config.data.validation_frames
     return -(-frames // (FRAMES_PER_SCENE * SCENES_PER_SHARD))
 
 
 def _frames_kept(config: Config, folder: Path) -> str:
-    """How many frames of how many are there, e.g. "64 of 384"."""
+    """Return how many frames of how many are on disk, e.g. "64 of 384"."""
     shards = sum(shard_count(config, split) for split in SPLITS)
     kept, each = shards - len(missing_shards(config, folder, 0, 1)), SCENES_PER_SHARD
     return f"{kept * each * FRAMES_PER_SCENE} of {shards * each * FRAMES_PER_SCENE}"
 
 
 def _claim(folder: Path, config: Config) -> None:
-    """Make the folder, or raise UserError if it holds something else."""
+    """Make the folder, or raise UserError if it holds something other than this data set."""
     content, mark = _content(config), folder / "content.yaml"
-    # The mark comes first, so a folder that another process claims at this moment is empty or has
-    # one by the time it is looked for.
+    # Another process may be claiming the folder at this moment. It writes the mark before anything
+    # else, so a folder that is not empty here has a mark in the next line.
     occupied = any(folder.glob("[!.]*"))
     if mark.exists():
         if mark.read_text(encoding="utf-8") != content:
@@ -193,7 +200,7 @@ def _make_shard(folder: Path, split: str, number: int) -> int:
 
 
 def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
-    """The training objects of each set, parted: (set, split) -> objects. No test object."""
+    """Return the training objects of each set by (set, split); no test object is among them."""
     parts = {}
     settings = config.objects.model_dump() | {"split": "train"}
     for name in config.data.object_sets:
@@ -214,9 +221,10 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
 def draw_scene(
     config: Config, split: str, seed: int, sets: dict[tuple[str, str], ObjectSet]
 ) -> tuple[Scene, str]:
-    """A scene of random layout, object set and number of objects, and the name of its set.
+    """Draw a scene of random layout, object set and number of objects; returns it and the set's
+    name.
 
-    Raises UserError if hardly any such scene can be made.
+    Raises UserError if none of MOST_DRAWS draws gives a scene.
     """
     rng = np.random.default_rng([config.seed, seed])
     for _ in range(MOST_DRAWS):
@@ -240,7 +248,8 @@ def draw_scene(
 def label_scene(
     config: Config, scene: Scene, set_name: str, cell: PybulletCell
 ) -> Iterator[tuple[LabelledFrame, list[Trial]]]:
-    """Labelled frames of a scene and of random parts of it, some with trials of their labels."""
+    """Yield labelled frames of a scene and of random parts of it, some with trials of their
+    labels."""
     rng = np.random.default_rng([config.seed, scene.seed, 1])
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     configured = cell.config.camera
@@ -267,7 +276,7 @@ def label_scene(
 
 
 def _part(scene: Scene, rng: np.random.Generator) -> Scene:
-    """A scene without up to three of its objects; at least one stays."""
+    """Return a scene without up to three of its objects; at least one stays."""
     total = len(scene.placements)
     count = int(rng.integers(max(total - 3, 1), total + 1))
     kept = np.sort(rng.choice(total, count, replace=False))
@@ -275,8 +284,9 @@ def _part(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
-    """Frame `number` of a scene with each object's friction and mass changed, in the physics and in
-    the labels alike. Draws of their own: everything else about the frame stays as it is."""
+    """Return the scene of frame `number` with each object's friction and mass changed, in the
+    physics and in the labels alike. The changes have a generator of their own, so that everything
+    else about the frame stays as it is."""
     rng = np.random.default_rng([config.seed, scene.seed, 2, number])
     ranges, placements = config.randomization.physics, []
     for placed in scene.placements:
@@ -296,8 +306,8 @@ def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
 def execute_pairs(
     cell: PybulletCell, scene: Scene, frame, labels, rng: np.random.Generator
 ) -> list[Trial]:
-    """Carry out labelled pairs of every quality, each on the scene freshly loaded. Where the
-    simulation blows up, the grasp has failed."""
+    """Execute labelled pairs of every quality, each on the freshly loaded scene. A grasp during
+    which the simulation blows up has failed."""
     trials = []
     for grasp, quality, weight in draw_pairs(frame, labels, cell.gripper, rng):
         cell.load(scene)

@@ -1,8 +1,8 @@
 """What `RobotGraspingEnv` measures after every action: observations and the numbers of info.
 
 `Observer` reads the robot, the nearest object and the camera of a cell. `OBSERVATIONS` lists the
-entries that an observation may hold; the environment's docstring gives their units and frames.
-Knows neither actions nor rewards.
+entries that an observation may hold; the environment's docstring gives their units and frames. This
+module knows neither actions nor rewards.
 """
 
 from __future__ import annotations

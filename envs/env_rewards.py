@@ -6,7 +6,7 @@ taken to the middle of the nearest object (`Outline`, config `env.goal=object`) 
 grasp that the object offers (`GraspGoals`, `env.goal=grasp`).
 
 Everything here is ground truth of the simulator: it serves rewards, critics and the training of a
-state estimator, never a policy at work. Knows no robot and no simulator.
+state estimator, never a policy at work. This module knows no robot and no simulator.
 """
 
 from __future__ import annotations

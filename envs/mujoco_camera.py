@@ -1,7 +1,7 @@
 """The RGB-D camera in MuJoCo: images drawn without a window by MuJoCo's OpenGL renderer.
 
-Camera model, depth and light settings are those of `envs.cell`. Knows nothing of robots, objects
-or tasks.
+Camera model, depth and light settings are those of `envs.cell`. This module knows nothing of
+robots, objects or tasks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The Panda in MuJoCo: the kinematics of PyBullet's model, identified inertias, other physics.
 
 The inertias in pybullet_data's `franka_panda/panda.urdf` are placeholders; identified ones replace
-them here. Knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.3,<4".
+them here. This module knows nothing of scenes and tasks. MuJoCo is optional: pip install
+"mujoco>=3.3,<4".
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""URDF and mesh files: which files of a folder are objects, and their meshes, colour and friction.
+"""Object files: the URDF and mesh files of a folder, and their geometry, colour and friction.
 
-Everything stays in the file's own units and axes. This module knows no mass, no simulator and no
+Lengths and axes stay those of the file. This module knows no mass, no simulator and no
 object set.
 """
 
@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 from envs.object_meshes import ObjectError, checked_mesh, load_mesh, write_mesh_obj
 
 SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
-DEFAULT_FRICTION = 0.7  # of a file that states none
+DEFAULT_FRICTION = 0.7  # for a file that states none
 
 
 @dataclass(frozen=True)
 class FineVisual:
-    """The original mesh: a vertex v of the file is at rotation(quaternion) @ (scale * v) + position
-    in the body frame (metres; quaternion x, y, z, w)."""
+    """The original mesh of an object, for pictures. A vertex v of the file lies at
+    rotation(quaternion) @ (scale * v) + position in the body frame (metres; quaternion x, y, z, w).
+    """
 
     path: Path
     scale: tuple[float, float, float]
@@ -34,8 +35,12 @@ class FineVisual:
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """What a file says. visual: (mesh file, scale (3,), T (4, 4)) if there is just one, as read by
-    PyBullet; otherwise the mesh itself is what there is to see."""
+    """The content of an object file.
+
+    mesh: the solid geometry. visual: (mesh file, scale (3,), T (4, 4)) of a URDF that has a single
+    visual mesh. visual_mesh: all visual geometry of a URDF as one mesh. Pictures show the first of
+    visual, visual_mesh and the file itself that exists.
+    """
 
     mesh: trimesh.Trimesh
     friction: float = DEFAULT_FRICTION
@@ -45,7 +50,8 @@ class ObjectSource:
 
 
 def object_files(folder: Path) -> list[Path]:
-    """Sorted URDF and mesh files below a folder, without the meshes that its URDFs refer to.
+    """List the URDF and mesh files below a folder, sorted, without the meshes that its URDFs refer
+    to.
 
     Raises ObjectError for a folder that holds none, and for a URDF that is not XML.
     """
@@ -67,9 +73,9 @@ def object_files(folder: Path) -> list[Path]:
 
 
 def read_object(path: Path) -> ObjectSource:
-    """What a URDF (all its links at zero joint angles, as one body) or mesh file says.
+    """Read a mesh file, or a URDF with all its links at zero joint angles as one body.
 
-    Raises ObjectError naming the file.
+    Raises ObjectError, which names the file.
     """
     return _read_urdf(path) if path.suffix.lower() == ".urdf" else ObjectSource(load_mesh(path))
 
@@ -77,10 +83,11 @@ def read_object(path: Path) -> ObjectSource:
 def fine_visual(
     path: Path, source: ObjectSource, scale: float, centre: np.ndarray, cache_dir: Path
 ) -> FineVisual:
-    """What an object file shows, as a mesh that PyBullet reads, written to `cache_dir` if need be.
+    """Return the original mesh of an object file in a format that PyBullet reads; meshes of other
+    formats are written to `cache_dir`.
 
-    path: the file that `source` was read from. scale: of the body. centre: (3,) the origin of the
-    body frame in the file's, before scaling.
+    path: the file that `source` was read from. scale: the body's size over the file's. centre: (3,)
+    the origin of the body frame in the file's axes, before scaling.
     """
     if source.visual is not None:
         file, file_scale, T = source.visual
@@ -88,7 +95,7 @@ def fine_visual(
         file, file_scale, T = write_mesh_obj(source.visual_mesh, cache_dir), np.ones(3), np.eye(4)
     else:
         file, file_scale, T = path, np.ones(3), np.eye(4)
-    if file.suffix.lower() != ".obj":  # what PyBullet makes of the others differs from trimesh
+    if file.suffix.lower() != ".obj":  # PyBullet reads the other formats unlike trimesh
         file = write_mesh_obj(load_mesh(file), cache_dir)
     return FineVisual(
         path=file,
@@ -106,7 +113,8 @@ def _parse_xml(path: Path) -> ElementTree.Element:
 
 
 def _resolve_mesh(filename: str, urdf: Path) -> str:
-    """The file that a URDF's mesh element means: relative to it, or in a package around it."""
+    """Return the file that a URDF's mesh element names, relative to the URDF or in a package that
+    contains it."""
     if filename.startswith("package://"):
         inside = Path(filename.removeprefix("package://"))
         for base in urdf.resolve().parents:
@@ -119,7 +127,7 @@ def _resolve_mesh(filename: str, urdf: Path) -> str:
 def _read_urdf(path: Path) -> ObjectSource:
     xml = _parse_xml(path)
     for element in xml.iter("mesh"):
-        # Checked first: its message names the mesh, which yourdfpy's may not.
+        # Reading the mesh first gives an error that names it, which yourdfpy's error may not.
         load_mesh(_resolve_mesh(element.get("filename", ""), path))
     try:
         robot = yourdfpy.URDF.load(
@@ -128,10 +136,10 @@ def _read_urdf(path: Path) -> ObjectSource:
             load_collision_meshes=True,
             filename_handler=lambda fname: _resolve_mesh(fname, path),
         )
-        # A link is solid where it collides; without any collision geometry, where it shows.
+        # Collision geometry is solid; a URDF without any is solid where its visual geometry is.
         scene = robot.collision_scene if robot.collision_scene.geometry else robot.scene
         mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
-        friction = xml.find(".//contact/lateral_friction")  # yourdfpy leaves <contact> out
+        friction = xml.find(".//contact/lateral_friction")  # yourdfpy does not read <contact>
         friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
     except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
         raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error

@@ -1,7 +1,7 @@
 """Triangle meshes: reading, cutting into few convex parts, mass properties, OBJ files.
 
-Bullet collides convex shapes only, and its cost grows with their number and their vertices. So
-`decompose` turns every mesh into a few small hulls, once; a cache keeps them under a hash of the
+Bullet collides convex shapes only, and its cost grows with their number and their vertices.
+`decompose` therefore turns every mesh into a few small hulls and caches them under a hash of the
 mesh. This module calls no simulator and knows no object set.
 """
 
@@ -28,14 +28,15 @@ from utils.runs import write_atomic
 
 MAX_PARTS = 8
 MAX_VERTICES = 32
-# Lengths below are fractions of the largest side of the mesh's bounding box.
+# The lengths below are fractions of the largest side of the mesh's bounding box.
 VERTEX_TOLERANCE = 0.004  # a hull may cut its own corners by this much: 0.3 mm on an 8 cm object
 MERGE_TOLERANCE = 0.03  # two parts become one if that adds less than this part of the volume
-CONVEX_RATIO = 0.95  # volume / hull volume from which a mesh counts as convex
-MAX_PAIRWISE = 24  # beyond, only the smallest piece is paired with the others: n pairs, not n^2
-# Chosen for time: 4 to 10 s for a scanned object on one core. Without its remeshing ("off", and
-# "auto" when the mesh is clean) or with a shallower search, whose many cuts have to be merged again
-# (50 s for a ring), CoACD takes up to minutes; its own decimation shrinks hulls by up to a sixth.
+CONVEX_RATIO = 0.95  # a mesh whose volume is this share of its hull's counts as convex
+MAX_PAIRWISE = 24  # with more parts only the smallest is paired with the others: n pairs, not n^2
+# These settings were chosen for their time: 4 to 10 s for a scanned object on one core. CoACD takes
+# up to minutes without its remeshing ("off", and "auto" when the mesh is clean) and with a
+# shallower search, whose many cuts have to be merged again (50 s for a ring). Its own decimation
+# shrinks hulls by up to a sixth.
 COACD_SETTINGS = {
     "threshold": 0.08,
     "max_convex_hull": MAX_PARTS,
@@ -56,8 +57,8 @@ class ObjectError(UserError):
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Of a solid of uniform density 1 kg/m3: volume m3, centre of mass (3,) m, inertia (3, 3)
-    about the centre of mass in the mesh's axes, kg m2."""
+    """Mass properties of a solid of uniform density 1 kg/m3: volume m3, centre of mass (3,) m,
+    inertia (3, 3) about the centre of mass in the mesh's axes, kg m2."""
 
     volume: float
     centre_of_mass: np.ndarray
@@ -65,7 +66,7 @@ class MassProperties:
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """All geometry of a mesh file as one mesh, in the file's own units and axes.
+    """Read all geometry of a mesh file as one mesh, in the file's own units and axes.
 
     Raises ObjectError for a file that is missing, unreadable, empty, flat or non-finite.
     """
@@ -81,7 +82,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 
 def checked_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
-    """The bare geometry of a mesh, vertices merged; ObjectError naming `name` if it is no body."""
+    """Return the bare geometry of a mesh with merged vertices. Raises ObjectError, which names
+    `name`, if the mesh bounds no body."""
     if len(mesh.faces) == 0:
         raise ObjectError(f"mesh {name} has no triangles; re-export or remove it")
     bad = int((~np.isfinite(mesh.vertices).all(axis=1)).sum())
@@ -91,30 +93,32 @@ def checked_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
             "re-export or remove it"
         )
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    # Triangles of two merged corners go; thin ones stay, for without them there would be holes.
+    # Triangles with two merged corners are removed; thin ones stay, because their removal would
+    # leave holes.
     bare.update_faces((np.diff(np.sort(bare.faces, axis=1), axis=1) > 0).all(axis=1))
     if not bare.nondegenerate_faces().any():
         raise ObjectError(f"mesh {name} has only degenerate triangles; re-export or remove it")
     centred = bare.vertices - bare.vertices.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False)
     if spread[2] < 1e-6 * spread[0]:
-        raise ObjectError(f"mesh {name} is flat: a body needs volume; thicken or remove it")
+        raise ObjectError(f"mesh {name} is flat, but a body needs volume; thicken or remove it")
     if bare.is_watertight and bare.volume < 0:
         bare.invert()
     return bare
 
 
 def decompose(mesh: trimesh.Trimesh, cache_dir: str | Path, name: str = "mesh") -> list[np.ndarray]:
-    """Convex parts that together cover a mesh: at most 8 vertex arrays (V <= 32, 3), in its frame.
+    """Cut a mesh into convex parts that cover it: at most 8 vertex arrays (V <= 32, 3), in its
+    frame.
 
-    A mesh made of convex pieces (many procedural sets are) is taken apart exactly, a convex one is
-    its own hull, anything else goes through CoACD (Wei et al., SIGGRAPH 2022). The result is
-    cached in `cache_dir` by content; scale and position of the mesh do not matter.
+    A mesh of convex pieces, as many procedural sets have, is taken apart exactly, a convex mesh is
+    its own hull, and CoACD (Wei et al., SIGGRAPH 2022) cuts every other one. The parts are cached
+    in `cache_dir` by the mesh's content; its scale and position do not matter.
     Raises ObjectError for a corrupt cache file or a mesh that cannot be cut.
     """
     low, high = mesh.bounds
     centre, size = (low + high) / 2, float((high - low).max())
-    # Rounded, so that the same mesh in other units has the same name; + 0.0 turns -0 into 0.
+    # Rounding gives the same mesh in other units the same name; + 0.0 turns -0 into 0.
     unit = trimesh.Trimesh(
         np.round((mesh.vertices - centre) / size, 6) + 0.0, mesh.faces, process=False
     )
@@ -127,7 +131,7 @@ def decompose(mesh: trimesh.Trimesh, cache_dir: str | Path, name: str = "mesh") 
         except (RuntimeError, QhullError) as error:
             raise ObjectError(f"mesh {name} cannot be cut into convex parts ({error})") from error
         if not parts:
-            raise ObjectError(f"mesh {name} cannot be cut into convex parts: nothing was left")
+            raise ObjectError(f"mesh {name} cannot be cut into convex parts: no part has a volume")
         _write_parts(path, parts)
     return [part * size + centre for part in parts]
 
@@ -135,10 +139,10 @@ def decompose(mesh: trimesh.Trimesh, cache_dir: str | Path, name: str = "mesh") 
 def simplify_hull(
     vertices: np.ndarray, max_vertices: int = MAX_VERTICES, tolerance: float = VERTEX_TOLERANCE
 ) -> np.ndarray:
-    """The few vertices (V, 3) of a convex hull that span nearly all of it.
+    """Return the few vertices (V, 3) of a convex hull that span nearly all of it.
 
-    Starts from a tetrahedron and keeps adding the vertex that lies farthest outside (as quickhull
-    does), until none is farther than `tolerance` or there are `max_vertices`.
+    The choice starts from a tetrahedron and keeps adding the vertex that lies farthest outside, as
+    quickhull does, until none is farther than `tolerance` or there are `max_vertices`.
     """
     points = np.asarray(vertices, dtype=float)
     points = points[ConvexHull(points).vertices]
@@ -156,7 +160,8 @@ def simplify_hull(
 
 
 def mass_properties(mesh: trimesh.Trimesh, parts: Sequence[np.ndarray]) -> MassProperties:
-    """Of the true solid where the mesh bounds one, overlaps counted once; else of its parts."""
+    """Compute the mass properties of the solid that the mesh bounds, overlaps counted once, or of
+    its convex parts if it bounds none."""
     pieces = _solid_pieces(mesh)
     if len(pieces) > 1:
         solid = _to_trimesh(_union([_from_trimesh(piece) for piece in pieces]))
@@ -168,7 +173,8 @@ def mass_properties(mesh: trimesh.Trimesh, parts: Sequence[np.ndarray]) -> MassP
 
 
 def write_parts_obj(parts: Sequence[np.ndarray], cache_dir: str | Path) -> Path:
-    """An OBJ file in the cache with one `o` group for each convex part, named by its content.
+    """Write an OBJ file with one `o` group for each convex part into the cache, named by its
+    content.
 
     PyBullet turns it into a compound with one convex hull for each group.
     """
@@ -184,7 +190,8 @@ def write_parts_obj(parts: Sequence[np.ndarray], cache_dir: str | Path) -> Path:
 
 
 def write_mesh_obj(mesh: trimesh.Trimesh, cache_dir: str | Path) -> Path:
-    """The mesh as an OBJ file in the cache, for the formats that PyBullet does not read."""
+    """Write the mesh as an OBJ file into the cache, because PyBullet does not read its own
+    format."""
     text = trimesh.exchange.obj.export_obj(
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), header=None
     )
@@ -195,7 +202,7 @@ def write_mesh_obj(mesh: trimesh.Trimesh, cache_dir: str | Path) -> Path:
 
 
 def _convex_parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
-    """Vertex arrays of the convex parts of a mesh of unit size, not yet simplified."""
+    """Return vertex arrays of the convex parts of a mesh of unit size, not yet simplified."""
     pieces = _solid_pieces(mesh)
     if pieces and all(_is_convex(piece) for piece in pieces):
         return _merged([_hull(piece.vertices) for piece in pieces])
@@ -205,10 +212,10 @@ def _convex_parts(mesh: trimesh.Trimesh) -> list[np.ndarray]:
 
 
 def _solid_pieces(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """The connected pieces of a mesh if each bounds a solid of its own, otherwise none.
+    """Return the connected pieces of a mesh if each bounds a solid of its own, otherwise none.
 
-    A mesh need not be watertight for that: pieces that touch along an edge share its vertices. A
-    piece turned inside out is a cavity of another and no solid.
+    The mesh itself need not be watertight: pieces that touch along an edge share its vertices. A
+    piece that is turned inside out is a cavity of another piece and no solid.
     """
     pieces = list(mesh.split(only_watertight=False))
     return pieces if all(piece.is_volume for piece in pieces) else []
@@ -219,8 +226,8 @@ def _is_convex(mesh: trimesh.Trimesh) -> bool:
 
 
 def _merged(parts: list[manifold3d.Manifold]) -> list[np.ndarray]:
-    """Joins the pair whose common hull adds least volume, while there are too many parts or while
-    joining costs next to nothing."""
+    """Join the pair whose common hull adds the least volume, as long as there are too many parts or
+    joining adds next to nothing."""
     parts = [part for part in parts if part.volume() > 0]
     parts = _without_dust(parts)
     allowance = MERGE_TOLERANCE * sum(part.volume() for part in parts)
@@ -244,7 +251,7 @@ def _merged(parts: list[manifold3d.Manifold]) -> list[np.ndarray]:
 
 
 def _without_dust(parts: list[manifold3d.Manifold]) -> list[manifold3d.Manifold]:
-    """At most MAX_PAIRWISE parts: the smallest joined to the partner whose hull grows least."""
+    """Reduce the parts to MAX_PAIRWISE: the smallest joins the partner whose hull grows least."""
     parts = sorted(parts, key=lambda part: part.volume())
     while len(parts) > MAX_PAIRWISE:
         smallest, rest = parts[0], parts[1:]
@@ -256,7 +263,8 @@ def _without_dust(parts: list[manifold3d.Manifold]) -> list[manifold3d.Manifold]
 
 
 def _tetrahedron(points: np.ndarray) -> list[int]:
-    """Indices of four points that span a volume: each is the farthest from those before it."""
+    """Return the indices of four points that span a volume: each is the farthest from those
+    before."""
     first = int(points[:, 0].argmin())
     offsets = points - points[first]
     second = int(np.linalg.norm(offsets, axis=1).argmax())
@@ -316,7 +324,7 @@ def _read_parts(path: Path) -> list[np.ndarray]:
         with np.load(path, allow_pickle=False) as data:
             vertices, counts = data["vertices"], data["counts"]
         if len(counts) == 0 or counts.sum() != len(vertices) or not np.isfinite(vertices).all():
-            raise ValueError("its numbers do not fit together")
+            raise ValueError("its numbers contradict each other")
     except _UNREADABLE as error:
         raise _corrupt(path, str(error)) from error
     return np.split(vertices, np.cumsum(counts)[:-1])

@@ -1,6 +1,6 @@
 """The RGB-D camera in PyBullet: images rendered by TinyRenderer or EGL, with metric depth.
 
-Knows nothing of robots, objects or tasks.
+This module knows nothing of robots, objects or tasks.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The Panda in PyBullet: model, motors, gripper and contacts.
 
-Knows nothing of objects, cameras or grasps; `envs.robot_kinematics` works out where to move.
+This module knows nothing of objects, cameras or grasps; `envs.robot_kinematics` works out where to
+move.
 """
 
 from __future__ import annotations

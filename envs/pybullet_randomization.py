@@ -1,6 +1,6 @@
 """Randomised physics and colours in PyBullet: changed from nominal, and brought back exactly.
 
-`utils.domain_randomization` draws what this module applies. Knows no distribution.
+`utils.domain_randomization` draws what this module applies. This module knows no distribution.
 """
 
 from __future__ import annotations

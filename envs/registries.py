@@ -19,7 +19,7 @@ from envs.env_rewards import make_reward
 from envs.objects import check_object_set
 from envs.scenarios import SCENARIOS
 from envs.simulators import SIMULATORS
-from envs.transfer_columns import COLUMNS
+from envs.transfer_plan import COLUMNS
 from models.grasp_policy import ACTIVATIONS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config

@@ -12,7 +12,7 @@ board on a jig at a known place before the fingers (teaching by showing).
 
 Motion: all remaining objects move in the plane, as on a tray: in every physics step each body is
 set to the motion's pose and velocity. When the robot touches one of them, or the motion is over,
-physics alone moves them from there on. Knows no control law.
+physics alone moves them from there on. This module knows no control law.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The arm as a velocity-controlled one behind the safety gate, for every servo loop of the cell.
 
 A loop sends desired joint velocities and the age of the image that they rest on; the gate
-(`envs.robot_safety.SafetyGate`) limits or refuses them. Knows neither a control law nor an image.
+(`envs.robot_safety.SafetyGate`) limits or refuses them. This module knows neither a control law nor
+an image.
 """
 
 from __future__ import annotations

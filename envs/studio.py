@@ -27,7 +27,6 @@ import numpy as np
 from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.registries import check_names
 from envs.simulators import make_cell
 from utils.errors import UserError
 from utils.runs import parse_args, run_script
@@ -156,7 +155,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
-    check_names(config)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )

@@ -1,1 +1,1 @@
-"""Everything that decides where and how to grasp. Knows nothing of the simulator (`envs`)."""
+"""Everything that decides where and how to grasp; no module here knows a simulator (`envs`)."""

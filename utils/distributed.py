@@ -1,8 +1,8 @@
 """The processes of one training: which device each uses, what they exchange, and a clean Ctrl-C.
 
 `torchrun` starts the processes; without it a training is a team of one. Collective operations give
-the same result bit for bit in every process, so that all processes take the same steps. Knows no
-network and no data.
+the same result bit for bit in every process, so that all processes take the same steps. This module
+knows no network and no data.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ halves in the axes of W. Formulas: Chaumette and Hutchinson, "Visual servo
 control, part II", IEEE Robotics and Automation Magazine 14(1), 2007; the adaptive gain and smooth
 start are those of ViSP (Marchand, Spindler and Chaumette, 2005).
 
-Knows no image.
+This module knows no image.
 """
 
 from __future__ import annotations

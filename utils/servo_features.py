@@ -5,7 +5,7 @@ Depths are metres along the optical axis. v_C is the twist (v, w) of the camera 
 Formulas: Chaumette and Hutchinson, "Visual servo control, parts I and II", IEEE Robotics and
 Automation Magazine 13(4) 2006 and 14(1) 2007; Corke, Robotics, Vision and Control, chapter 15.
 
-Knows no control law and no robot.
+This module knows no control law and no robot.
 """
 
 from __future__ import annotations

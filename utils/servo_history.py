@@ -1,6 +1,6 @@
 """What a visual servo did, image by image, and pictures of it.
 
-Knows no control law: a history holds what each step recorded.
+This module knows no control law: a history holds what each step recorded.
 """
 
 from __future__ import annotations

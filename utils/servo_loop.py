@@ -2,7 +2,8 @@
 
 A control law is a subclass of `VisualServo` that says which displacement of the camera would null
 the error (`utils.visual_servo`). Everything else stands here: gain, smooth start, limits, the loop
-around any camera and any robot, and an ideal camera to try a law on. Knows no simulator.
+around any camera and any robot, and an ideal camera to try a law on. This module knows no
+simulator.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The transfer report: how well each policy does where it was not trained.
 
 One table of success rates, rows of policies by columns such as another simulator, and how well one
-column predicts another. This module counts and draws; `envs.transfer_columns` has their registry,
-`envs.transfer_scenes` says what is played.
+column predicts another. This module counts, writes and draws; `envs.transfer_plan` has the columns'
+registry and says what is played.
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from utils.config_schema import TransferPolicy
+from utils.config import Config, TransferPolicy
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord
+from utils.runs import save_results, write_atomic
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
 
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
@@ -197,6 +199,26 @@ def transfer_content(
             for one in agreements(lines, columns)
         ],
     }
+
+
+def write_transfer(
+    run: Path,
+    lines: Sequence[TransferLine],
+    columns: Mapping[str, Column],
+    config: Config,
+    device: str,
+    complete: bool,
+    copy: Path | None = None,
+) -> None:
+    """Write results.json, see `utils.runs.save_results`, and transfer.png into the run's folder.
+
+    copy: another file for the results, None for none.
+    """
+    content = {"complete": complete, "device": device, "config": config.model_dump(mode="json")}
+    content |= transfer_content(lines, columns)
+    for path in filter(None, [run / "results.json", copy]):
+        save_results(path, content)
+    write_atomic(run / "transfer.png", draw_transfer(lines, columns))
 
 
 def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:

@@ -1,27 +1,70 @@
-"""What the transfer report scores: its rows on their scenes in each simulated column, and the
-planners on photographs.
+"""The plan of the transfer report: its columns, the scenes of its rows, and what each row scores.
 
-`envs.transfer_columns` has the registry of the columns, `utils.transfer` makes the report of the
-scores, evaluate.py plays the evaluations.
+`COLUMNS` is the registry of the columns: a new entry is a new name for the config's key
+`transfer.columns`. A simulated column says in which cell the rows are played, a column of
+photographs how a planner is scored on them. evaluate.py plays the evaluations that are planned
+here; `utils.transfer` writes and draws the table.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from envs.policy_approach import check_learned, is_learned
-from envs.transfer_columns import PhotographColumn, SimulatedColumn, columns_of, config_of
-from models.rectangle_examples import draw_rectangles
+from models.photographs import judge_as_taken, judge_photographs
+from models.rectangle_examples import Judged, draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
-from utils.errors import UserError
+from utils.errors import UserError, unknown_choice
 from utils.evaluation import policies_of
 from utils.rectangles import RealSample
 from utils.result_records import OPEN_LOOP
-from utils.transfer import Score
+from utils.transfer import Column, Score, TransferLine
+
+# --- The columns ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedColumn(Column):
+    """A column that is played. simulator: a key of `SIMULATORS`. randomise: whether the section
+    `randomization` changes every scene, as evaluate.randomise does."""
+
+    simulator: str
+    randomise: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotographColumn(Column):
+    """A column of photographs. judge: scores a planner, given by its name, on samples with a seed:
+    an entry for each sample, or None for a planner that photographs do not suffice for."""
+
+    judge: Callable[[str, Sequence[RealSample], int], list[Judged | None] | None]
+    if_empty: str | None = "no photographs were scored: add transfer.cornell=path/to/cornell"
+
+
+COLUMNS: dict[str, SimulatedColumn | PhotographColumn] = {
+    "pybullet": SimulatedColumn("PyBullet", simulator="pybullet"),
+    "mujoco": SimulatedColumn("MuJoCo", simulation="pybullet", simulator="mujoco"),
+    "outside": SimulatedColumn(
+        "PyBullet outside the ranges", simulation="pybullet", simulator="pybullet", randomise=True
+    ),
+    "cornell": PhotographColumn("Cornell photographs", judge=judge_photographs),
+    "cornell_as_taken": PhotographColumn("Cornell as taken", judge=judge_as_taken),
+}
+
+
+def columns_of(config: Config) -> dict[str, SimulatedColumn | PhotographColumn]:
+    """The report's columns by their names. Raises UserError for an unknown name."""
+    for name in config.transfer.columns:
+        if name not in COLUMNS:
+            raise unknown_choice("transfer.columns", name, COLUMNS)
+    return {name: COLUMNS[name] for name in config.transfer.columns}
+
+
+# --- The rows and their scenes --------------------------------------------------------------------
 
 
 class Scenes(NamedTuple):
@@ -51,7 +94,16 @@ class TransferEvaluation:
 
 
 def evaluations_of(config: Config) -> list[TransferEvaluation]:
-    """The evaluations of the transfer report; rows that are not trained are left out."""
+    """The evaluations of the transfer report; rows that are not trained are left out.
+
+    Raises UserError where the report would have to compare closed loops, and for a row that cannot
+    be scored on its scenes.
+    """
+    if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
+        raise UserError(
+            "transfer.policies: the report compares open loops; leave evaluate.controllers null "
+            "and closed_loop.controller open_loop"
+        )
     trained = [row for row in config.transfer.policies if is_trained(row)]
     found = []
     for scenes in dict.fromkeys(scenes_of(row, config) for row in trained):
@@ -62,7 +114,14 @@ def evaluations_of(config: Config) -> list[TransferEvaluation]:
         for name, column in columns_of(config).items():
             if isinstance(column, SimulatedColumn):
                 found.append(TransferEvaluation(name, scenes, rows, config_of(here, column)))
+                _check_rows(found[-1])
     return found
+
+
+def config_of(config: Config, column: SimulatedColumn) -> Config:
+    """The config of an evaluation in a simulated column of the report."""
+    config = with_settings(config, "evaluate", {"randomise": column.randomise})
+    return config.model_copy(update={"simulator": column.simulator})
 
 
 def scenes_of(row: TransferPolicy, config: Config) -> Scenes:
@@ -79,16 +138,7 @@ def is_trained(row: TransferPolicy) -> bool:
     return file.suffix not in (".pt", ".zip") or file.exists()
 
 
-def check_open_loop(config: Config) -> None:
-    """Raise UserError where the report would have to compare closed loops."""
-    if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
-        raise UserError(
-            "transfer.policies: the report compares open loops; leave evaluate.controllers null "
-            "and closed_loop.controller open_loop"
-        )
-
-
-def check_rows(evaluation: TransferEvaluation) -> None:
+def _check_rows(evaluation: TransferEvaluation) -> None:
     """Raise UserError for a row that cannot be scored on its scenes."""
     for row in evaluation.rows:
         if is_learned(row.planner):
@@ -123,3 +173,13 @@ def score_photographs(
         if shown:
             draw_rectangles(pictures / f"{Path(row.planner).stem}-{name}.png", *zip(*shown))
     return scores
+
+
+def transfer_lines(
+    config: Config, scores: Mapping[TransferPolicy, Mapping[str, Score]]
+) -> list[TransferLine]:
+    """The rows of the report with their scores by column."""
+    return [
+        TransferLine(row, str(scenes_of(row, config)), scores[row], is_trained(row))
+        for row in config.transfer.policies
+    ]

@@ -11,8 +11,14 @@ import pytest
 import evaluate
 from envs.registries import check_names
 from envs.simulators import SIMULATORS
-from envs.transfer_columns import COLUMNS, SimulatedColumn, columns_of
-from envs.transfer_scenes import Scenes, evaluations_of, score_photographs
+from envs.transfer_plan import (
+    COLUMNS,
+    Scenes,
+    SimulatedColumn,
+    columns_of,
+    evaluations_of,
+    score_photographs,
+)
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
 from utils.transfer import pairs_of
