@@ -81,7 +81,7 @@ def level(frame: RGBDFrame) -> RGBDFrame:
     """The frame with its camera turned in place and lifted, so that its table is level at z = 0.
     Horizontal position and heading keep their errors. Without this a planner finds the table two
     centimetres in the air and plans nothing."""
-    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC), 0.0)
+    normal, offset = fit_table_plane(frame.depth, frame.K, inverse_pose(frame.T_WC))
     up = frame.T_WC[:3, :3] @ normal
     turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])
     T_WC = frame.T_WC.copy()

@@ -34,6 +34,7 @@ from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
+FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
 _HOLD = 6  # pictures for which the last one of an episode stays
 
 
@@ -65,13 +66,12 @@ class Studio:
 
 
 class Film:
-    """Films a cell from now on, at `rate` pictures a second of simulated time, until written."""
+    """Films a cell from now on, FILM_RATE pictures a second of simulated time, until written."""
 
-    def __init__(self, cell: Cell, rate: int = 6, width: int = 480, height: int = 368):
-        self._cell, self._rate = cell, rate
-        self._studio = Studio(cell, width, height)
+    def __init__(self, cell: Cell):
+        self._cell, self._studio = cell, Studio(cell, *FILM_SIZE)
         self._pictures: list[np.ndarray] = []
-        self._every = max(1, round(1 / (rate * cell.dt)))
+        self._every = max(1, round(1 / (FILM_RATE * cell.dt)))
         cell.on_step = self._on_step
 
     def _on_step(self, cell: Cell) -> None:
@@ -84,7 +84,7 @@ class Film:
         if not self._pictures:  # the arm has not moved: at least show the scene
             self._pictures.append(self._studio.picture())
         self._studio.close()
-        _write(path, self._pictures, speed * self._rate)
+        _write(path, self._pictures, speed * FILM_RATE)
 
 
 def film_episode(

@@ -23,14 +23,13 @@ from models.graspnet_decoding import (
 from utils.depth import fill_holes
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
-from utils.grasp_labels import LabelSettings, grasp_below_surface
+from utils.grasp_labels import grasp_below_surface
 from utils.images import PixelScaling
 from utils.transforms import Grasp, ImageGrasp, RGBDFrame, deproject
 
 SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
 MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
-PEAKS = PeakSettings()
-CANDIDATES = 1000  # peaks, of which those above the table remain
+PEAKS = PeakSettings(count=1000)  # those above the table remain
 
 
 @dataclass(frozen=True)
@@ -63,19 +62,16 @@ def predict(
     table_height: float,
     gripper: GripperGeometry,
     count: int = 20,
-    labels: LabelSettings = LABELS,
-    peaks: PeakSettings = PEAKS,
 ) -> Prediction:
     """Find the `count` best grasps in a frame of any size, aspect ratio and focal lengths.
 
     metres_per_pixel: the scale of the training images. table_height: z of the table in W, metres.
     gripper: the hand, whose opening limits the widths; `SavedGraspNet.gripper` is that of the
-    training. peaks: in pixels at the training's scale. A grasp needs a surface beside which the
-    fingertips fit, as in the labels; peaks on the table are left out. Raises UserError as
-    `training_scale` does.
+    training. A grasp needs a surface beside which the fingertips fit, as in the labels; peaks on
+    the table are left out. Raises UserError as `training_scale` does.
     """
     scaling, maps = scaled_maps(model, metres_per_pixel, frame)
-    grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper, labels, peaks)
+    grasps = grasps_in_maps(maps, scaling, frame, table_height, gripper)
     quality, angle, width = maps
     shape = frame.depth.shape
     bins = angle[0].argmax(dim=0).numpy() * (np.pi / model.num_angle_bins)
@@ -111,11 +107,9 @@ def grasps_in_maps(
     frame: RGBDFrame,
     table_height: float,
     gripper: GripperGeometry,
-    labels: LabelSettings,
-    peaks: PeakSettings,
 ) -> list[PredictedGrasp]:
     """Return the grasps on surfaces above the table, best first, at the original's pixels."""
-    found = find_peaks(*maps, PeakSettings(peaks.threshold, CANDIDATES, peaks.radius, peaks.blur))
+    found = find_peaks(*maps, PEAKS)
     rows, columns = frame.depth.shape
     original = Peaks(
         np.clip(scaling.original_pixels(found.pixel), 0, (columns - 1, rows - 1)),
@@ -128,11 +122,11 @@ def grasps_in_maps(
     seen = surface_grasps(original, frame.depth, gripper, radius)
     pixels = np.array([grasp.pixel for grasp in seen]).reshape(-1, 2)
     surface = deproject(pixels, [grasp.depth for grasp in seen], frame.K, frame.T_WC)
-    rises = surface[:, 2] - table_height > labels.table_clearance + labels.min_engagement
+    rises = surface[:, 2] - table_height > LABELS.table_clearance + LABELS.min_engagement
     return [
         PredictedGrasp(
             grasp,
-            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, labels),
+            grasp_below_surface(grasp, frame.K, frame.T_WC, table_height, gripper, LABELS),
         )
         for grasp, high in zip(seen, rises)
         if high

@@ -83,13 +83,13 @@ def save_graspnet(
     )
 
 
-def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") -> SavedGraspNet:
-    """Load a network from a file of `save_graspnet` or from a training checkpoint.
+def load_graspnet(path: Path | str) -> SavedGraspNet:
+    """Load a network onto the CPU from a file of `save_graspnet` or from a training checkpoint.
 
     Raises UserError, naming the file, if it is missing, damaged, no GraspNet of this project, of
     another version or architecture, or holds weights that are not finite.
     """
-    checkpoint = load_checkpoint(path, KIND, map_location=map_location)
+    checkpoint = load_checkpoint(path, KIND)
     try:
         model = GraspNet(**checkpoint["model_args"])
     except (TypeError, ValueError, RuntimeError) as error:  # UserError is a ValueError
@@ -101,7 +101,7 @@ def load_graspnet(path: Path | str, map_location: str | torch.device = "cpu") ->
     pixel_size = extra.pop(PIXEL_SIZE, None)
     if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
         raise UserError(f"{path}: does not hold the pixel size of its images ({PIXEL_SIZE})")
-    return SavedGraspNet(model.to(map_location).eval(), pixel_size, checkpoint["config"], extra)
+    return SavedGraspNet(model.eval(), pixel_size, checkpoint["config"], extra)
 
 
 def load_initial(model: GraspNet, path: Path | str) -> None:

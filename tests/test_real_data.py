@@ -107,8 +107,6 @@ def test_missing_folder_empty_folder_and_unknown_kind(tmp_path):
         JacquardDataset(tmp_path)
     with pytest.raises(UserError, match="did you mean cornell"):
         open_real_data("cornel", tmp_path)
-    with pytest.raises(UserError, match="perfect, stereo"):
-        JacquardDataset(tmp_path, depth="sterio")
 
 
 @pytest.mark.parametrize(
@@ -179,7 +177,6 @@ def test_jacquard_sample(tmp_path):
     assert (rectangle.width, rectangle.height) == (12, 4)
     assert sample.negatives == ()
     assert np.all(sample.depth == np.float32(1.2))
-    assert np.all(JacquardDataset(tmp_path, "stereo")[0].depth == np.float32(1.5))  # hole filled
 
 
 @pytest.mark.parametrize(
@@ -196,14 +193,6 @@ def test_broken_jacquard_labels(tmp_path, grasps, named):
     data = JacquardDataset(write_jacquard(tmp_path, grasps))
     with pytest.raises(UserError, match=named):
         data[0]
-
-
-def test_jacquard_without_its_stereo_depth(tmp_path):
-    write_jacquard(tmp_path)
-    (tmp_path / f"{JACQUARD_ID}_stereo_depth.tiff").unlink()
-    assert len(JacquardDataset(tmp_path)) == 1
-    with pytest.raises(UserError, match="_stereo_depth.tiff"):
-        JacquardDataset(tmp_path, "stereo")
 
 
 @pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")

@@ -94,10 +94,10 @@ def _whole(values: Sequence[np.ndarray], unit: float, kind: type) -> np.ndarray:
     return np.clip(scaled, 0, np.iinfo(kind).max).astype(kind)
 
 
-def read_trials(folder: Path, split: str = "train") -> list[Trial]:
-    """Read all label trials of a data set."""
+def read_trials(folder: Path) -> list[Trial]:
+    """Read all label trials on a data set's training images."""
     trials = []
-    for path in sorted((Path(folder) / split).glob("*.h5")):
+    for path in sorted((Path(folder) / "train").glob("*.h5")):
         with _open(path) as file:
             trials += [Trial(float(q), float(w), bool(s)) for q, w, s in file["trials"][:]]
     return trials

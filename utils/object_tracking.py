@@ -71,20 +71,20 @@ class ObjectTemplate:
         return len(self.height)
 
 
-def grasp_frame(grasp: Grasp, table: float = 0.0) -> np.ndarray:
-    """(4, 4) T_WO: on the table (at z = `table`) below the grasp, x along its closing line."""
+def grasp_frame(grasp: Grasp) -> np.ndarray:
+    """(4, 4) T_WO: on the table (z = 0) below the grasp, x along its closing line."""
     T = np.eye(4)
     c, s = np.cos(grasp.angle), np.sin(grasp.angle)
-    T[:2, :2], T[:2, 3], T[2, 3] = [[c, -s], [s, c]], grasp.position[:2], table
+    T[:2, :2], T[:2, 3] = [[c, -s], [s, c]], grasp.position[:2]
     return T
 
 
-def make_template(frame: RGBDFrame, grasp: Grasp, table: float = 0.0) -> ObjectTemplate:
+def make_template(frame: RGBDFrame, grasp: Grasp) -> ObjectTemplate:
     """Cut the object of a grasp out of the frame on which the grasp was planned.
 
     Raises TargetLostError where nothing stands on the table at the grasp.
     """
-    T_WO = grasp_frame(grasp, table)
+    T_WO = grasp_frame(grasp)
     T_OC = inverse_pose(T_WO) @ frame.T_WC
     reach = int(_LARGEST / CELL)
     whole = _patch(frame.depth, frame.K, T_OC, 2 * reach + 1)
@@ -179,13 +179,13 @@ class TemplateMatcher:
         self._centre = self._solid[:, :2].mean(axis=0)
         self.round = self._levels[-1].round
 
-    def find(self, depth: np.ndarray, T_CO: np.ndarray, T_CW: np.ndarray, table=0.0) -> Found:
+    def find(self, depth: np.ndarray, T_CO: np.ndarray, T_CW: np.ndarray) -> Found:
         """The object in a depth image (H, W), metres.
 
         T_CO: (4, 4) expected pose. T_CW: (4, 4) the world in the camera by the calibration, from
         which the fit of the table starts. Raises TargetLostError.
         """
-        T_PC = table_frame(*fit_table_plane(depth, self.K, T_CW, table))
+        T_PC = table_frame(*fit_table_plane(depth, self.K, T_CW))
         x, y, turn = planar_part(T_PC @ T_CO)
         expected = planar(x, y, turn)
         if self.seen_share(inverse_pose(T_PC) @ expected) < _SEEN:

@@ -115,28 +115,25 @@ class CornellDataset(RealDataset):
 
 
 class JacquardDataset(RealDataset):
-    """The Jacquard dataset: `<id>` + _RGB.png, _<kind>_depth.tiff, _grasps.txt.
+    """The Jacquard dataset: `<id>` + _RGB.png, _perfect_depth.tiff (rendered), _grasps.txt.
 
-    depth: "perfect" (rendered) or "stereo" (with a simulated sensor's holes). An id is
-    `<view>_<object>`: the views of one object share its part after the first underscore.
+    An id is `<view>_<object>`: the views of one object share its part after the first underscore.
+    The depth images with a simulated sensor's holes, _stereo_depth.tiff, are not read.
     """
 
-    def __init__(self, root: str | Path, depth: str = "perfect") -> None:
-        if depth not in ("perfect", "stereo"):
-            raise unknown_choice("data.depth", depth, ("perfect", "stereo"))
+    def __init__(self, root: str | Path) -> None:
         root = existing_folder(root)
-        self.depth_file = f"_{depth}_depth.tiff"
-        files = group_files(root, r"(.+?)(_RGB\.png|_(?:perfect|stereo)_depth\.tiff|_grasps\.txt)")
+        files = group_files(root, r"(.+?)(_RGB\.png|_perfect_depth\.tiff|_grasps\.txt)")
         if not files:
             raise UserError(f"{root}: no Jacquard files <id>_RGB.png found here or in subfolders")
-        check_complete(root, files, ("_RGB.png", self.depth_file, "_grasps.txt"))
+        check_complete(root, files, ("_RGB.png", "_perfect_depth.tiff", "_grasps.txt"))
         super().__init__(
             root, [Record(n, n.split("_", 1)[-1], f) for n, f in sorted(files.items())]
         )
 
     def read(self, record: Record) -> RealSample:
         positives = _read_jacquard_rectangles(record.files["_grasps.txt"])
-        rgb, depth = read_rgbd(record.files["_RGB.png"], record.files[self.depth_file])
+        rgb, depth = read_rgbd(record.files["_RGB.png"], record.files["_perfect_depth.tiff"])
         return RealSample(record.name, record.object_id, rgb, depth, positives)
 
 

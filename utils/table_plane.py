@@ -54,12 +54,10 @@ _PLANE_BANDS = (0.035, 0.012, 0.004)  # m around the expected table, narrower an
 _PLANE_SHARE = 0.15  # of the known pixels that have to lie on the table
 
 
-def fit_table_plane(
-    depth: np.ndarray, K: np.ndarray, T_CW: np.ndarray, table: float = 0.0
-) -> tuple[np.ndarray, float]:
+def fit_table_plane(depth: np.ndarray, K: np.ndarray, T_CW: np.ndarray) -> tuple[np.ndarray, float]:
     """(3,) unit normal towards the camera and offset d (metres) of the table, n . p + d = 0 in C.
 
-    Least squares on the pixels near the plane z = `table` of W; T_CW (4, 4) has to be right to a
+    Least squares on the pixels near the plane z = 0 of W; T_CW (4, 4) has to be right to a
     few centimetres. Raises TargetLostError where the image shows too little of the table.
     """
     step = max(1, int(np.sqrt(depth.size / 8000)))
@@ -68,7 +66,7 @@ def fit_table_plane(
     points = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1)
     points = points[known_depth(z)]
     normal = T_CW[:3, 2].copy()
-    offset = -normal @ (T_CW[:3, 3] + table * normal)
+    offset = -normal @ T_CW[:3, 3]
     for band in _PLANE_BANDS:
         near = points[np.abs(points @ normal + offset) < band]
         if len(near) < max(50, _PLANE_SHARE * len(points)):
@@ -132,14 +130,14 @@ class Plane:
         return inverse_pose(T_CW)
 
 
-def dominant_plane(points: np.ndarray, seed: int = 0) -> Plane:
+def dominant_plane(points: np.ndarray) -> Plane:
     """The plane on which most points (..., 3) in the camera's frame lie; rows of NaN are unknown.
 
     Raises UserError where no plane holds a fifth of the points.
     """
     known = points.reshape(-1, 3)
     known = known[np.isfinite(known).all(axis=1)]
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     if len(known) < 3:
         raise UserError("depth: too few known pixels to find the table")
     tolerance = TOLERANCE * float(np.median(np.linalg.norm(known, axis=1)))
