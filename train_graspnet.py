@@ -40,10 +40,9 @@ from tqdm import tqdm
 from envs.cell import camera_intrinsics
 from envs.data_generation import generate
 from envs.registries import check_names
-from models.graspnet import GraspNet, create_model
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, epoch_loader, simulated_data, steps_per_epoch
-from models.graspnet_io import load_graspnet, load_initial, save_graspnet
+from models.graspnet_io import load_graspnet, save_graspnet
 from models.graspnet_scores import (
     check_graspable,
     describe_scores,
@@ -51,7 +50,7 @@ from models.graspnet_scores import (
     draw_predictions,
     write_curves,
 )
-from models.graspnet_training import Trainer, mean_of
+from models.graspnet_training import Trainer, make_network, mean_of
 from models.rectangle_examples import Judged
 from models.rectangle_folds import (
     cross_validation_results,
@@ -134,16 +133,6 @@ def make_trainer(config: Config, data: TrainingData, processes: Team) -> Trainer
     if config.adaptation.target is not None:
         return AdaptingTrainer(model, config.train, total_steps, processes, config.adaptation)
     return Trainer(model, config.train, total_steps, processes)
-
-
-def make_network(config: Config, max_width: float) -> GraspNet:
-    """Make the network that the config describes; raises UserError if that is impossible."""
-    # Only simulated images are labelled with centres of mass.
-    centre_head = config.data.kind == "simulated" and config.train.centre_weight > 0
-    model = create_model(name=config.train.backbone, max_width=max_width, centre_head=centre_head)
-    if config.train.initial is not None:
-        load_initial(model, config.train.initial)
-    return model
 
 
 def open_run(config: Config, processes: Team) -> Path:

@@ -47,6 +47,7 @@ from models.ppo_progress import (
     save_training,
     summary,
     time_in_words,
+    updates_of,
 )
 from models.ppo_rollouts import (
     EVALUATION,
@@ -134,7 +135,7 @@ def announce(config: Config, run: Path, ppo: GraspPPO) -> None:
     hidden = ", ".join(part.key for part in layout.privileged)
     estimated = ", ".join(settings.estimated_observations or ())
     print(
-        f"PPO on {settings.env_id}: {settings.envs} environments, {updates(config)} updates of "
+        f"PPO on {settings.env_id}: {settings.envs} environments, {updates_of(config)} updates of "
         f"{settings.envs * settings.rollout_steps:,} steps each, "
         f"{sum(p.numel() for p in ppo.network.parameters()):,} parameters, "
         f"{processes.ranks} process(es), {processes.device}, seed {config.seed}; "
@@ -145,11 +146,6 @@ def announce(config: Config, run: Path, ppo: GraspPPO) -> None:
     )
 
 
-def updates(config: Config) -> int:
-    """The number of updates until rl.total_steps are reached."""
-    return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
-
-
 def train(
     config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[ProgressRow]
 ) -> bool:
@@ -157,7 +153,7 @@ def train(
     history."""
     processes, settings, watch = ppo.team, config.rl, Stopwatch()
     collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, processes.device, watch)
-    per_update, total = settings.envs * settings.rollout_steps, updates(config)
+    per_update, total = settings.envs * settings.rollout_steps, updates_of(config)
     step = ppo.updates * per_update
     curves = Curves(run / "tensorboard", step, processes.is_main)
     try:

@@ -1,4 +1,4 @@
-"""Training steps of GraspNet: precision, schedule, and checkpoints that resume exactly.
+"""Training of GraspNet: the network to train, precision, schedule, steps, exact resume.
 
 This module knows neither the source of the batches nor how a trained network is judged.
 """
@@ -15,9 +15,9 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from models.graspnet import GraspLoss, GraspNet
+from models.graspnet import GraspLoss, GraspNet, create_model
 from models.graspnet_data import Example
-from models.graspnet_io import KIND, PIXEL_SIZE
+from models.graspnet_io import KIND, PIXEL_SIZE, load_initial
 from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
 from utils.config import Config, TrainConfig
 from utils.distributed import Team
@@ -47,6 +47,16 @@ def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
     if step < warmup:
         return (step + 1) / (warmup + 1)
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))
+
+
+def make_network(config: Config, max_width: float) -> GraspNet:
+    """Make the network that the config describes; raises UserError if that is impossible."""
+    # Only simulated images are labelled with centres of mass.
+    centre_head = config.data.kind == "simulated" and config.train.centre_weight > 0
+    model = create_model(name=config.train.backbone, max_width=max_width, centre_head=centre_head)
+    if config.train.initial is not None:
+        load_initial(model, config.train.initial)
+    return model
 
 
 class Trainer:

@@ -30,6 +30,11 @@ UNITS = {
 }
 
 
+def updates_of(config: Config) -> int:
+    """The number of updates until rl.total_steps are reached."""
+    return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
+
+
 def summary(episodes: Sequence[Episode]) -> dict[str, float]:
     """Means over episodes: return, length, and success where episodes report it; empty without
     episodes."""
