@@ -20,8 +20,9 @@ v_C = (v, w), m/s and rad/s, of the camera in its own frame. Formulas: Chaumette
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import sin, sqrt
+from typing import Any
 
 import numpy as np
 
@@ -95,8 +96,8 @@ class ImageBasedVisualServo(VisualServo):
         *,
         interaction: str = "current",
         depth: float | DepthFromMotion | None = None,
-        **options,
-    ):
+        **options: Any,
+    ) -> None:
         """interaction: L at the current view, at the desired one, or the mean of both.
         depth: used where a view has no depths: metres for all points, or an estimator; with None a
         view without depths is a DepthError. options: see `VisualServo`.
@@ -112,14 +113,22 @@ class ImageBasedVisualServo(VisualServo):
         if isinstance(self.depth, DepthFromMotion):
             self.depth.reset()
 
-    def compute_interaction_matrix(self, point, Z: float | None = None) -> np.ndarray:
+    def compute_interaction_matrix(
+        self, point: Sequence[float], Z: float | None = None
+    ) -> np.ndarray:
         """(2, 6) L of one pixel (u, v) at depth Z, metres; in normalised coordinates."""
         xy = self.camera.normalise_unchecked(np.array([point], dtype=float))
         if not np.isfinite(xy).all():
             raise PointError(f"point: not finite: {point}")
         return interaction_matrix(xy, self._depths(xy, Z))
 
-    def compute_velocity(self, current_points, desired_points, Z=None, desired_Z=None):
+    def compute_velocity(
+        self,
+        current_points: np.ndarray,
+        desired_points: np.ndarray,
+        Z: np.ndarray | float | None = None,
+        desired_Z: np.ndarray | float | None = None,
+    ) -> np.ndarray:
         """(6,) v_C from current and desired pixels (n, 2).
 
         Z: current depths, (n,) or one for all points, metres. desired_Z: depths at the goal, which
@@ -142,7 +151,7 @@ class ImageBasedVisualServo(VisualServo):
         inverse, condition = pseudo_inverse(L, self.damping, self.truncation)
         return error, inverse @ error, condition
 
-    def _depths(self, xy: np.ndarray, given) -> np.ndarray:
+    def _depths(self, xy: np.ndarray, given: np.ndarray | float | None) -> np.ndarray:
         if given is not None:
             return check_depths(given, len(xy))
         if isinstance(self.depth, DepthFromMotion):
@@ -159,14 +168,17 @@ class PositionBasedVisualServo(VisualServo):
     and Hutchinson 2006, equation 15).
     """
 
-    def estimate_3d_position(self, point, depth_map: np.ndarray) -> np.ndarray:
+    def estimate_3d_position(self, point: Sequence[float], depth_map: np.ndarray) -> np.ndarray:
         """(3,) point in C, metres, of a pixel (u, v) in a depth image (H, W).
 
         Raises PointError outside the image and DepthError where the depth is unknown.
         """
-        return self.pixel_to_3d(*point, depths_from_image(point, depth_map)[0])
+        u, v = point
+        return self.pixel_to_3d(u, v, depths_from_image(point, depth_map)[0])
 
-    def compute_end_effector_velocity(self, current_pose, target_pose) -> np.ndarray:
+    def compute_end_effector_velocity(
+        self, current_pose: np.ndarray, target_pose: np.ndarray
+    ) -> np.ndarray:
         """(6,) v_C from the object's current and desired pose T_CO (4, 4). All six components."""
         return self.step(ServoView(T_CO=current_pose), ServoView(T_CO=target_pose)).velocity
 
@@ -200,8 +212,8 @@ class HybridVisualServo(VisualServo):
         scheme: str = "blend",
         interaction: str = "mean",
         truncation: float = 1e-4,
-        **options,
-    ):
+        **options: Any,
+    ) -> None:
         """alpha: share of the position-based velocity, 0 to 1. scheme: blend or 2.5d.
 
         interaction: of the blend's image-based half. With the mean one the camera turns in place
@@ -223,7 +235,12 @@ class HybridVisualServo(VisualServo):
         )
 
     def compute_velocity(
-        self, current_pose, current_pixels, target_pose, target_pixels, depth_map
+        self,
+        current_pose: np.ndarray,
+        current_pixels: np.ndarray,
+        target_pose: np.ndarray,
+        target_pixels: np.ndarray,
+        depth_map: np.ndarray,
     ) -> np.ndarray:
         """(6,) v_C from the current and the desired view.
 
@@ -234,7 +251,7 @@ class HybridVisualServo(VisualServo):
         depths = depths_from_image(current_pixels, depth_map)
         view = ServoView(current_pixels, depths, current_pose)
         T_GC = relative_pose(view, ServoView(T_CO=target_pose))
-        goal_depths = transform_points(T_GC, points_from_depths(xy, view.depths))[:, 2]
+        goal_depths = transform_points(T_GC, points_from_depths(xy, depths))[:, 2]
         return self.step(view, ServoView(target_pixels, goal_depths, target_pose)).velocity
 
     def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
@@ -264,7 +281,7 @@ class HybridVisualServo(VisualServo):
         return error, inverse @ error, condition
 
 
-def centre_of(xy: np.ndarray, depths) -> np.ndarray:
+def centre_of(xy: np.ndarray, depths: np.ndarray | float | None) -> np.ndarray:
     """(3,) mean in C of points at normalised coordinates (n, 2) and depths (n,), metres."""
     if depths is None:
         raise DepthError("depths: needed in the view and in the goal, got None")
