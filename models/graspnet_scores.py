@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
@@ -178,6 +177,8 @@ def write_curves(writer: SummaryWriter, row: Mapping[str, float]) -> None:
 
 def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
     """Draw one small plot for every loss (training) and score (validation) over the epochs."""
+    import matplotlib.pyplot as plt  # takes long to import, and few need it
+
     names = [name for name in history[-1] if name not in NO_CURVES]
     columns = 4
     rows = -(-len(names) // columns)
@@ -200,6 +201,8 @@ def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
 
 def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count: int = 8) -> None:
     """Draw rows of: colour with the best grasps, depth, labelled and predicted quality."""
+    import matplotlib.pyplot as plt  # takes long to import, and few need it
+
     chosen = np.linspace(0, len(images) - 1, min(count, len(images))).astype(int)
     titles = ("grasps", "depth", "labelled quality", "predicted quality")
     figure, axes = plt.subplots(

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from torch.utils.data import Dataset
@@ -32,6 +32,9 @@ from utils.rectangles import (
 )
 from utils.runs import save_figure
 from utils.transforms import angle_difference
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 ANYWHERE = 0.5  # of the examples show any part of the view: its corners hold nothing to grasp
 HIGHEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
@@ -213,6 +216,8 @@ def draw_rectangles(
 ) -> None:
     """Draw a grid of images with their labels (green) and the prediction (blue if correct, else
     red); the thick sides are the plates."""
+    import matplotlib.pyplot as plt  # takes long to import, and few need it
+
     chosen = np.unique(np.linspace(0, len(judged) - 1, min(shown, len(judged))).astype(int))
     rows = -(-len(chosen) // COLUMNS)
     figure, axes = plt.subplots(
@@ -238,7 +243,7 @@ def draw_rectangles(
     save_figure(path, figure)
 
 
-def _outline(axis: plt.Axes, rectangle: GraspRectangle, colour: str, width: float) -> None:
+def _outline(axis: Axes, rectangle: GraspRectangle, colour: str, width: float) -> None:
     corners = rectangle.corners()
     u, v = corners[[0, 1, 2, 3, 0]].T
     axis.plot(u, v, color=colour, linewidth=width)

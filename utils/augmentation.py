@@ -2,8 +2,9 @@
 
 Image, depth, mask, angle bins and widths move together, so that the labels of the changed image
 are the changed labels. Angles are image angles of the closing line, from +u (right) towards +v
-(down), modulo pi; bin k of B is centred at k x pi / B. torchvision resamples. This module knows no
-data set, no network and no simulator.
+(down), modulo pi; bin k of B is centred at k x pi / B. torchvision resamples; it is imported where
+it is used, because its import takes seconds and only a training needs it. This module knows no data
+set, no network and no simulator.
 """
 
 from __future__ import annotations
@@ -14,9 +15,6 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from torchvision import tv_tensors
-from torchvision.transforms.v2 import InterpolationMode
-from torchvision.transforms.v2 import functional as F
 
 TensorNoise = Callable[[torch.Tensor, np.random.Generator], torch.Tensor]
 
@@ -113,9 +111,9 @@ def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
     # The origin of each new pixel: the changed image of pixel numbers counted from 1.
     source = torch.arange(1, image.depth.numel() + 1, dtype=torch.float32).reshape(1, *size)
     if change.mirror:
-        rgb, source = F.horizontal_flip(rgb), F.horizontal_flip(source)
-    rgb = _affine(tv_tensors.Image(rgb), change)
-    source = _affine(tv_tensors.Mask(source), change).long().flatten() - 1
+        rgb, source = rgb.flip(-1), source.flip(-1)
+    rgb = _affine(rgb, change, kind="Image")
+    source = _affine(source, change, kind="Mask").long().flatten() - 1
     outside = source < 0
     source.clamp_(min=0)
 
@@ -139,18 +137,24 @@ def apply_similarity(image: LabelledImage, change: Similarity) -> LabelledImage:
     )  # fmt: skip
 
 
-def _affine(image: tv_tensors.TVTensor, change: Similarity) -> torch.Tensor:
-    """Turned, scaled and shifted; `F.affine` turns clockwise and takes the nearest for a Mask."""
-    if (change.turn, *change.shift, change.scale) != (0, 0, 0, 1):
-        image = F.affine(
-            image,
-            angle=float(np.degrees(change.turn)),
-            translate=list(change.shift),
-            scale=change.scale,
-            shear=[0.0, 0.0],
-            interpolation=InterpolationMode.BILINEAR,
-        )
-    return image.as_subclass(torch.Tensor)
+def _affine(image: torch.Tensor, change: Similarity, kind: str) -> torch.Tensor:
+    """Turned, scaled and shifted. kind: of torchvision's tensors; `affine` turns clockwise,
+    interpolates an "Image" and takes the nearest pixel of a "Mask"."""
+    if (change.turn, *change.shift, change.scale) == (0, 0, 0, 1):
+        return image
+    from torchvision import tv_tensors
+    from torchvision.transforms.v2 import InterpolationMode
+    from torchvision.transforms.v2.functional import affine
+
+    moved = affine(
+        getattr(tv_tensors, kind)(image),
+        angle=float(np.degrees(change.turn)),
+        translate=list(change.shift),
+        scale=change.scale,
+        shear=[0.0, 0.0],
+        interpolation=InterpolationMode.BILINEAR,
+    )
+    return moved.as_subclass(torch.Tensor)
 
 
 def turn_bins(
@@ -200,6 +204,8 @@ class ColourJitter:
 
     def __call__(self, rgb: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
         """Return the image (3, H, W) uint8 with changed colours."""
+        from torchvision.transforms.v2 import functional as F
+
         for adjust, half in (
             (F.adjust_brightness, self.brightness),
             (F.adjust_contrast, self.contrast),

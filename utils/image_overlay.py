@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import cv2
-import matplotlib
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from PIL import Image
 
 from utils.images import PixelScaling
 from utils.transforms import ImageGrasp
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SUCCESS_COLOR = (52, 211, 123)  # RGB
 FAILURE_COLOR = (248, 92, 92)
@@ -116,6 +116,9 @@ def prediction_panel(
     numbered in that order, the best is green. quality, angle, width: (H, W); image angles in
     radians, widths in metres. max_width: metres at the top of the width's scale.
     """
+    from matplotlib.cm import ScalarMappable  # takes long to import, and few need it
+    from matplotlib.figure import Figure
+
     scaling = _to_picture(K, rgb.shape[:2])
     picture = _with_grasps(scaling, rgb, K, grasps)
     rows, columns = picture.shape[:2]
@@ -143,7 +146,7 @@ def prediction_panel(
         axes = figure.add_subplot(grid[row, 1])
         axes.imshow(bare)
         drawn = axes.imshow(_nearest(scaling, values), vmin=0, vmax=high, cmap=colours, alpha=alpha)
-        scale = matplotlib.cm.ScalarMappable(drawn.norm, drawn.cmap)  # without the fading
+        scale = ScalarMappable(drawn.norm, drawn.cmap)  # without the fading
         bar = figure.colorbar(scale, ax=axes, fraction=0.05, pad=0.03)
         if high == 180.0:
             bar.set_ticks([0, 45, 90, 135, 180])
@@ -194,6 +197,8 @@ def _nearest(scaling: PixelScaling, values: np.ndarray) -> np.ndarray:
 
 
 def _number(axes: Axes, rank: int, pixel: np.ndarray) -> None:
+    from matplotlib import patheffects
+
     text = axes.annotate(
         str(rank), pixel, xytext=(5, 5), textcoords="offset points",
         color="white", fontsize=9, fontweight="bold", annotation_clip=True,

@@ -8,12 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from utils.transforms import rotation_log
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FRAME_COLOURS = ("tab:red", "tab:green", "tab:blue")  # x, y, z
 
@@ -76,6 +79,8 @@ class ServoHistory:
     def plot(self, path: Path | str | None = None, title: str = "") -> Figure:
         """A figure of errors, velocities, condition number, image trajectories and the camera's
         path in 3-D; also written to `path`, unless that is None."""
+        from matplotlib.figure import Figure  # takes long to import, and few need it
+
         figure = Figure(figsize=(13, 7.5), layout="constrained")
         figure.suptitle(f"{title}: {self.reason}" if title else self.reason)
         panels = [figure.add_subplot(2, 3, i) for i in (1, 2, 3, 4)]
@@ -156,6 +161,8 @@ class ServoHistory:
 def plot_histories(histories: Mapping[str, ServoHistory], path: Path | str | None = None) -> Figure:
     """A figure that compares runs to one goal, each under its name: the distance and the angle
     between camera and goal, and both speeds, over time. Also written to `path`, unless None."""
+    from matplotlib.figure import Figure  # takes long to import, and few need it
+
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
     for name, history in histories.items():

@@ -11,17 +11,16 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from utils.config import Config, TransferPolicy
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord
 from utils.runs import save_results, write_atomic
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NOT_TRAINED = "-"  # a row's training where the policy learns nothing
 
@@ -224,6 +223,8 @@ def write_transfer(
 def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:
     """The bytes of a PNG file: one small panel for each column with the rows' rates and 95 %
     intervals, and below them one panel for each pair of columns that agree or do not."""
+    from matplotlib.figure import Figure  # takes long to import, and few need it
+
     shown = [line for line in lines if line.scores]
     rows = 0.27 * max(len(shown), 4)
     figure = Figure(figsize=(3.4 + 2.1 * len(columns), rows + 5.0), layout="constrained")
@@ -310,5 +311,7 @@ def _label(line: TransferLine) -> str:
 
 def _colours(lines: Sequence[TransferLine]) -> dict[str, Any]:
     """A colour for each policy."""
+    import matplotlib
+
     names = dict.fromkeys(line.row.policy for line in lines)
     return {name: matplotlib.colormaps["tab10"](k % 10) for k, name in enumerate(names)}
