@@ -42,6 +42,26 @@ def tiny_data(tmp_path_factory):
     return folder, overrides
 
 
+@pytest.fixture
+def played_here(monkeypatch):
+    """Evaluations play their rounds in this process instead of worker processes."""
+    from envs import evaluation_worker
+    from tests.helpers.played_here import CallingExecutor
+
+    monkeypatch.setattr("utils.evaluation.process_pool", CallingExecutor)
+    cells = []
+
+    def set_up(config: Config) -> None:
+        set_up_worker(config)
+        cells.append(evaluation_worker._cell)
+
+    set_up_worker = evaluation_worker.set_up
+    monkeypatch.setattr("evaluate.set_up", set_up)
+    yield
+    for cell in cells:
+        cell.close()
+
+
 @pytest.fixture(scope="module", params=list(SIMULATORS))
 def taught_cell(request, config: Config):
     """The cell of each simulator, whose wrist camera has been shown the board."""

@@ -56,7 +56,7 @@ def test_a_wrong_calibration_does_not_hurt_what_was_shown(cell, scene, controlle
 
 
 @pytest.mark.slow
-def test_evaluate_scores_closed_loops(tmp_path, monkeypatch):
+def test_evaluate_scores_closed_loops(tmp_path, monkeypatch, played_here):
     """The command of docs/sim_to_real.md, on one object."""
     monkeypatch.chdir(tmp_path)
     settings = (

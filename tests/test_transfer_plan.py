@@ -2,8 +2,6 @@
 
 import json
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -154,17 +152,18 @@ def test_outside_is_outside():
 
 
 @pytest.mark.slow
-def test_the_command_from_end_to_end(tmp_path):
-    command = [
-        sys.executable, REPOSITORY / "evaluate.py", "--config", REPORT, "evaluate.rounds=1",
-        "evaluate.workers=1", "evaluate.scenarios=isolated", "evaluate.object_sets=primitives",
+def test_the_command_from_end_to_end(tmp_path, monkeypatch, capsys, played_here):
+    monkeypatch.chdir(tmp_path)
+    arguments = [
+        "--config", str(REPORT), "evaluate.rounds=1", "evaluate.workers=1",
+        "evaluate.scenarios=isolated", "evaluate.object_sets=primitives",
         "transfer.columns=pybullet,outside,cornell", "sim.renderer=tiny",
         "--results", "copy.json",
     ]  # fmt: skip
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert "PyBullet outside the ranges" in done.stdout and "not trained" in done.stdout
-    assert "transfer.cornell" in done.stdout
+    assert evaluate.main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "PyBullet outside the ranges" in printed and "not trained" in printed
+    assert "transfer.cornell" in printed
     rows = json.loads((tmp_path / "copy.json").read_text())["rows"]
     heuristic = next(row for row in rows if row["policy"] == "heuristic")
     assert set(heuristic["columns"]) == {"pybullet", "outside"}
