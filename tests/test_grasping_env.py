@@ -758,8 +758,8 @@ def test_stable_baselines3_trains_on_it_unmodified(config, algorithm):
     if algorithm == "PPO":
         settings = {"n_steps": 250, "batch_size": 125, "n_epochs": 1}
     else:
-        settings = {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32, "train_freq": 50,
-                    "gradient_steps": 5}  # fmt: skip
+        settings = {"buffer_size": 2000, "learning_starts": 100, "batch_size": 8, "train_freq": 100,
+                    "gradient_steps": 2}  # fmt: skip
     learner = getattr(stable_baselines3, algorithm)("MultiInputPolicy", env, seed=0, **settings)
     learner.learn(2000)
     assert learner.num_timesteps >= 2000
