@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 .PHONY: run quick test test-fast lint typecheck bench results clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
-PARALLEL := -n 2 --dist loadfile
+# tests/conftest.py orders the files.
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 test test-fast: export OMP_NUM_THREADS := 1
 
 run: $(VENV)/.installed

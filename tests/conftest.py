@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+from collections import Counter
+
 import hypothesis
 import pytest
 
@@ -11,6 +15,13 @@ from utils.config import Config, load_config
 # The same examples everywhere, and no verdict from how busy the machine is.
 hypothesis.settings.register_profile("everywhere", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("everywhere")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The files with the most slow tests first: a file stays in one process, and so the last files
+    have to be short for two processes to end together."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")
@@ -29,16 +40,23 @@ def box_set(config: Config):
 
 @pytest.fixture(scope="session")
 def tiny_data(tmp_path_factory):
-    """32 training and 32 validation images of 64 pixels, and the overrides that made them."""
+    """32 training and 32 validation images of 64 pixels, and the overrides that made them.
+
+    The processes of one run share them; the first that needs them makes them."""
     from envs.data_generation import generate
 
-    folder = tmp_path_factory.mktemp("tiny_data")
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # whose folder lies in that of the whole run
+        shared = shared.parent
+    folder = shared / "tiny_data"
     overrides = [
         "sim.renderer=tiny", "camera.width=64", "camera.height=64", f"data.root={folder}",
         "data.frames=32", "data.validation_frames=32", "data.object_sets=primitives",
         "data.max_objects=2", "data.executed_share=0.01", "data.workers=1",
     ]  # fmt: skip
-    generate(load_config(None, overrides))
+    with open(shared / "tiny_data.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        generate(load_config(None, overrides))
     return folder, overrides
 
 
@@ -71,6 +89,13 @@ def taught_cell(request, config: Config):
 
     with SIMULATORS[request.param](config) as cell:
         teach(cell)  # empties the cell, the first time
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def bullet_cell(config: Config):
+    """An empty PyBullet cell."""
+    with SIMULATORS["pybullet"](config) as cell:
         yield cell
 
 

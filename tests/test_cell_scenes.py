@@ -7,14 +7,12 @@ import pytest
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.objects import load_object_set
 from envs.pybullet_bodies import LayoutTable
-from envs.pybullet_cell import PybulletCell
 from utils.config import with_settings
 
 
 @pytest.fixture(scope="module")
-def cell(config):
-    with PybulletCell(config) as cell:
-        yield cell
+def cell(bullet_cell):
+    return bullet_cell
 
 
 @pytest.fixture(scope="module")

@@ -192,6 +192,7 @@ def test_resume_runs_only_what_is_missing(finished, monkeypatch, played_here):
     }
 
 
+@pytest.mark.slow
 def test_ctrl_c_writes_what_was_measured(tmp_path):
     process = subprocess.Popen(
         [sys.executable, REPOSITORY / "evaluate.py", *SMALL, "evaluate.rounds=400",

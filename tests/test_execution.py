@@ -6,16 +6,14 @@ import pytest
 
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
 from envs.execution import execute_grasp
-from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.transforms import Grasp
 
 
 @pytest.fixture(scope="module")
-def cell(config):
-    with PybulletCell(config) as cell:
-        yield cell
+def cell(bullet_cell):
+    return bullet_cell
 
 
 def test_good_grasp_succeeds_and_the_cube_ends_in_the_bin(cell, box_set):

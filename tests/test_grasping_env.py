@@ -144,6 +144,7 @@ def test_public_methods_of_the_tutorial_exist():
         assert callable(getattr(RobotGraspingEnv, name)), name
 
 
+@pytest.mark.slow
 def test_demonstration_runs_without_a_display(tmp_path):
     """The tutorial's command, from any folder: a line on each phase, a picture and a film."""
     repository = str(Path(__file__).resolve().parents[1])

@@ -444,9 +444,9 @@ def test_the_choice_can_go_back_to_an_earlier_epoch():
 
 @pytest.fixture(scope="module")
 def finished(tiny_data, photographs, tmp_path_factory):
-    """An adaptation of three epochs of four steps: its run folder and its arguments."""
+    """An adaptation of two epochs of four steps: its run folder and its arguments."""
     folder = tmp_path_factory.mktemp("adaptation")
-    arguments = [*tiny_data[1], *SMALL, f"adaptation.target={photographs}"]
+    arguments = [*tiny_data[1], *SMALL, "train.epochs=2", f"adaptation.target={photographs}"]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert train_graspnet.main([*arguments, "--weights", "adapted.pt"]) == 0
@@ -455,10 +455,11 @@ def finished(tiny_data, photographs, tmp_path_factory):
     return run, arguments
 
 
+@pytest.mark.slow
 def test_the_script_adapts(finished):
     run, _ = finished
     history = json.loads((run / "results.json").read_text())["history"]
-    assert [row["step"] for row in history] == [4, 8, 12]
+    assert [row["step"] for row in history] == [4, 8]
     assert all(row["information"] >= 0 and row["domain_loss"] > 0 for row in history)
     best = load_graspnet(run / "best.pt")
     epoch = best.extra["history"][-1]["epoch"]

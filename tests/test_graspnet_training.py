@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +13,10 @@ from models.graspnet_io import save_graspnet
 from models.graspnet_training import Trainer, choose_precision, warm_up_and_cosine
 from tests.helpers.compare import same
 from tests.helpers.one_step import joint_batch, part_of, take_steps
+from tests.helpers.torchrun import REPOSITORY, in_two_processes
 from utils.config import load_config
 from utils.distributed import ALONE, Team
 from utils.errors import UserError
-
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 
 def test_warm_up_and_cosine():
@@ -122,12 +117,7 @@ def test_checkpoints_that_do_not_fit_are_refused(tmp_path, config):
 
 @pytest.mark.slow
 def test_two_processes_take_the_step_of_the_joint_batch(tmp_path):
-    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    done = subprocess.run(
-        [*run, "-m", "tests.helpers.one_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
-        capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    in_two_processes(REPOSITORY, "-m", "tests.helpers.one_step", tmp_path)
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert same(first, second), "the processes stay together"
     joint = take_steps(ALONE)["gradients"]

@@ -28,6 +28,7 @@ def test_settled_objects_stay_where_pybullet_has_them(cells, pile):
         assert np.linalg.norm(off) < 0.003
 
 
+@pytest.mark.slow
 def test_an_oracle_clears_a_pile(cells, pile):
     """Judged by the same function as in PyBullet."""
     mujoco = cells[1]

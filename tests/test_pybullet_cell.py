@@ -14,9 +14,8 @@ from utils.transforms import top_down_pose
 
 
 @pytest.fixture(scope="module")
-def cell(config):
-    with PybulletCell(config) as cell:
-        yield cell
+def cell(bullet_cell):
+    return bullet_cell
 
 
 def test_frame_shows_the_cube_where_it_is(cell, box_set):

@@ -9,7 +9,6 @@ import pytest
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
 from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
@@ -18,9 +17,8 @@ from utils.transforms import Grasp
 
 
 @pytest.fixture(scope="module")
-def cell(config):
-    with PybulletCell(config) as cell:
-        yield cell
+def cell(bullet_cell):
+    return bullet_cell
 
 
 def planner_of(grasps):

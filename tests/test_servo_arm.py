@@ -8,7 +8,6 @@ import pytest
 
 from envs.cell_layout import Scene
 from envs.pybullet_bodies import static_box
-from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics
 from envs.robot_safety import ArmStoppedError
 from envs.servo_arm import ServoArm
@@ -16,9 +15,8 @@ from utils.config import load_config
 
 
 @pytest.fixture(scope="module")
-def cell(config):
-    with PybulletCell(config) as cell:
-        yield cell
+def cell(bullet_cell):
+    return bullet_cell
 
 
 def empty(cell, *overrides):

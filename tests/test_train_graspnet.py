@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -23,6 +20,7 @@ from models.graspnet_scores import LabelScores
 from models.graspnet_training import Trainer
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
+from tests.helpers.torchrun import in_two_processes
 from tests.helpers.trainings import SMALL
 from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
@@ -104,6 +102,7 @@ def test_tensorboard_tells_training_from_validation_with_units(finished):
     assert rate == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [4, 5])
 def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     finished, tmp_path, monkeypatch, capfd, stop
@@ -206,13 +205,8 @@ def test_training_can_start_from_weights(finished, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_script_under_torchrun_leaves_one_run(tiny_data, tmp_path):
-    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    done = subprocess.run(
-        [*run, REPOSITORY / "train_graspnet.py", *tiny_data[1], *SMALL, "train.epochs=1"],
-        cwd=tmp_path, timeout=300, capture_output=True, text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "2 process(es)" in done.stdout and done.stdout.count("best after epoch 1") == 1
+    script = REPOSITORY / "train_graspnet.py"
+    printed = in_two_processes(tmp_path, script, *tiny_data[1], *SMALL, "train.epochs=1")
+    assert "2 process(es)" in printed and printed.count("best after epoch 1") == 1
     (folder,) = (tmp_path / "runs" / "train_graspnet").iterdir()
     assert json.loads((folder / "results.json").read_text())["best"]["step"] == 4

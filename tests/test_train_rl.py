@@ -27,6 +27,7 @@ from tests.helpers.interruption import interrupt_after
 from tests.helpers.ppo_parts import batch_of, ppo_of
 from tests.helpers.ppo_step import SIZE, take_step
 from tests.helpers.quick_envs import POINT
+from tests.helpers.torchrun import in_two_processes
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.distributed import ALONE
@@ -136,6 +137,7 @@ def test_a_run_that_estimates_goes_on_bit_for_bit(tmp_path, monkeypatch, memory,
         assert torch.equal(found[name], value), name
 
 
+@pytest.mark.slow
 def test_the_estimator_learns_where_the_goal_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     longer = [*POINT, *ESTIMATED, "rl.total_steps=4096", "rl.rollout_steps=128", "rl.lr=1e-4",
@@ -147,6 +149,7 @@ def test_the_estimator_learns_where_the_goal_is(tmp_path, monkeypatch):
     assert losses[-1] < losses[0] / 3
 
 
+@pytest.mark.slow
 def test_pretraining_teaches_the_estimator_before_anything_is_done(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = [*POINT, *ESTIMATED, "rl.total_steps=128", "rl.rollout_steps=64",
@@ -338,16 +341,10 @@ def test_a_killed_worker_ends_the_script_with_its_traceback(tmp_path):
 
 # --- Several processes -------------------------------------------------------------------------
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-
 
 @pytest.mark.slow
 def test_two_processes_take_the_step_of_the_joint_minibatch(tmp_path):
-    done = subprocess.run(
-        [*TORCHRUN, "-m", "tests.helpers.ppo_step", str(tmp_path)], cwd=REPOSITORY, timeout=300,
-        capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    in_two_processes(REPOSITORY, "-m", "tests.helpers.ppo_step", tmp_path)
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert same(dict(first), dict(second)), "the processes stay together"
     joint = take_step(ALONE)
@@ -360,19 +357,17 @@ def test_two_processes_take_the_step_of_the_joint_minibatch(tmp_path):
 
 @pytest.mark.slow
 def test_the_script_under_torchrun_leaves_one_run(tmp_path):
-    done = subprocess.run(
-        [*TORCHRUN, REPOSITORY / "train_rl.py", *POINT, "rl.envs=4"], cwd=tmp_path, timeout=300,
-        capture_output=True, text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "2 process(es)" in done.stdout and done.stdout.count("best evaluation") == 1
+    printed = in_two_processes(tmp_path, REPOSITORY / "train_rl.py", *POINT, "rl.envs=4")
+    assert "2 process(es)" in printed and printed.count("best evaluation") == 1
     (run,) = (tmp_path / "runs" / "train_rl").iterdir()
     rows = json.loads((run / "results.json").read_text())["history"]
     assert [row["step"] for row in rows] == [0, 128, 192]
 
 
 # --- Learning ----------------------------------------------------------------------------------
+
+
+LITTLE = 0.3  # the success of a policy that has not learned
 
 
 @pytest.mark.slow
@@ -389,28 +384,28 @@ def test_the_point_learns_to_go_to_its_goal(tmp_path, monkeypatch, target, chang
     monkeypatch.chdir(tmp_path)
     settings = ["rl.total_steps=30000", "rl.rollout_steps=64", "rl.envs=8", "rl.batch_size=128",
                 "rl.hidden_dim=32", "rl.lr=2e-3", "rl.gamma=0.9", "rl.evaluation_episodes=50",
-                f"rl.target_success={target}", "rl.evaluate_every=10", "rl.epochs=5",
+                f"rl.target_success={(LITTLE + target) / 2}", "rl.evaluate_every=10", "rl.epochs=5",
                 "rl.image_feature_dim=64", "rl.target_kl=null",
                 "rl.initial_log_std=-1"]  # fmt: skip
     assert train_rl.main([*POINT, *settings, *changes]) == 0
     (run,) = Path("runs/train_rl").iterdir()
     history = json.loads((run / "results.json").read_text())["history"]
     # Half of what was there to win: how much of it a seed gets differs from processor to processor.
-    assert history[0]["success"] < 0.3
+    # The training stops as soon as it is certain.
+    assert history[0]["success"] < LITTLE
     assert max(row["success"] for row in history) >= (history[0]["success"] + target) / 2
 
 
 @pytest.mark.slow
 def test_the_pendulum_is_learned(tmp_path, monkeypatch):
     """To a return that takes swinging up and balancing from most places: hanging still costs about
-    1,200 an episode, the best known policies 150. It stops at -400; less has to do, as how fast a
-    seed learns differs from processor to processor."""
+    1,200 an episode, the best known policies 150."""
     monkeypatch.chdir(tmp_path)
     settings = ["rl.env_id=Pendulum-v1", "rl.envs=4", "rl.rollout_steps=256", "rl.batch_size=64",
                 "rl.epochs=10", "rl.gamma=0.9", "rl.lr=1e-3", "rl.hidden_dim=64",
                 "rl.total_steps=100000", "rl.parallel=false", "rl.target_kl=null",
                 "rl.evaluation_episodes=20", "rl.initial_log_std=0",
-                "rl.evaluate_every=10", "rl.target_return=-400", "rl.device=cpu"]  # fmt: skip
+                "rl.evaluate_every=10", "rl.target_return=-600", "rl.device=cpu"]  # fmt: skip
     assert train_rl.main(settings) == 0
     (run,) = Path("runs/train_rl").iterdir()
     history = json.loads((run / "results.json").read_text())["history"]
