@@ -134,8 +134,9 @@ PARTS = (
                 "cornell,cornell_as_taken transfer.cornell=CORNELL"),
         Command("folds", "train_graspnet.py", "--config configs/cornell.yaml data.root=CORNELL"),
     ), needs_cornell=True),
-    Part("speed", "the environment against panda-gym and PyBullet's stock objects", 5, (
+    Part("speed", "the environment against its peers, and the planners; on a quiet machine", 8, (
         Command("environment", "bench_env", ""),
+        Command("planning", "bench_planning", ""),
     )),
 )  # fmt: skip
 

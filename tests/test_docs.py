@@ -51,6 +51,15 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower().replace("`", "")).replace(" ", "-")
 
 
+@pytest.mark.parametrize("page", [ROOT / page for page in PAGES], ids=lambda page: page.name)
+def test_every_table_is_measured(page):
+    """`with_tables` writes the command of `make results` in place of a table without figures."""
+    for body in re.findall(
+        r"<!-- results:\w+ -->\n(.*?)<!-- /results -->", text_of(page), re.DOTALL
+    ):
+        assert body.startswith("|"), body
+
+
 def test_readme_is_short():
     assert len(text_of(READMES[0]).splitlines()) <= 150
     assert len(text_of(READMES[1]).splitlines()) <= 150

@@ -1,0 +1,67 @@
+"""Time from a frame to ranked grasps: python -m benchmarks.bench_planning [--json FILE]
+
+The median over frames of fresh piles for each of the four planners of the scoreboard, with all
+cores of this machine and nothing else running. An unmeasured pass over all frames comes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+
+from benchmarks.metrics import Metric, benchmark_parser, report
+from envs.cell_scenes import make_scene
+from envs.evaluation_worker import new_planner
+from envs.objects import load_object_set
+from envs.simulators import make_cell
+from utils.config import Config, load_config
+from utils.runs import run_script
+from utils.transforms import RGBDFrame
+
+PLANNERS = ("random", "heuristic", "graspnet", "oracle")
+COUNTS = (5, 15)  # objects in a pile
+FIRST_SEED = 710_000  # of the scenes
+FRAMES = 20
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = benchmark_parser(__doc__.splitlines()[0])
+    options = parser.parse_args(argv)
+    frames = 2 if options.quick else FRAMES
+    metrics = []
+    for count in COUNTS:
+        config = load_config(None, ["sim.renderer=tiny", f"scene.count={count}"])
+        seen = frames_of(config, frames)
+        metrics += [
+            Metric(f"{name}, pile of {count}", plan_ms(name, config, seen), "ms")
+            for name in PLANNERS
+        ]
+    report(metrics, options.json)
+
+
+def frames_of(config: Config, count: int) -> list[RGBDFrame]:
+    """Frames, with the truth that the oracle needs, of piles of unseen objects."""
+    objects = load_object_set("random_urdfs", cache_dir=config.cache_folder)
+    frames = []
+    with make_cell(config) as cell:
+        for seed in range(FIRST_SEED, FIRST_SEED + count):
+            cell.load(make_scene("pile", objects, seed, config))
+            frames.append(cell.frame(with_truth=True))
+    return frames
+
+
+def plan_ms(name: str, config: Config, frames: Sequence[RGBDFrame]) -> float:
+    """The median time of a planner's plans in milliseconds."""
+    plan = new_planner(name, config)
+    times = []
+    for frame in [*frames, *frames]:
+        start = perf_counter()
+        plan(frame)
+        times.append(1000 * (perf_counter() - start))
+    return float(np.median(times[len(frames) :]))
+
+
+if __name__ == "__main__":
+    run_script(main)
