@@ -8,6 +8,7 @@ no simulator.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -119,10 +120,10 @@ FINGER_SURFACE = Surface(friction=1.0, spinning=0.1, stiffness=30000.0, damping=
 
 
 # --- Shapes ---------------------------------------------------------------------------------------
-# Each link is one convex hull, as both simulators made of each of pybullet_data's collision meshes.
-# Arm links are the hulls of a few discs, found by least squares on the distances to the tangent
-# planes of those meshes in 700 directions; `python -m benchmarks.show_robot` prints how far the two
-# lie apart.
+# Each link is one convex hull, the form in which both simulators would take a mesh, too. Arm links
+# are hulls of a few discs, fitted by least squares to the tangent planes of pybullet_data's
+# collision meshes in 700 directions; `python -m benchmarks.show_robot` prints how far the two lie
+# apart.
 
 
 class Disc(NamedTuple):
@@ -204,7 +205,7 @@ ARM_DISCS = {
         Disc("z", (0.058, 0.038, 0.081), 0.020),
         Disc("z", (0.038, 0.075, 0.092), 0.006),
         Disc("z", (0.075, 0.038, 0.092), 0.006),
-        Disc("z", (0.038, 0.080, 0.079), 0.001),
+        Disc("z", (0.038, 0.080, 0.079), 0.001),  # from here on, the corners of its lug
         Disc("z", (0.080, 0.038, 0.079), 0.001),
         Disc("z", (0.037, 0.077, 0.096), 0.001),
         Disc("z", (0.077, 0.037, 0.096), 0.001),
@@ -215,6 +216,7 @@ _CORNERS = 16  # of the polygon that stands for a disc
 # The palm's underside, as `palm_outline` has it, reaches along the closing line from y to y, mm.
 _PALM_ENDS = ((-93.1, 92.1), (-87.3, 91.1), (-90.0, 89.2), (-85.2, 93.6), (-0.9, -0.9))
 # The rest of the hand: mm across, along and below the hand's frame; each point is on both sides.
+# Fitted like the discs. The mesh is 0.6 mm off its own mirror image, the real hand is not.
 _HAND_POINTS = (
     (2.3, -83.9, -26.0), (2.0, -43.1, -26.0), (2.3, -100.2, -15.8), (0.6, -104.2, -7.4),
     (25.4, 83.3, -4.7), (31.6, -0.9, 1.0), (21.7, 91.0, 1.4), (14.1, 92.8, 3.2),
@@ -241,14 +243,16 @@ def hull_of_discs(discs: tuple[Disc, ...]) -> np.ndarray:
 def finger_hull(gripper: GripperGeometry) -> np.ndarray:
     """(V, 3) vertices, m, of the left finger in its frame: x across, y outward, z towards the tip;
     the pad's face is y = 0."""
-    (_, _), (thickness, _), *_, (widest, shoulder), (base, length) = gripper.finger_outline
+    thickness = gripper.finger_outline[1][0]
+    (outside, shoulder), (base, length) = gripper.finger_outline[-2:]
     tip, pad, bevel = gripper.tip_half_width, gripper.pad_half_width, gripper.tip_bevel
     half = gripper.finger_half_width
     points = [  # across, outward, above the tip
         (tip, 0.0, 0.0), (tip, thickness, 0.0),
         (pad, 0.0, bevel), (pad, thickness - 0.0003, bevel),
-        (pad - 0.0009, thickness - 0.0001, bevel / 2),
-        (pad, 0.0, gripper.pad_height), (half, 0.0155, shoulder), (half, widest, shoulder),
+        (pad - 0.0009, thickness - 0.0001, bevel / 2),  # the outer edge of the bevel is round
+        (pad, 0.0, gripper.pad_height),
+        (half, gripper.flank, shoulder), (half, outside, shoulder),
         (half, gripper.pad_recess, length), (half, base, length),
     ]  # fmt: skip
     return _corners(_on_both_sides(points) * (1, 1, -1) + (0, 0, length))
@@ -320,6 +324,7 @@ class Link:
         return [transform_points(shape.T, shape.hull) for shape in self.shapes]
 
 
+@functools.cache  # MuJoCo's cell asks at every build
 def panda_links(gripper: GripperGeometry) -> tuple[Link, ...]:
     """Base, seven arm links, hand, left and right finger; each comes after its parent."""
     base = Shape("link0", np.eye(4), hull_of_discs(ARM_DISCS[BASE]))

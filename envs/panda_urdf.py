@@ -42,6 +42,7 @@ def write_panda(
     fine: for pictures, which show `meshes`, the detailed mesh of each part, or the shapes of the
     physics in the real robot's colours where a part has none. Otherwise those shapes are white.
     """
+    shown = meshes if fine and meshes else {}
     files: dict[str, bytes] = {}
     robot = ElementTree.Element("robot", name="panda")
     for link in welded(panda_links(gripper)):
@@ -52,7 +53,7 @@ def write_panda(
         for shape in link.shapes:
             files[f"{shape.part}.obj"] = _obj(shape.hull)
             _add_mesh(element, "collision", shape.T, f"{shape.part}.obj")
-            _add_picture(element, shape, meshes or {} if fine else {}, fine)
+            _add_picture(element, shape, shown, fine)
         if link.joint is not None:
             _add_joint(robot, link, link.joint)
     ElementTree.indent(robot)  # PyBullet takes no line of more than some 1,000 characters

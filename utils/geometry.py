@@ -128,6 +128,7 @@ class GripperGeometry:
     pad_half_width: float = 0.0087  # across, the flat face that touches the object
     pad_height: float = 0.0176  # flat from the tip up
     pad_recess: float = 0.0026  # how far the hull has receded from the pad's face at its upper end
+    flank: float = 0.0155  # outward from the pad's face, where the finger gets its whole width
     tip_half_width: float = 0.0056  # across, at the lowest point
     tip_bevel: float = 0.0030  # height above the tip from which the pad has its whole width
     palm_half_length: float = 0.104  # along
