@@ -15,9 +15,9 @@ from scipy.spatial import ConvexHull
 
 from envs.panda_model import panda_links
 from envs.pybullet_files import data_folder
-from utils.config import run_script
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
+from utils.runs import run_script
 
 
 def main(argv: Sequence[str] | None = None) -> None:
