@@ -1,87 +1,37 @@
-"""The Panda in MuJoCo: the kinematics of PyBullet's model, identified inertias, other physics.
+"""The Panda in MuJoCo: the links of `envs.panda_model`, servos, gripper and contacts.
 
-The inertias in pybullet_data's `franka_panda/panda.urdf` are placeholders; identified ones replace
-them here. This module knows nothing of scenes and tasks. MuJoCo is optional: pip install
-"mujoco>=3.3,<4".
+This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.3,<4".
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from envs.pybullet_files import FINGER_JOINTS, panda_model
-from envs.robot import FINGER_SPEED, Contact, Robot
-from envs.robot_kinematics import (
-    JOINT_LOWER,
-    JOINT_TORQUE,
-    JOINT_UPPER,
-    JOINT_VELOCITY,
-    forward_kinematics,
+from envs.panda_model import (
+    ARM_JOINTS,
+    ARM_LINKS,
+    BASE,
+    FINGER_FORCE,
+    FINGER_JOINTS,
+    FINGERS,
+    HAND,
+    Link,
+    panda_links,
 )
+from envs.robot import FINGER_SPEED, Contact, Robot
+from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, forward_kinematics
 from envs.robot_safety import ArmGate
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
+from utils.transforms import position_quaternion
 
 if TYPE_CHECKING:
     import mujoco
 
-ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
-FINGERS = ("panda_leftfinger", "panda_rightfinger")
-HAND_LINK = "panda_hand"
-_HAND_LINKS = ("panda_link7", "panda_link8", HAND_LINK)  # one link in PyBullet's cell
-FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
-
-
-class Inertial(NamedTuple):
-    """mass: kg. centre: (3,) m in the link's frame. inertia: kg m2 about the centre, along the
-    link's axes: xx, yy, zz, xy, xz, yz."""
-
-    mass: float
-    centre: tuple[float, float, float]
-    inertia: tuple[float, float, float, float, float, float]
-
-
-# Arm: Gaz, Cognetti, Oliva, Robuffo Giordano and De Luca, "Dynamic identification of the Franka
-# Emika Panda robot with retrieval of feasible parameters using penalty-based optimization" (RA-L
-# 2019), in the links' frames as Franka's description of the robot and MuJoCo Menagerie carry them.
-# Hand: the same two.
-INERTIALS = {
-    "panda_link1": Inertial(
-        4.970684, (0.003875, 0.002081, -0.04762),
-        (0.70337, 0.70661, 0.0091170, -0.000139, 0.006772, 0.019169),
-    ),
-    "panda_link2": Inertial(
-        0.646926, (-0.003141, -0.02872, 0.003495),
-        (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704),
-    ),
-    "panda_link3": Inertial(
-        3.228604, (0.027518, 0.039252, -0.066502),
-        (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805),
-    ),
-    "panda_link4": Inertial(
-        3.587895, (-0.05317, 0.104419, 0.027454),
-        (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
-    ),
-    "panda_link5": Inertial(
-        1.225946, (-0.011953, 0.041065, -0.038437),
-        (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
-    ),
-    "panda_link6": Inertial(
-        1.666555, (0.060149, -0.014117, -0.010517),
-        (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
-    ),
-    "panda_link7": Inertial(
-        0.735522, (0.010517, -0.004252, 0.061597),
-        (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
-    ),
-    "panda_hand": Inertial(0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0)),
-    "panda_leftfinger": Inertial(0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0, 0, 0)),
-    "panda_rightfinger": Inertial(0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0, 0, 0)),
-}  # fmt: skip
+_HAND_LINKS = (ARM_LINKS[-1], HAND)  # one link in PyBullet's cell
 
 # Servos: N m/rad and N m s/rad, near critical damping with the reflected inertia of the motors,
 # about 0.1 kg m2 (the gears' ratio squared times the rotor's), which the identified links lack.
@@ -110,16 +60,12 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     One motor drives both fingers, as in the real hand. Raises UserError without MuJoCo.
     """
     mujoco = load_mujoco()
-    spec = mujoco.MjSpec.from_string(_urdf(gripper))
-    for name, inertial in INERTIALS.items():
-        body = spec.body(name)
-        body.mass, body.ipos, body.fullinertia = inertial
-        body.iquat = [1, 0, 0, 0]
-        body.explicitinertial = True
-        body.gravcomp = 1.0  # Franka's controller carries the arm's own weight
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    for link in panda_links(gripper):
+        _add_link(mujoco, spec, link)
     for i, name in enumerate(ARM_JOINTS):
         joint = spec.joint(name)
-        joint.range = [JOINT_LOWER[i], JOINT_UPPER[i]]  # the URDF's are wider
         joint.armature = _ARMATURE
         stiffness, torque = _STIFFNESS[i], JOINT_TORQUE[i]
         _servo(mujoco, spec, name, mujoco.mjtTrn.mjTRN_JOINT, (
@@ -138,11 +84,30 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     _servo(mujoco, spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, (
         _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
     ), FINGER_FORCE, [0.0, gripper.max_opening])  # fmt: skip
-    for one, other in (("panda_link7", HAND_LINK), ("panda_link5", "panda_link7")):
+    # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
+    for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
         exclude = spec.add_exclude()
         exclude.bodyname1, exclude.bodyname2 = one, other
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return spec
+
+
+def _add_link(mujoco, spec: mujoco.MjSpec, link: Link) -> None:
+    parent = spec.worldbody if link.parent is None else spec.body(link.parent)
+    position, quaternion = position_quaternion(link.T)
+    body = parent.add_body(name=link.name, pos=list(position), quat=np.roll(quaternion, 1).tolist())
+    body.mass, body.ipos, body.fullinertia = link.inertial
+    body.explicitinertial = True
+    body.gravcomp = 1.0  # Franka's controller carries the arm's own weight
+    for shape, hull in zip(link.shapes, link.hulls()):
+        mesh = spec.add_mesh(name=f"{link.name}_{shape.part}", uservert=hull.ravel())
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=[1, 1, 1, 1])
+    if link.joint is not None:
+        kinds = {"revolute": mujoco.mjtJoint.mjJNT_HINGE, "prismatic": mujoco.mjtJoint.mjJNT_SLIDE}
+        joint = body.add_joint(
+            name=link.joint.name, type=kinds[link.joint.kind], axis=list(link.joint.axis)
+        )
+        joint.range, joint.limited = [link.joint.lower, link.joint.upper], True
 
 
 def _servo(mujoco, spec, target: str, kind, gains, force: float, span) -> None:
@@ -153,20 +118,6 @@ def _servo(mujoco, spec, target: str, kind, gains, force: float, span) -> None:
     actuator.biasprm[:3] = [0.0, *gains[1:]]
     actuator.forcerange, actuator.ctrlrange = [-force, force], list(span)
     actuator.forcelimited = actuator.ctrllimited = True
-
-
-def _urdf(gripper: GripperGeometry) -> str:
-    """The URDF with settings that MuJoCo takes, and the coarse meshes: the fine ones have the same
-    file names, and MuJoCo would take one for the other."""
-    robot = panda_model(gripper)
-    settings = ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler")
-    # Links without shapes are frames that are asked for; none of the shapes is only for show.
-    for name, value in {
-        "discardvisual": "false", "fusestatic": "false", "strippath": "false",
-        "balanceinertia": "true",
-    }.items():  # fmt: skip
-        settings.set(name, value)
-    return ElementTree.tostring(robot, encoding="unicode")
 
 
 class MujocoPanda(Robot):

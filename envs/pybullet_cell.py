@@ -13,6 +13,7 @@ import pybullet
 from envs.board import Board
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
+from envs.panda_urdf import write_panda
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
     add_bin,
@@ -23,7 +24,7 @@ from envs.pybullet_bodies import (
     spawn,
 )
 from envs.pybullet_camera import PybulletCamera, load_renderer
-from envs.pybullet_files import write_welded_panda
+from envs.pybullet_files import panda_meshes
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.pybullet_randomization import PybulletRandomizable
 from utils.config import Config
@@ -54,7 +55,8 @@ class PybulletCell(Cell):
         self._gui = gui
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.camera = PybulletCamera(self.client, load_renderer(self.client, config.sim.renderer))
-        self._urdf = write_welded_panda(config.cache_folder, self.gripper, fine)
+        meshes = panda_meshes() if fine else None
+        self._urdf = write_panda(config.cache_folder, self.gripper, fine, meshes)
 
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
         # Resetting states alone would leave the solver's memory behind (bullet3 #2442). A build

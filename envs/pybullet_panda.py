@@ -16,21 +16,15 @@ import numpy as np
 import pybullet
 
 from envs.robot import FINGER_SPEED, LEFT, Contact, Robot
-from envs.robot_kinematics import (
-    JOINT_LOWER,
-    JOINT_TORQUE,
-    JOINT_UPPER,
-    JOINT_VELOCITY,
-    TOOL_LENGTH,
-)
+from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
 from utils.geometry import GripperGeometry
 
-# Link numbers in the model of `envs.pybullet_files`; the hand is part of the last arm link.
+# Link numbers in the URDF of `envs.panda_urdf`; the hand is part of the last arm link.
 ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
-_URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES
+_URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_INERTIA_FROM_FILE
 _POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
@@ -40,7 +34,7 @@ _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 class PybulletPanda(Robot):
     """The robot's body in one physics client.
 
-    urdf: the model that `envs.pybullet_files.write_welded_panda` has written for this gripper.
+    urdf: the model that `envs.panda_urdf.write_panda` has written for this gripper.
     position_gain, velocity_gain, gripper_gain: factors on the motors' gains, 1 unless changed.
     latency: physics steps after which a motor command arrives, 0 unless changed.
     """
@@ -78,11 +72,6 @@ class PybulletPanda(Robot):
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
             )
-        for joint, lower, upper in zip(ARM, JOINT_LOWER, JOINT_UPPER):  # the URDF's are wider
-            pybullet.changeDynamics(
-                self.body, joint, jointLowerLimit=lower, jointUpperLimit=upper,
-                physicsClientId=client,
-            )  # fmt: skip
         self.limit_speed(JOINT_VELOCITY.max())
 
     # --- State --------------------------------------------------------------------------------

@@ -33,9 +33,10 @@ _ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 
 _D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
 
 
-TOOL_LENGTH = 0.107 + 0.105  # m from joint 7's frame to E
-# Flange 0.107 m beyond joint 7; hand turned by -45 degrees; E 0.105 m beyond the hand's origin.
-_TOOL_TURN = -np.pi / 4
+FLANGE_LENGTH = 0.107  # m from joint 7's frame to the flange, where the hand's frame is
+HAND_TURN = -np.pi / 4  # rad, of the hand about joint 7's axis
+GRASP_DEPTH = 0.105  # m from the hand's frame to E
+TOOL_LENGTH = FLANGE_LENGTH + GRASP_DEPTH
 # Each joint's a, sin alpha, which is 0, 1 or -1, and d; the tool as one more that does not turn.
 _LINKS = [
     (a, float(np.round(np.sin(alpha))), d)
@@ -48,6 +49,14 @@ _IDENTITY = np.eye(6)
 
 class UnreachableError(UserError):
     """The arm cannot reach a pose within its joint limits."""
+
+
+def joint_origin(number: int) -> tuple[tuple[float, float, float], float]:
+    """Where joint 1 to 7 is in the frame of the one before it: (3,) metres, and radians about the
+    x axis."""
+    a, alpha, d = _A[number - 1], _ALPHA[number - 1], _D[number - 1]
+    sine, cosine = (float(np.round(f(alpha))) for f in (np.sin, np.cos))  # right angles
+    return (a, -sine * d, cosine * d), alpha
 
 
 def forward_kinematics(q: np.ndarray) -> np.ndarray:
@@ -72,7 +81,7 @@ def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     In plain numbers, which for matrices this small is twice as fast as numpy.
     """
-    angles = [*q.tolist(), _TOOL_TURN]
+    angles = [*q.tolist(), HAND_TURN]
     links = [(*link, math.cos(angle), math.sin(angle)) for link, angle in zip(_LINKS, angles)]
     rows, axes, origins = [], [], []
     for x, y, z in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):

@@ -8,10 +8,13 @@ import pybullet_data
 import pytest
 from scipy.spatial.transform import Rotation
 
+from envs.panda_model import ARM_LINKS, BASE, INERTIALS
+from envs.panda_model import FINGERS as FINGER_LINKS
+from envs.panda_urdf import write_panda
 from envs.pybullet_bodies import set_up_physics
-from envs.pybullet_files import write_welded_panda
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.robot_kinematics import (
+    GRASP_DEPTH,
     JOINT_ACCELERATION,
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -32,7 +35,7 @@ HOME = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 def robot(config):
     client = pybullet.connect(pybullet.DIRECT)
     set_up_physics(client, config.sim)
-    urdf = write_welded_panda(config.cache_folder, config.gripper.geometry, fine=False)
+    urdf = write_panda(config.cache_folder, config.gripper.geometry)
     dt = 1 / config.sim.frequency
     gate = ArmGate(config.safety, config.robot, dt, config.closed_loop.floor)
     gripper, force = config.gripper.geometry, config.robot.grip_force
@@ -82,17 +85,9 @@ def _distance(client: int, body: int, point) -> float:
     return min(point[8] for point in found)
 
 
-def test_welded_model_is_the_stock_robot(stock, robot):
+def test_links_are_where_the_stock_robot_has_them(stock, robot):
     client, body = stock
     rng = np.random.default_rng(3)
-    mass = {
-        c: sum(
-            pybullet.getDynamicsInfo(b, link, physicsClientId=c)[0]
-            for link in range(-1, pybullet.getNumJoints(b, physicsClientId=c))
-        )
-        for c, b in (stock, (robot.client, robot.body))
-    }
-    assert mass[client] == pytest.approx(mass[robot.client])
     for _ in range(10):
         q, opening = rng.uniform(JOINT_LOWER, JOINT_UPPER), rng.uniform(0, 0.08)
         robot.place(q, opening)
@@ -105,12 +100,42 @@ def test_welded_model_is_the_stock_robot(stock, robot):
             )
             np.testing.assert_allclose(a[4], b[4], atol=1e-6)  # the links' frames
             assert abs(np.dot(a[5], b[5])) == pytest.approx(1, abs=1e-6)
-        # Shapes are where they were: equal distances to a small ball near the hand.
+        # So are the shapes: distances to a small ball near the hand, which arm links may be 6 mm
+        # nearer or farther from.
         near = forward_kinematics(q)[:3, 3] + rng.uniform(-0.15, 0.15, 3)
         np.testing.assert_allclose(
-            _distance(robot.client, robot.body, near), _distance(client, body, near), atol=1e-5
+            _distance(robot.client, robot.body, near), _distance(client, body, near), atol=0.007
         )
         np.testing.assert_allclose(robot.tip_pose(), forward_kinematics(q), atol=1e-6)
+
+
+def test_the_ready_pose(robot):
+    """As Franka and PyBullet have it: the hand at 0.590 m, E at 0.485 m."""
+    robot.place(HOME)
+    T = robot.tip_pose()
+    np.testing.assert_allclose(T[:3, 3], [0.306891, 0, 0.485282], atol=1e-6)
+    np.testing.assert_allclose(
+        T[:3, 3] - GRASP_DEPTH * T[:3, 2], [0.306891, 0, 0.590282], atol=1e-6
+    )
+
+
+def test_masses_and_inertias_are_the_identified_ones(robot):
+    """Principal moments of each link; hand and last arm link are one body."""
+    found = [
+        pybullet.getDynamicsInfo(robot.body, link, physicsClientId=robot.client)
+        for link in [*ARM, *FINGERS]
+    ]
+    moving = [inertial for name, inertial in INERTIALS.items() if name != BASE]
+    assert sum(f[0] for f in found) == pytest.approx(sum(i.mass for i in moving))
+    names = [*ARM_LINKS[:-1], None, *FINGER_LINKS]
+    for name, (mass, _, moments, centre, *_) in zip(names, found):
+        if name is None:
+            continue
+        inertial = INERTIALS[name]
+        assert mass == pytest.approx(inertial.mass)
+        assert centre == pytest.approx(inertial.centre)
+        expected = np.linalg.eigvalsh(inertial.tensor())
+        np.testing.assert_allclose(np.sort(moments), expected, rtol=1e-3)
 
 
 def test_straight_moves_respect_every_limit(robot):

@@ -111,11 +111,11 @@ class Workspace:
 class GripperGeometry:
     """Outer shape of the Franka hand, metres, measured from the fingertips' lowest point up.
 
-    Read off the collision meshes `finger.obj` and `hand.obj` of pybullet_data/franka_panda
-    (PyBullet uses their convex hulls) with the joint origins of `panda.urdf`: fingers start 0.0584
-    below the hand frame and are 0.0538 long, so the tips lie 0.1122 below it; E
-    (`panda_grasptarget`) is at 0.105. "Along" is the closing line, "across" is horizontal
-    and at right angles to it.
+    Read off the convex hulls of the collision meshes `finger.obj` and `hand.obj` in
+    pybullet_data/franka_panda, with the joint origins of its `panda.urdf`: the hand's frame lies
+    0.1122 above the tips, E 0.105 below that frame. "Along" is the closing line, "across" is
+    horizontal and at right angles to it. `envs.panda_model` makes the simulators' fingers and the
+    palm's underside from these numbers.
 
     The defaults are the Panda's own hand. Robot, planners, labels and networks take theirs from a
     config or a checkpoint (`gripper.max_opening`), whose default repeats this one;
@@ -123,10 +123,14 @@ class GripperGeometry:
     """
 
     max_opening: float = 0.08  # two finger joints of 0.04 each
-    tip_below_centre: float = 0.0072  # 0.0584 + 0.0538 - 0.105: how far the tips reach below E
+    tip_below_centre: float = 0.0072  # 0.1122 - 0.105: how far the tips reach below E
     finger_half_width: float = 0.0105  # across, at the widest
     pad_half_width: float = 0.0087  # across, the flat face that touches the object
-    pad_height: float = 0.0176  # flat from the tip up; above, the hull recedes by 2.5 mm
+    pad_height: float = 0.0176  # flat from the tip up
+    pad_recess: float = 0.0026  # how far the hull has receded from the pad's face at its upper end
+    flank: float = 0.0155  # outward from the pad's face, where the finger gets its whole width
+    tip_half_width: float = 0.0056  # across, at the lowest point
+    tip_bevel: float = 0.0030  # height above the tip from which the pad has its whole width
     palm_half_length: float = 0.104  # along
     # Underside of a finger: (distance outward from the pad's face, height above the tip).
     finger_outline: tuple[tuple[float, float], ...] = (
