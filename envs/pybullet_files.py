@@ -5,11 +5,11 @@ Both simulators build the Panda from the same URDF. Reading the files needs no s
 
 from __future__ import annotations
 
+import importlib.util
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
-import pybullet_data
 from scipy.spatial.transform import Rotation
 
 from utils.geometry import GripperGeometry
@@ -18,9 +18,10 @@ from utils.runs import write_atomic
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
-def data_folder() -> Path:
-    """The folder of `pybullet_data`."""
-    return Path(pybullet_data.getDataPath())
+def data_folder() -> Path | None:
+    """The folder of `pybullet_data`, None where PyBullet is not installed."""
+    found = importlib.util.find_spec("pybullet_data")
+    return None if found is None else Path(found.origin).parent
 
 
 def panda_model(gripper: GripperGeometry, fine: bool = False) -> ElementTree.Element:
