@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Self
 
 import numpy as np
+from typing_extensions import Self
 
 from envs.cell_layout import (
     REST_CHECK_STEPS,

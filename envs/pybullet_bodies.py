@@ -11,10 +11,11 @@ import atexit
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 import pybullet
+from typing_extensions import Self
 
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
