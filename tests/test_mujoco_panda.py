@@ -5,8 +5,6 @@ import pybullet
 import pybullet_data
 import pytest
 
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-
 from envs.mujoco_panda import HAND_LINK, INERTIALS, MujocoPanda, panda_spec
 from envs.pybullet_files import FINGER_JOINTS
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics
