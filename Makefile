@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
+CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
+	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
+
 .PHONY: run quick test test-fast lint typecheck bench results clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
@@ -44,7 +47,7 @@ results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell $(CORNELL)) $(ARGS)
 
 $(VENV)/bin/python:
-	$(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -c "$(CHECK_PYTHON)" && $(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -r requirements.txt

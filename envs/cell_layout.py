@@ -1,21 +1,25 @@
 """What stands in a cell, as data: gravity, table, bin, walls, objects, and the scene of a round.
 
-Every simulator builds its cell from these constants and from a `Scene`. `envs.objects` makes the
-objects, `envs.cell_scenes` lays scenes out. This module knows no simulator and no robot.
+Every simulator builds its cell from these constants and from a `Scene`, and implements the
+`LayoutTable` on which objects come to rest. `envs.objects` makes the objects, `envs.cell_scenes`
+lays scenes out. This module knows no simulator and no robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import Self
 
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
+from utils.config import Config
 from utils.geometry import ConvexSolid
 
 GRAVITY = 9.81  # m/s^2
@@ -135,3 +139,44 @@ class Scene:
 
 
 EMPTY = Scene("isolated", 0, ())
+
+
+class LayoutTable(ABC):
+    """A table alone, on which objects are put down and come to rest. Use it in a `with` block.
+
+    models: the objects that may be put on it, each as often as it stands there. Bodies are the
+    table's own numbers. Entering takes everything off the table.
+    """
+
+    @abstractmethod
+    def __init__(self, config: Config, models: Sequence[ObjectModel]): ...
+
+    @abstractmethod
+    def __enter__(self) -> Self: ...
+
+    @abstractmethod
+    def __exit__(self, *exception: object) -> None: ...
+
+    @abstractmethod
+    def put(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
+        """Add an object with its centre of mass at position (3,) in W; its body number."""
+
+    @abstractmethod
+    def put_walls(self, walls: Iterable[Box]) -> list[int]:
+        """Add immovable walls; their body numbers."""
+
+    @abstractmethod
+    def remove(self, body: int) -> None:
+        """Take an object or a wall away."""
+
+    @abstractmethod
+    def settle(self, bodies: Sequence[int]) -> bool:
+        """Simulate until the bodies rest; False if they still move after scene.settle_seconds."""
+
+    @abstractmethod
+    def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) of an object's centre of mass in W and its quaternion (4,)."""
+
+    @abstractmethod
+    def is_near(self, body: int, others: Sequence[int], distance: float) -> bool:
+        """Whether a body comes closer than `distance` metres to one of the others."""

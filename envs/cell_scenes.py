@@ -2,10 +2,10 @@
 
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. The last two follow VGN (Breyer et al.,
-"Volumetric Grasping Network", CoRL 2020). The objects come to rest in PyBullet, on a
-`envs.pybullet_bodies.LayoutTable`, whichever simulator the scene is for, so that all simulators
-start from the same poses. The scene itself is data (`envs.cell_layout.Scene`). This module knows no
-robot, camera or task.
+"Volumetric Grasping Network", CoRL 2020). The objects come to rest in the simulator
+`scene.simulator`, whichever simulator the scene is for, so that all simulators start from the same
+poses. The scene itself is data (`envs.cell_layout.Scene`). This module knows no robot, camera or
+task.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import ObjectModel, Placement, Scene, square_walls
+from envs.cell_layout import LayoutTable, ObjectModel, Placement, Scene, square_walls
 from envs.objects import ObjectSet
-from envs.pybullet_bodies import LayoutTable
+from envs.simulators import make_layout_table
 from utils.config import Config
 from utils.errors import UserError
 
@@ -48,7 +48,7 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     for _ in range(_TRIES):
         chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
-        with LayoutTable(config) as table:
+        with make_layout_table(config, models) as table:
             bodies = arrange(table, models, rng, config)
             if bodies is None or not table.settle(bodies):
                 continue

@@ -21,13 +21,13 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from envs.cell import PhysicsError, camera_intrinsics
+from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import cell_class
 from utils.config import Config, dump_config, with_settings
 from utils.config_types import changed, draw
 from utils.errors import UserError
@@ -61,7 +61,8 @@ def data_folder(config: Config, root: Path = Path("data")) -> Path:
 def _content(config: Config) -> str:
     """Return as YAML all that one shard depends on; the number of shards does not belong to it."""
     everything = config.model_dump(mode="json")
-    chosen = {key: everything[key] for key in ("seed", "sim", "camera", "workspace", "scene")}
+    keys = ("seed", "simulator", "sim", "camera", "workspace", "scene")
+    chosen = {key: everything[key] for key in keys}
     for key in ("depth_noise", "depth_noise_args"):  # images are stored clean
         chosen["camera"].pop(key)
     chosen["objects"] = everything["objects"] | {"split": "train"}
@@ -175,13 +176,13 @@ def _claim(folder: Path, config: Config) -> None:
 # --- In a worker process --------------------------------------------------------------------
 
 _worker_config: Config
-_worker_cell: PybulletCell
+_worker_cell: Cell
 _worker_sets: dict[tuple[str, str], ObjectSet]
 
 
 def _set_up(config: Config) -> None:
     global _worker_config, _worker_cell, _worker_sets
-    _worker_config, _worker_cell = config, PybulletCell(config)
+    _worker_config, _worker_cell = config, cell_class(config.simulator)(config)
     _worker_sets = object_sets(config)
 
 
@@ -246,7 +247,7 @@ def draw_scene(
 
 
 def label_scene(
-    config: Config, scene: Scene, set_name: str, cell: PybulletCell
+    config: Config, scene: Scene, set_name: str, cell: Cell
 ) -> Iterator[tuple[LabelledFrame, list[Trial]]]:
     """Yield labelled frames of a scene and of random parts of it, some with trials of their
     labels."""
@@ -304,7 +305,7 @@ def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
 
 
 def execute_pairs(
-    cell: PybulletCell, scene: Scene, frame, labels, rng: np.random.Generator
+    cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator
 ) -> list[Trial]:
     """Execute labelled pairs of every quality, each on the freshly loaded scene. A grasp during
     which the simulation blows up has failed."""

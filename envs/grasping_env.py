@@ -17,20 +17,20 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
-from envs.cell import PhysicsError
+from envs.cell import Cell, PhysicsError
 from envs.cell_layout import on_table
 from envs.cell_scenes import make_scene
 from envs.env_actions import ActionDecoder, action_entries, near_pose, pretraining_state
 from envs.env_observations import Observer, observed_names
 from envs.env_rewards import SHORTEST_LIFT, RewardState, make_reward, progress
 from envs.objects import ObjectSet, check_object_set, load_object_set
-from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import (
     JOINT_VELOCITY,
     UnreachableError,
     forward_kinematics,
     inverse_kinematics,
 )
+from envs.simulators import cell_class
 from envs.studio import Studio
 from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
@@ -136,7 +136,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self,
         render_mode: str | None = None,
         config: Config | Path | str | None = None,
-        cell: PybulletCell | None = None,
+        cell: Cell | None = None,
         **settings: Any,
     ):
         self._closed = True  # until everything below has been built
@@ -172,7 +172,9 @@ class RobotGraspingEnv(gymnasium.Env):
                 "use render_mode='rgb_array'"
             )
         self._borrowed = cell is not None
-        self.cell = cell or PybulletCell(self.config, gui=render_mode == "human")
+        self.cell = cell or cell_class(self.config.simulator)(
+            self.config, gui=render_mode == "human"
+        )
         self._studio: Studio | None = None
         self._running = False
         self._states_left = 0

@@ -9,7 +9,7 @@ PyBullet the product).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from envs.cell_layout import (
 )
 from envs.mujoco_camera import MujocoCamera, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
+from envs.object_primitives import NativeShape
 from utils.config import Config
 from utils.geometry import GripperGeometry
 from utils.transforms import pose_matrix, position_quaternion
@@ -52,25 +53,31 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
 
     Bodies are called `table`, `bin0` to `bin3` and `object0` on. Raises UserError without MuJoCo.
     """
-    mujoco = load_mujoco()
-    spec = panda_spec(gripper)
-    spec.option.gravity = [0, 0, -GRAVITY]
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 100  # of friction's stiffness: grasped objects creep less
+    spec = set_up_physics(panda_spec(gripper))
     for name in FINGERS:
         for geom in spec.body(name).geoms:
             geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
-    _add_box(mujoco, spec, "table", table_box(), TABLE_COLOUR)
+    add_box(spec, "table", table_box(), TABLE_COLOUR)
     for i, wall in enumerate(bin_walls()):
-        _add_box(mujoco, spec, f"bin{i}", wall, BIN_COLOUR)
+        add_box(spec, f"bin{i}", wall, BIN_COLOUR)
     for i, placed in enumerate(scene.placements):
-        _add_object(mujoco, spec, f"object{i}", placed.model, placed.position, placed.quaternion)
+        add_object(spec, f"object{i}", placed.model, placed.position, placed.quaternion)
     # The base stands on the table.
     exclude = spec.add_exclude()
     exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
     for geom in spec.geoms:
         geom.solref[0] = _CONTACT_TIME
     add_view(spec)
+    return spec
+
+
+def set_up_physics(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Set gravity and the friction solver of a model; returns it."""
+    mujoco = load_mujoco()
+    spec.option.gravity = [0, 0, -GRAVITY]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 100  # of friction's stiffness: grasped objects creep less
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return spec
 
 
@@ -91,28 +98,60 @@ def add_board(spec: mujoco.MjSpec, board: Board, T_WO: np.ndarray) -> None:
         geom.contype = geom.conaffinity = 0
 
 
-def _add_box(mujoco, spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
+def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
+    """Add an immovable box."""
+    mujoco = load_mujoco()
     body = spec.worldbody.add_body(name=name, pos=list(box.position))
     geom = body.add_geom(
         name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=list(box.half_size), rgba=list(colour)
     )
     geom.friction = [_NO_FRICTION, _TORSION, _ROLLING]
+    geom.solref[0] = _CONTACT_TIME
 
 
-def _add_object(mujoco, spec, name: str, model: ObjectModel, position, quaternion) -> None:
+def add_object(
+    spec: mujoco.MjSpec, name: str, model: ObjectModel, position, quaternion
+) -> mujoco.MjsBody:
+    """Add an object with its centre of mass at position (3,) in W, turned by a quaternion (4,);
+    returns MuJoCo's specification of its body."""
     body = spec.worldbody.add_body(
         name=name, pos=list(position), quat=np.roll(quaternion, 1).tolist()
     )
     body.add_freejoint(name=name)
     body.mass, body.inertia, body.ipos = model.mass, model.inertia, [0, 0, 0]
     body.explicitinertial = True
-    for i, part in enumerate(model.parts):
-        mesh = spec.add_mesh(name=f"{name}_{i}")
-        mesh.uservert = np.asarray(part, dtype=np.float32).ravel()
-        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+    for geom in _add_shapes(spec, body, name, model):
         geom.rgba = list(model.color)
         geom.friction = [model.friction, _TORSION, max(model.rolling_friction, _ROLLING)]
         geom.condim = 6 if model.rolling_friction else 4
+        geom.solref[0] = _CONTACT_TIME
+    return body
+
+
+def _add_shapes(spec: mujoco.MjSpec, body, name: str, model: ObjectModel) -> list:
+    """Give a body its object's shape: a native one, or a mesh for each convex part."""
+    mujoco = load_mujoco()
+    if isinstance(model.collision, NativeShape):
+        kind, size = _native(mujoco, model.collision)
+        return [body.add_geom(type=kind, size=size)]
+    geoms = []
+    for i, part in enumerate(model.parts):
+        mesh = spec.add_mesh(name=f"{name}_{i}")
+        mesh.uservert = np.asarray(part, dtype=np.float32).ravel()
+        geoms.append(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name))
+    return geoms
+
+
+def _native(mujoco, shape: NativeShape) -> tuple[Any, list[float]]:
+    """MuJoCo's type and size, in half lengths, of a native shape."""
+    kinds = mujoco.mjtGeom
+    if shape.kind == "box":
+        return kinds.mjGEOM_BOX, [side / 2 for side in shape.size]
+    if shape.kind == "sphere":
+        return kinds.mjGEOM_SPHERE, [shape.size[0], 0, 0]
+    radius, length = shape.size
+    kind = kinds.mjGEOM_CYLINDER if shape.kind == "cylinder" else kinds.mjGEOM_CAPSULE
+    return kind, [radius, length / 2, 0]
 
 
 # MuJoCo's steps in one of the cell's steps: a grip lasts through about one millisecond.
@@ -124,7 +163,7 @@ class MujocoCell(Cell):
 
     robot: MujocoPanda
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, gui: bool = False):
         super().__init__(config)
         self._mujoco = load_mujoco()
         self._camera: MujocoCamera | None = None

@@ -294,7 +294,13 @@ def _random_urdfs(settings: SetSettings) -> ObjectSet:
 
 def _random_urdf_files(split: str) -> list[Path]:
     """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
-    folder = data_folder() / "random_urdfs"
+    data = data_folder()
+    if data is None:
+        raise ObjectError(
+            "objects: random_urdfs comes with PyBullet, which is not installed; use primitives, "
+            "box or a folder of meshes"
+        )
+    folder = data / "random_urdfs"
     numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
     return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
 

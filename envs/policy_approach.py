@@ -144,7 +144,7 @@ def _check_knowledge(name: str, policy: SavedPolicy) -> None:
 
 def _check_spaces(policy: Sb3Policy, config: Config) -> None:
     """Raise UserError for a policy whose spaces are not those of the config's section env."""
-    env = RobotGraspingEnv(config=config.model_copy(update={"simulator": "pybullet"}))
+    env = RobotGraspingEnv(config=config)
     try:
         policy.check_spaces(env.observation_space, env.action_space)
     finally:

@@ -1,7 +1,6 @@
 """Bodies in a PyBullet client: table, bin and walls, objects, boards, and whether they rest.
 
-`LayoutTable` is the empty table on which scenes are laid out before any cell is built. Scenes are
-laid out there for every simulator, so that all of them start from the same poses;
+`PybulletTable` is the empty table on which scenes are laid out before any cell is built;
 `envs.cell_scenes` decides what is put where. The functions take the number of the physics client.
 This module knows no cell, robot or camera.
 """
@@ -12,10 +11,11 @@ import atexit
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 import pybullet
+from typing_extensions import Self
 
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
@@ -26,6 +26,7 @@ from envs.cell_layout import (
     TABLE_COLOUR,
     WALL_COLOUR,
     Box,
+    LayoutTable,
     ObjectModel,
     bin_walls,
     table_box,
@@ -251,68 +252,63 @@ def _resting(client: int, body: int) -> bool:
 # --- The table on which scenes are laid out --------------------------------------------------
 
 
-class LayoutTable:
-    """A table alone, on which objects are put down and come to rest. Use it in a `with` block.
+class PybulletTable(LayoutTable):
+    """A `LayoutTable` in PyBullet.
 
-    Entering takes everything off the table. All tables of a process share one physics client,
-    because connecting takes 25 ms and laying out an isolated scene 5 ms; it is connected at first
-    use and disconnected when the process ends. So only one table can be in use at a time: entering
-    a second one inside the first raises RuntimeError, and another thread waits for its turn.
+    All tables of a process share one physics client, because connecting takes 25 ms and laying out
+    an isolated scene 5 ms; it is connected at first use and disconnected when the process ends. So
+    only one table can be in use at a time: entering a second one inside the first raises
+    RuntimeError, and another thread waits for its turn.
     """
 
     _client: ClassVar[int | None] = None
     _turn: ClassVar[threading.RLock] = threading.RLock()
     _in_use: ClassVar[bool] = False
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, models: Sequence[ObjectModel]):
         self._config = config
 
     def __enter__(self) -> Self:
-        LayoutTable._turn.acquire()
-        if LayoutTable._in_use:
-            LayoutTable._turn.release()
-            raise RuntimeError("a LayoutTable is in use already; leave its with block first")
-        LayoutTable._in_use = True
-        if LayoutTable._client is None:
-            LayoutTable._client = pybullet.connect(pybullet.DIRECT)
-            atexit.register(LayoutTable._disconnect)
+        PybulletTable._turn.acquire()
+        if PybulletTable._in_use:
+            PybulletTable._turn.release()
+            raise RuntimeError("a PybulletTable is in use already; leave its with block first")
+        PybulletTable._in_use = True
+        if PybulletTable._client is None:
+            PybulletTable._client = pybullet.connect(pybullet.DIRECT)
+            atexit.register(PybulletTable._disconnect)
         set_up_physics(self._client, self._config.sim)
         add_table(self._client)
         return self
 
     def __exit__(self, *exception: object) -> None:
-        LayoutTable._in_use = False
-        LayoutTable._turn.release()
+        PybulletTable._in_use = False
+        PybulletTable._turn.release()
 
     @staticmethod
     def _disconnect() -> None:
-        pybullet.disconnect(physicsClientId=LayoutTable._client)
-        LayoutTable._client = None
+        pybullet.disconnect(physicsClientId=PybulletTable._client)
+        PybulletTable._client = None
 
     def put(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
-        """Add an object with its centre of mass at position (3,); its body number."""
         return spawn(self._client, model, position, quaternion)
 
     def put_walls(self, walls: Iterable[Box]) -> list[int]:
-        """Add immovable walls; their body numbers."""
         return add_walls(self._client, walls)
 
     def remove(self, body: int) -> None:
         pybullet.removeBody(body, physicsClientId=self._client)
 
     def settle(self, bodies: Sequence[int]) -> bool:
-        """Simulate until the bodies rest; False if they still move after scene.settle_seconds."""
         return settle(self._client, bodies, self._config)
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) of a body's centre of mass in W and its quaternion (4,)."""
         position, quaternion = pybullet.getBasePositionAndOrientation(
             body, physicsClientId=self._client
         )
         return np.array(position), np.array(quaternion)
 
     def is_near(self, body: int, others: Sequence[int], distance: float) -> bool:
-        """Whether a body comes closer than `distance` metres to one of the others."""
         return any(
             pybullet.getClosestPoints(body, other, distance, physicsClientId=self._client)
             for other in others

@@ -28,7 +28,6 @@ from envs.pybullet_files import panda_meshes
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.pybullet_randomization import PybulletRandomizable
 from utils.config import Config
-from utils.errors import UserError
 from utils.transforms import position_quaternion
 
 # As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
@@ -44,13 +43,8 @@ class PybulletCell(Cell):
 
     robot: PybulletPanda
 
-    def __init__(self, config: Config, fine: bool = False, gui: bool = False):
+    def __init__(self, config: Config, gui: bool = False, fine: bool = False):
         super().__init__(config)
-        if config.simulator != "pybullet":
-            raise UserError(
-                f"simulator={config.simulator} works in evaluate.py alone; set simulator=pybullet "
-                "here"
-            )
         self.fine = fine
         self._gui = gui
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)

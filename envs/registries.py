@@ -28,6 +28,7 @@ from utils.real_data import FORMATS
 
 REGISTRIES: dict[str, Collection[str]] = {
     "simulator": SIMULATORS,
+    "scene.simulator": SIMULATORS,
     "closed_loop.controller": CONTROLLERS,
     "data.kind": ("simulated", *FORMATS),
     "train.backbone": BACKBONES,

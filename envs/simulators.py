@@ -1,23 +1,76 @@
-"""The simulators, by the names that the config's key `simulator` takes, and `make_cell`.
+"""The simulators, by the names that the config's keys `simulator` and `scene.simulator` take.
 
-A new simulator brings a `Cell` and a `Camera` (`envs.cell`), a `Robot` (`envs.robot`), and an entry
-here. It can be randomised if its cell implements `randomizable`.
+A new simulator brings a `Cell` and a `Camera` (`envs.cell`), a `Robot` (`envs.robot`), a
+`LayoutTable` (`envs.cell_layout`), and an entry here. It can be randomised if its cell implements
+`randomizable`. Its modules are imported when they are first asked for, so that a machine needs the
+package of the simulator that it uses, and of no other.
 """
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 from envs.cell import Cell, not_randomizable
-from envs.mujoco_cell import MujocoCell
-from envs.pybullet_cell import PybulletCell
+from envs.cell_layout import LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
-from utils.errors import unknown_choice
-
-SIMULATORS: dict[str, type[Cell]] = {"pybullet": PybulletCell, "mujoco": MujocoCell}
+from utils.errors import UserError, unknown_choice
 
 
-def make_cell(config: Config) -> Cell:
-    """A cell in the configured simulator.
+@dataclass(frozen=True)
+class Simulator:
+    """package: the Python package of the simulator. cell, layout_table: the classes that implement
+    `Cell` and `LayoutTable`, as `module:name`. install: how a user gets the package."""
+
+    package: str
+    cell: str
+    layout_table: str
+    install: str
+
+    @property
+    def installed(self) -> bool:
+        return importlib.util.find_spec(self.package) is not None
+
+    def load(self, path: str, name: str) -> type:
+        """The class that `path` names. Raises UserError where the package is not installed."""
+        if not self.installed:
+            offered = [other for other, one in SIMULATORS.items() if one.installed]
+            raise UserError(
+                f"simulator={name}: the package {self.package} is not installed; {self.install}, "
+                f"or use {' or '.join(f'simulator={other}' for other in offered)}"
+            )
+        module, _, attribute = path.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+
+
+SIMULATORS: dict[str, Simulator] = {
+    "pybullet": Simulator(
+        "pybullet",
+        "envs.pybullet_cell:PybulletCell",
+        "envs.pybullet_bodies:PybulletTable",
+        "it has wheels for CPython 3.9 to 3.11 on Linux (pip install pybullet)",
+    ),
+    "mujoco": Simulator(
+        "mujoco",
+        "envs.mujoco_cell:MujocoCell",
+        "envs.mujoco_bodies:MujocoTable",
+        'pip install "mujoco>=3.3,<4" (4.0.0 is another package)',
+    ),
+}
+
+
+def cell_class(name: str) -> type[Cell]:
+    """The class of a simulator's cells. Raises UserError for a simulator that does not exist or is
+    not installed."""
+    simulator = _simulator(name, "simulator")
+    return simulator.load(simulator.cell, name)
+
+
+def make_cell(config: Config, gui: bool = False) -> Cell:
+    """A cell in the configured simulator; `gui` opens a window that shows it.
 
     With evaluate.randomise the cell differs from scene to scene by what the section `randomization`
     says, in the same way for the same scene. Noise and bias of actions apply to learned policies
@@ -25,7 +78,7 @@ def make_cell(config: Config) -> Cell:
     simulator, and where the cell cannot be had in it.
     """
     check_simulator(config)
-    cell = SIMULATORS[config.simulator](config)
+    cell = cell_class(config.simulator)(config, gui=gui)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
         cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
@@ -33,9 +86,22 @@ def make_cell(config: Config) -> Cell:
     return cell
 
 
+def make_layout_table(config: Config, models: Sequence[ObjectModel]) -> LayoutTable:
+    """A table on which a scene of these objects is laid out, in the simulator `scene.simulator`."""
+    name = config.scene.simulator
+    simulator = _simulator(name, "scene.simulator")
+    return simulator.load(simulator.layout_table, name)(config, models)
+
+
 def check_simulator(config: Config) -> None:
-    """Raise UserError for an unknown simulator, and for one that cannot be randomised."""
-    if config.simulator not in SIMULATORS:
-        raise unknown_choice("simulator", config.simulator, SIMULATORS)
-    if config.evaluate.randomise and not SIMULATORS[config.simulator].can_be_randomized():
+    """Raise UserError for a simulator that does not exist, is not installed, or cannot be
+    randomised."""
+    cell = cell_class(config.simulator)
+    if config.evaluate.randomise and not cell.can_be_randomized():
         raise not_randomizable(config)
+
+
+def _simulator(name: str, key: str) -> Simulator:
+    if name not in SIMULATORS:
+        raise unknown_choice(key, name, SIMULATORS)
+    return SIMULATORS[name]

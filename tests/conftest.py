@@ -9,7 +9,7 @@ from collections import Counter
 import hypothesis
 import pytest
 
-from envs.simulators import SIMULATORS
+from tests.helpers.simulators import INSTALLED
 from utils.config import Config, load_config
 
 # The same examples everywhere, and no verdict from how busy the machine is.
@@ -80,14 +80,13 @@ def played_here(monkeypatch):
         cell.close()
 
 
-@pytest.fixture(scope="module", params=list(SIMULATORS))
+@pytest.fixture(scope="module", params=INSTALLED)
 def taught_cell(request, config: Config):
     """The cell of each simulator, whose wrist camera has been shown the board."""
-    if request.param == "mujoco":
-        pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
     from envs.scenarios import teach
+    from envs.simulators import cell_class
 
-    with SIMULATORS[request.param](config) as cell:
+    with cell_class(request.param)(config) as cell:
         teach(cell)  # empties the cell, the first time
         yield cell
 
@@ -118,18 +117,18 @@ def cell(taught_cell, scene):
 @pytest.fixture(scope="module")
 def cells(config: Config):
     """A PyBullet cell and a MuJoCo cell."""
-    pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-    from envs.simulators import SIMULATORS
+    pytest.importorskip("pybullet")
+    from envs.simulators import cell_class
 
-    with SIMULATORS["pybullet"](config) as bullet, SIMULATORS["mujoco"](config) as mujoco:
+    with cell_class("pybullet")(config) as bullet, cell_class("mujoco")(config) as mujoco:
         yield bullet, mujoco
 
 
 @pytest.fixture(scope="module")
 def pile(config: Config):
-    """A pile of random_urdfs."""
+    """A pile of objects of the default test set."""
     from envs.cell_scenes import make_scene
     from envs.objects import load_object_set
 
-    objects = load_object_set("random_urdfs", cache_dir=config.cache_folder)
+    objects = load_object_set(config.evaluate.object_sets[0], cache_dir=config.cache_folder)
     return make_scene("pile", objects, 2, config)

@@ -1,18 +1,20 @@
-"""Scenes as pure functions of their seeds."""
+"""Scenes as pure functions of their seeds, laid out in each simulator."""
 
 import numpy as np
-import pybullet
 import pytest
 
+from envs.cell_layout import square_walls
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
 from envs.objects import load_object_set
-from envs.pybullet_bodies import LayoutTable
+from envs.simulators import make_layout_table
+from tests.helpers.simulators import INSTALLED
 from utils.config import with_settings
 
 
-@pytest.fixture(scope="module")
-def cell(bullet_cell):
-    return bullet_cell
+@pytest.fixture(scope="module", params=INSTALLED)
+def laid_out(request, config):
+    """The config with scenes laid out in each simulator."""
+    return with_settings(config, "scene", {"simulator": request.param})
 
 
 @pytest.fixture(scope="module")
@@ -21,35 +23,59 @@ def primitives(config):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_scene_is_a_pure_function_of_its_seed(layout, primitives, config, cell):
-    first = make_scene(layout, primitives, 7, config)
-    other = make_scene(layout, primitives, 9, config)  # other work in between
-    again = make_scene(layout, primitives, 7, config)
-    assert len(first.placements) == (1 if layout == "isolated" else config.scene.count)
+def test_scene_is_a_pure_function_of_its_seed(layout, primitives, laid_out):
+    first = make_scene(layout, primitives, 7, laid_out)
+    other = make_scene(layout, primitives, 9, laid_out)  # other work in between
+    again = make_scene(layout, primitives, 7, laid_out)
+    assert len(first.placements) == (1 if layout == "isolated" else laid_out.scene.count)
     for a, b in zip(first.placements, again.placements):
         assert a.model.name == b.model.name
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_array_equal(a.quaternion, b.quaternion)
     assert any((a.position != b.position).any() for a, b in zip(first.placements, other.placements))
     for placement in first.placements:
-        offset = abs(placement.position[:2] - config.workspace.center)
-        assert offset.max() <= config.workspace.size / 2 and placement.position[2] > 0
+        offset = abs(placement.position[:2] - laid_out.workspace.center)
+        assert offset.max() <= laid_out.workspace.size / 2 and placement.position[2] > 0
 
 
-def test_packed_objects_stand_apart(primitives, config, cell):
-    scene = make_scene("packed", primitives, 3, config)
-    cell.load(scene)
-    for i, a in enumerate(cell.bodies):
-        for b in cell.bodies[:i]:
-            assert not pybullet.getContactPoints(a, b, physicsClientId=cell.client)
+def test_packed_objects_stand_apart(primitives, laid_out):
+    placements = make_scene("packed", primitives, 3, laid_out).placements
+    with make_layout_table(laid_out, [placed.model for placed in placements]) as table:
+        bodies = [table.put(*vars(placed).values()) for placed in placements]
+        for body in bodies:
+            assert not table.is_near(body, [one for one in bodies if one != body], 5e-4)
+            assert table.is_near(body, [one for one in bodies if one != body], 0.3)
 
 
-def test_one_layout_table_at_a_time(config):
-    with LayoutTable(config) as first:
-        with pytest.raises(RuntimeError, match="in use already"), LayoutTable(config):
+def test_a_cube_on_a_table(box_set, laid_out):
+    """A cube of 6 cm falls flat, stays inside a wall until it is taken away, and is gone when it is
+    removed."""
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    with make_layout_table(laid_out, [box_set[0], box_set[0]]) as table:
+        walls = table.put_walls(square_walls((0.5, 0.0), 0.08, 0.1, 0.02))
+        cube = table.put(box_set[0], np.array([0.5, 0.0, 0.05]), level)
+        assert table.settle([cube])
+        position, quaternion = table.pose(cube)
+        np.testing.assert_allclose(position, [0.5, 0.0, 0.03], atol=1e-3)
+        assert abs(quaternion[3]) == pytest.approx(1, abs=1e-4)
+        for distance, near in ((0.045, False), (0.055, True)):  # the wall is 5 cm away
+            assert table.is_near(cube, walls, distance) == near
+        other = table.put(box_set[0], np.array([0.5, 0.0, 0.15]), level)
+        table.remove(cube)
+        for wall in walls:
+            table.remove(wall)
+        assert table.settle([other])  # falls to where the first one was
+        np.testing.assert_allclose(table.pose(other)[0], [0.5, 0.0, 0.03], atol=1e-3)
+
+
+def test_one_layout_table_of_pybullet_at_a_time(config):
+    pytest.importorskip("pybullet")
+    config = with_settings(config, "scene", {"simulator": "pybullet"})
+    with make_layout_table(config, []) as first:
+        with pytest.raises(RuntimeError, match="in use already"), make_layout_table(config, []):
             pass
         assert first.settle([])  # still there
-    with LayoutTable(config):
+    with make_layout_table(config, []):
         pass
 
 

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Intrinsics
 from envs.mujoco_camera import camera_of
 from utils.transforms import look_at

@@ -1,21 +1,15 @@
 """The cell in MuJoCo beside PyBullet's: its bodies, what is gripped, what is a success."""
 
-import sys
-
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
 
 from envs.cell import PhysicsError
 from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
 from envs.mujoco_cell import MujocoCell
+from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
-from envs.simulators import make_cell
 from models.planners import make_planner
-from utils.config import load_config
-from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import position_quaternion
 
@@ -117,12 +111,6 @@ def test_diverged_physics_is_reported(held_box):
         cell.check_physics()
 
 
-def test_without_mujoco_the_error_says_what_to_do(config, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(UserError, match="pip install"):
-        make_cell(load_config(None, ["simulator=mujoco"]))
-
-
 @pytest.fixture(scope="module")
 def scene(config):
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
@@ -148,6 +136,10 @@ def test_shapes_lie_where_pybullet_has_them(cell, scene):
     """MuJoCo moves meshes to their own centres; their vertices in W must not notice."""
     for i, placed in enumerate(scene.placements):
         T, body = cell.object_pose(i), cell.robot.model.body(f"object{i}")
+        if isinstance(placed.model.collision, NativeShape):
+            sides = 2 * cell.robot.model.geom_aabb[body.geomadr[0], 3:]
+            np.testing.assert_allclose(sides, placed.model.extents, atol=1e-6)
+            continue
         for k, part in enumerate(placed.model.parts):
             geom = body.geomadr[0] + k
             mesh = cell.robot.model.mesh(f"object{i}_{k}")

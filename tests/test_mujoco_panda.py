@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
-
 from envs.mujoco_panda import MujocoPanda, panda_spec
 from envs.panda_model import BASE, FINGER_JOINTS, HAND, INERTIALS
 from envs.robot_kinematics import GRASP_DEPTH, JOINT_LOWER, JOINT_UPPER, forward_kinematics

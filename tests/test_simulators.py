@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,11 @@ import pytest
 from envs.cell import Camera, Cell
 from envs.cell_layout import Placement, Scene
 from envs.execution import execute_grasp
-from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
 from envs.robot import Robot
-from envs.simulators import SIMULATORS, check_simulator, make_cell
+from envs.simulators import SIMULATORS, cell_class, check_simulator, make_cell, make_layout_table
 from models.planners import make_planner
+from tests.helpers.simulators import INSTALLED
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import Workspace
@@ -26,12 +26,10 @@ SIDE = 0.09  # m, of a cube that the Panda's own hand cannot take
 
 
 def _cell(simulator: str, *overrides: str):
-    if simulator == "mujoco":
-        pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.3,<4"')
     return make_cell(load_config(None, [f"simulator={simulator}", "sim.renderer=tiny", *overrides]))
 
 
-@pytest.fixture(scope="module", params=SIMULATORS)
+@pytest.fixture(scope="module", params=INSTALLED)
 def wide(request):
     """A cell whose hand opens 0.10 m, and the frame of a cube of 0.09 m in it."""
     with _cell(request.param, f"gripper.max_opening={WIDE}") as cell:
@@ -66,7 +64,7 @@ def test_a_hand_of_ten_centimetres_grasps_a_cube_of_nine(wide):
     assert outcome.reason == "success"
 
 
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@pytest.mark.parametrize("simulator", INSTALLED)
 def test_the_pandas_own_hand_opens_eight_centimetres(simulator, box_set):
     with _cell(simulator) as cell:
         at = Placement(box_set[0], np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
@@ -84,7 +82,7 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@pytest.mark.parametrize("simulator", INSTALLED)
 def test_a_simulator_brings_nothing_under_another_name(simulator, box_set):
     """Cell, robot and camera are implementations of the abstract ones. What the abstract classes
     declare keeps its parameters, so that calls mean the same in every simulator, and what they do
@@ -109,20 +107,24 @@ def test_an_unknown_simulator_is_refused():
         make_cell(config)
 
 
-def test_a_cell_of_pybullet_is_not_made_for_mujoco():
-    with pytest.raises(UserError, match=r"mujoco works in evaluate\.py alone; set sim"):
-        PybulletCell(load_config(None, ["simulator=mujoco"]))
+def test_auto_is_the_simulator_that_is_installed():
+    config = load_config(None, ["simulator=auto"])
+    assert config.simulator == config.scene.simulator == INSTALLED[0]
 
 
-def test_randomisation_is_refused_in_mujoco():
-    with pytest.raises(UserError, match="cannot be randomised; use simulator=pybullet"):
-        make_cell(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
+@pytest.mark.parametrize("name", SIMULATORS)
+def test_a_simulator_that_is_not_installed_is_refused(name, monkeypatch):
+    missing = replace(SIMULATORS[name], package="no_such_package")
+    monkeypatch.setitem(SIMULATORS, name, missing)
+    config = load_config(None, [f"simulator={name}", f"scene.simulator={name}"])
+    message = f"simulator={name}: the package no_such_package is not installed; .* or use simulator"
+    with pytest.raises(UserError, match=message):
+        make_cell(config)
+    with pytest.raises(UserError, match=message):
+        make_layout_table(config, [])
 
 
-def test_any_simulator_that_implements_it_can_be_randomised(monkeypatch):
-    class Own(MujocoCell):
-        def randomizable(self):
-            raise NotImplementedError("reached")
-
-    monkeypatch.setitem(SIMULATORS, "mujoco", Own)
-    check_simulator(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
+def test_a_simulator_without_randomisation_is_refused(monkeypatch):
+    monkeypatch.setattr(cell_class(INSTALLED[0]), "randomizable", Cell.randomizable)
+    with pytest.raises(UserError, match="its cell cannot be randomised"):
+        check_simulator(load_config(None, ["evaluate.randomise=true"]))

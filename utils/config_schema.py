@@ -29,7 +29,10 @@ from utils.config_types import (
     Section,
     Several,
     Share,
+    SimulatorName,
     TermScales,
+    TestSets,
+    TrainingSets,
     Vector2,
     Vector3,
     no_repeats,
@@ -113,6 +116,7 @@ class ObjectsConfig(Section):
 
 
 class SceneConfig(Section):
+    simulator: SimulatorName
     count: Annotated[int, Field(ge=1, le=50)]
     settle_seconds: Positive
 
@@ -177,7 +181,7 @@ class EvaluateConfig(Section):
     policies: Names
     controllers: Names | None
     scenarios: Names
-    object_sets: Names
+    object_sets: TestSets
     rounds: Count
     randomise: bool
     workers: Count | None
@@ -227,7 +231,7 @@ class DataConfig(Section):
     repeats: Count
     frames: Count
     validation_frames: Count
-    object_sets: Names
+    object_sets: TrainingSets
     max_objects: Annotated[int, Field(ge=2, le=12)]
     randomise: bool
     randomise_physics: bool
@@ -384,7 +388,7 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
-    simulator: Name
+    simulator: SimulatorName
     sim: SimConfig
     robot: RobotConfig
     gripper: GripperConfig

@@ -7,6 +7,7 @@ changes a nominal value. This module does not know what a range's parameter mean
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -48,6 +49,32 @@ Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
 JointVector = Annotated[tuple[float, float, float, float, float, float, float], Field(strict=False)]
 Several = Field(min_length=1, strict=False)
 Names = Annotated[tuple[Name, ...], Several, AfterValidator(no_repeats)]
+
+
+AUTO = "auto"
+
+
+def _installed_simulator(name: str) -> str:
+    """`auto` is PyBullet where it is installed, and else MuJoCo: a config holds the answer, so that
+    a resumed run stays in the simulator it began in."""
+    if name != AUTO:
+        return name
+    return "mujoco" if importlib.util.find_spec("pybullet") is None else "pybullet"
+
+
+def _offered_sets(names: tuple[str, ...], sets: tuple[str, ...]) -> tuple[str, ...]:
+    """`auto` is `sets`, or else primitives where pybullet_data, which brings random_urdfs, is not
+    installed."""
+    if names != (AUTO,):
+        return names
+    return ("primitives",) if importlib.util.find_spec("pybullet_data") is None else sets
+
+
+SimulatorName = Annotated[Name, AfterValidator(_installed_simulator)]
+TrainingSets = Annotated[
+    Names, AfterValidator(lambda names: _offered_sets(names, ("random_urdfs", "primitives")))
+]
+TestSets = Annotated[Names, AfterValidator(lambda names: _offered_sets(names, ("random_urdfs",)))]
 
 
 class Section(BaseModel):
