@@ -29,6 +29,7 @@ from envs.cell_layout import (
 )
 from envs.mujoco_camera import MujocoCamera, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
+from envs.mujoco_randomization import MujocoRandomizable
 from utils.config import Config
 from utils.geometry import GripperGeometry
 from utils.transforms import pose_matrix, position_quaternion
@@ -70,6 +71,7 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
     exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
     for geom in spec.geoms:
         geom.solref[0] = _CONTACT_TIME
+    _add_pairs(spec, len(scene.placements))
     add_view(spec)
     return spec
 
@@ -115,6 +117,28 @@ def _add_object(mujoco, spec, name: str, model: ObjectModel, position, quaternio
         geom.condim = 6 if model.rolling_friction else 4
 
 
+def _add_pairs(spec: mujoco.MjSpec, count: int) -> None:
+    """Give the contacts of the objects with table and fingers parameters of their own.
+
+    They are those that MuJoCo would take from the two shapes, and the physics is the same to the
+    last bit; `envs.mujoco_randomization` changes them.
+    """
+    touched = [
+        geom for name in ("table", *FINGERS) for geom in spec.body(name).geoms if geom.contype
+    ]
+    for number, geom in enumerate(touched):
+        geom.name = geom.name or f"touched{number}"
+    for i in range(count):
+        for number, shape in enumerate(spec.body(f"object{i}").geoms):
+            shape.name = f"object{i}_{number}"
+            for other in touched:
+                sliding, torsion, rolling = np.maximum(shape.friction, other.friction)
+                pair = spec.add_pair(geomname1=shape.name, geomname2=other.name)
+                pair.friction = [sliding, sliding, torsion, rolling, rolling]
+                pair.condim = max(shape.condim, other.condim)
+                pair.solref, pair.solimp = shape.solref, shape.solimp
+
+
 # MuJoCo's steps in one of the cell's steps: a grip lasts through about one millisecond.
 SUBSTEPS = 4
 
@@ -144,10 +168,16 @@ class MujocoCell(Cell):
         self._places = [model.joint(name).qposadr[0] for name in names]
         self._speeds = [model.joint(name).dofadr[0] for name in names]
         self._table = model.body("table").id
+        self._randomizable: MujocoRandomizable | None = None
 
     def _make_robot(self, spec: mujoco.MjSpec) -> MujocoPanda:
         grip_force = self.config.robot.grip_force
         return MujocoPanda(spec, self.dt, SUBSTEPS, self.gripper, grip_force, self._new_gate())
+
+    def randomizable(self) -> MujocoRandomizable:
+        if self._randomizable is None:
+            self._randomizable = MujocoRandomizable(self.robot, self._table, self.bodies)
+        return self._randomizable
 
     def _settle(self) -> None:
         for _ in range(int(self.config.scene.settle_seconds / self.dt / REST_CHECK_STEPS)):
@@ -204,8 +234,13 @@ class MujocoCell(Cell):
 
     def _immobilise(self, index: int) -> None:
         model, body = self.robot.model, self.bodies[index]
-        model.geom_contype[model.geom_bodyid == body] = 0
-        model.geom_conaffinity[model.geom_bodyid == body] = 0
+        shapes = model.geom_bodyid == body
+        model.geom_contype[shapes] = model.geom_conaffinity[shapes] = 0
+        # A pair collides whatever these say; without its bounding spheres it does not.
+        one, other = model.pair_geom1, model.pair_geom2
+        pairs = shapes[one] | shapes[other]
+        spheres = model.geom_rbound[one] + model.geom_rbound[other]
+        model.pair_margin[pairs] = -spheres[pairs]
         model.body_gravcomp[body] = 1.0  # with nothing that pulls or touches, it stays
         self.robot.data.qvel[self._speeds[index] : self._speeds[index] + 6] = 0.0
 
