@@ -42,7 +42,7 @@ from utils.random_ranges import Change, changed
 from utils.transforms import pose_matrix
 
 _OF_OBJECTS = ("object_mass", "object_friction", "rolling_friction", "restitution")
-_CONTACT_DEPENDENT, _WHOLE = 4, 6  # dimensions of a contact without and with rolling friction
+_WITHOUT_ROLLING, _WHOLE = 4, 6  # dimensions of a contact without and with rolling friction
 # The fields of MuJoCo's model that `apply` changes. MuJoCo derives others from them.
 _PHYSICS = (
     "body_mass", "body_inertia", "geom_friction", "geom_condim", "pair_friction", "pair_dim",
@@ -147,7 +147,7 @@ class MujocoRandomizable:
                     new = _changed(changes, "rolling_friction", length, i)
                     if new != length:
                         friction[number, rolling] = new
-                        dim[number] = _WHOLE if new > 0 else _CONTACT_DEPENDENT
+                        dim[number] = _WHOLE if new > 0 else _WITHOUT_ROLLING
         for name, pairs in (
             ("table_friction", self._with_table), ("finger_friction", self._with_fingers)
         ):  # fmt: skip
@@ -166,15 +166,19 @@ class MujocoRandomizable:
                 for number in np.flatnonzero(pairs & self._with_table):
                     stiffness, damping = _stiffness_damping(solref[number])
                     natural = 2 * math.sqrt(stiffness)
-                    bounce = _changed(changes, "restitution", restitution_of(damping / natural), i)
-                    ratio = _damping_ratio(bounce, most / natural)
-                    solref[number] = -stiffness, -ratio * natural
+                    nominal = restitution_of(damping / natural)
+                    bounce = _changed(changes, "restitution", nominal, i)
+                    if bounce != nominal:
+                        ratio = _damping_ratio(bounce, most / natural)
+                        solref[number] = -stiffness, -ratio * natural
         if "contact_stiffness" in changes or "contact_damping" in changes:
             for number in np.flatnonzero(self._with_fingers):
-                stiffness, damping = _stiffness_damping(solref[number])
-                stiffness = _changed(changes, "contact_stiffness", stiffness)
-                damping = _changed(changes, "contact_damping", damping)
-                solref[number] = -min(stiffness, _MOST_STIFFNESS / step**2), -min(damping, most)
+                nominal = _stiffness_damping(solref[number])
+                stiffness = _changed(changes, "contact_stiffness", nominal[0])
+                damping = _changed(changes, "contact_damping", nominal[1])
+                if (stiffness, damping) != nominal:
+                    stiffness = min(stiffness, _MOST_STIFFNESS / step**2)
+                    solref[number] = -stiffness, -min(damping, most)
 
     def _change_motors(self, changes: Mapping[str, Change]) -> None:
         model, robot = self._model, self._robot
