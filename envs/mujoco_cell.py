@@ -27,7 +27,7 @@ from envs.cell_layout import (
     bin_walls,
     table_box,
 )
-from envs.mujoco_camera import MujocoCamera, add_view
+from envs.mujoco_camera import MujocoCamera, Window, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
 from envs.mujoco_randomization import MujocoRandomizable
 from utils.config import Config
@@ -144,14 +144,18 @@ SUBSTEPS = 4
 
 
 class MujocoCell(Cell):
-    """A cell simulated by MuJoCo. Raises UserError where MuJoCo is not installed."""
+    """A cell simulated by MuJoCo.
+
+    gui: opens a window. Raises UserError where MuJoCo is not installed, or no window can be opened.
+    """
 
     robot: MujocoPanda
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, gui: bool = False):
         super().__init__(config)
         self._mujoco = load_mujoco()
         self._camera: MujocoCamera | None = None
+        self._window = Window() if gui else None
 
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
         self._free_camera()
@@ -169,6 +173,8 @@ class MujocoCell(Cell):
         self._speeds = [model.joint(name).dofadr[0] for name in names]
         self._table = model.body("table").id
         self._randomizable: MujocoRandomizable | None = None
+        if self._window is not None:
+            self._window.show(model, self.robot.data)
 
     def _make_robot(self, spec: mujoco.MjSpec) -> MujocoPanda:
         grip_force = self.config.robot.grip_force
@@ -191,7 +197,12 @@ class MujocoCell(Cell):
         return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
 
     def _advance(self, count: int) -> None:
-        self.robot.step(count)
+        if self._window is None:
+            self.robot.step(count)
+            return
+        for _ in range(count):
+            self.robot.step()
+            self._window.update()
 
     @property
     def camera(self) -> MujocoCamera:
@@ -251,3 +262,5 @@ class MujocoCell(Cell):
 
     def close(self) -> None:
         self._free_camera()
+        if self._window is not None:
+            self._window.close()

@@ -38,7 +38,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from envs.mujoco_panda import ARM_JOINTS, FINGERS, HAND_LINKS, MujocoPanda, load_mujoco
-from utils.random_ranges import Change, changed
+from utils.config_types import Change, changed
 from utils.transforms import pose_matrix
 
 _OF_OBJECTS = ("object_mass", "object_friction", "rolling_friction", "restitution")

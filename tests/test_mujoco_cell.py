@@ -1,5 +1,6 @@
 """The cell in MuJoCo beside PyBullet's: its bodies, what is gripped, what is a success."""
 
+import os
 import sys
 
 import numpy as np
@@ -120,6 +121,27 @@ def test_without_mujoco_the_error_says_what_to_do(config, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(UserError, match="pip install"):
         make_cell(load_config(None, ["simulator=mujoco"]))
+
+
+@pytest.mark.skipif("DISPLAY" in os.environ, reason="there is a display")
+def test_without_a_display_no_window_opens(config):
+    with pytest.raises(UserError, match="needs a display, and there is none here"):
+        MujocoCell(config, gui=True)
+
+
+@pytest.mark.skipif("DISPLAY" not in os.environ, reason="there is no display")
+def test_a_window_changes_nothing(config, box_set):
+    """Two scenes after each other, shown and not shown; the camera draws beside the window."""
+    one = make_scene("isolated", box_set, 0, config)
+    ends = []
+    for gui in (True, False):
+        with MujocoCell(config, gui=gui) as cell:
+            for _ in range(2):
+                cell.build(one)
+                cell.robot.drive_arm_to(cell.home + 0.1)
+                cell.step(10)
+            ends.append((cell.robot.q.tolist(), cell.frame().rgb.tolist()))
+    assert ends[0] == ends[1]
 
 
 @pytest.fixture(scope="module")
