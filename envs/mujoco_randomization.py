@@ -7,7 +7,7 @@ parameter changes, beside PyBullet's cell (`envs.pybullet_randomization`):
 |---|---|
 | object_mass | mass and inertia of the object, and the constants that follow from them |
 | object_friction | sliding friction of the object in every contact |
-| rolling_friction | rolling friction, m, of the object in every contact; 0 without rolling resistance |
+| rolling_friction | rolling friction, m, of the object in every contact; none if it is 0 |
 | spinning_friction | torsional friction, m, in contacts of objects with the fingertips |
 | table_friction, finger_friction | 1 nominally; multiplies the object's sliding friction there |
 | restitution | damping of the object's contact with the table, see `restitution_of` |

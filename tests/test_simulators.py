@@ -79,7 +79,7 @@ def test_the_pandas_own_hand_opens_eight_centimetres(simulator, box_set):
 # Public methods that only the simulator's own modules call, between a cell and its robot; `mirror`
 # belongs to what `Cell.detailed_twin` returns.
 OWN = {
-    "pybullet": {"mirror", "receive"},
+    "pybullet": {"mirror"},
     "mujoco": {"meet", "pose", "step"},
 }
 
@@ -114,15 +114,12 @@ def test_a_cell_of_pybullet_is_not_made_for_mujoco():
         PybulletCell(load_config(None, ["simulator=mujoco"]))
 
 
-def test_randomisation_is_refused_in_mujoco():
-    with pytest.raises(UserError, match="cannot be randomised; use simulator=pybullet"):
-        make_cell(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
-
-
-def test_any_simulator_that_implements_it_can_be_randomised(monkeypatch):
+def test_a_simulator_that_does_not_implement_randomisation_is_refused(monkeypatch):
     class Own(MujocoCell):
-        def randomizable(self):
-            raise NotImplementedError("reached")
+        randomizable = Cell.randomizable
 
+    config = load_config(None, ["simulator=mujoco", "evaluate.randomise=true"])
+    check_simulator(config)
     monkeypatch.setitem(SIMULATORS, "mujoco", Own)
-    check_simulator(load_config(None, ["simulator=mujoco", "evaluate.randomise=true"]))
+    with pytest.raises(UserError, match="simulator=mujoco: its cell does not implement rand"):
+        check_simulator(config)
