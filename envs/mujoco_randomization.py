@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -134,51 +135,45 @@ class MujocoRandomizable:
     def _change_friction(self, changes: Mapping[str, Change]) -> None:
         model = self._model
         for i, (shapes, pairs) in enumerate(zip(self._shapes_of, self._pairs_of)):
-            for friction, dim, chosen, sliding, rolling in (
+            for friction, dimensions, rows, sliding, rolling in (
                 (model.geom_friction, model.geom_condim, shapes, slice(0, 1), slice(2, 3)),
                 (model.pair_friction, model.pair_dim, pairs, _SLIDING, _ROLLING),
             ):
-                for number in np.flatnonzero(chosen):
-                    friction[number, sliding] = _changed(
-                        changes, "object_friction", friction[number, sliding.start], i
-                    )
-                    rolls = dim[number] == _WHOLE
-                    length = float(friction[number, rolling.start]) if rolls else 0.0
-                    new = _changed(changes, "rolling_friction", length, i)
-                    if new != length:
-                        friction[number, rolling] = new
-                        dim[number] = _WHOLE if new > 0 else _WITHOUT_ROLLING
-        for name, pairs in (
-            ("table_friction", self._with_table), ("finger_friction", self._with_fingers)
-        ):  # fmt: skip
-            model.pair_friction[pairs, _SLIDING] *= _changed(changes, name, 1.0)
-        for number in np.flatnonzero(self._with_fingers):
-            torsion = float(model.pair_friction[number, _TORSION])
-            model.pair_friction[number, _TORSION] = _changed(changes, "spinning_friction", torsion)
+                nominal = friction[rows, sliding]
+                friction[rows, sliding] = _changed(changes, "object_friction", nominal, i)
+                first = np.flatnonzero(rows)[0]  # all of an object's have the same
+                rolls = dimensions[first] == _WHOLE
+                length = float(friction[first, rolling.start]) if rolls else 0.0
+                new = _changed(changes, "rolling_friction", length, i)
+                if new != length:
+                    friction[rows, rolling] = new
+                    dimensions[rows] = _WHOLE if new > 0 else _WITHOUT_ROLLING
+        table, fingers, friction = self._with_table, self._with_fingers, model.pair_friction
+        friction[table, _SLIDING] *= _changed(changes, "table_friction", 1.0)
+        friction[fingers, _SLIDING] *= _changed(changes, "finger_friction", 1.0)
+        torsion = friction[fingers, _TORSION]
+        friction[fingers, _TORSION] = _changed(changes, "spinning_friction", torsion)
 
     def _change_contacts(self, changes: Mapping[str, Change]) -> None:
         """Write stiffness and damping where they change: MuJoCo takes them negated, in place of a
         time and a damping ratio."""
         solref, step = self._model.pair_solref, self._model.opt.timestep
         most = _MOST_DAMPING / step
-        if "restitution" in changes:
-            for i, pairs in enumerate(self._pairs_of):
-                for number in np.flatnonzero(pairs & self._with_table):
-                    stiffness, damping = _stiffness_damping(solref[number])
-                    natural = 2 * math.sqrt(stiffness)
-                    nominal = restitution_of(damping / natural)
-                    bounce = _changed(changes, "restitution", nominal, i)
-                    if bounce != nominal:
-                        ratio = _damping_ratio(bounce, most / natural)
-                        solref[number] = -stiffness, -ratio * natural
-        if "contact_stiffness" in changes or "contact_damping" in changes:
-            for number in np.flatnonzero(self._with_fingers):
-                nominal = _stiffness_damping(solref[number])
-                stiffness = _changed(changes, "contact_stiffness", nominal[0])
-                damping = _changed(changes, "contact_damping", nominal[1])
-                if (stiffness, damping) != nominal:
-                    stiffness = min(stiffness, _MOST_STIFFNESS / step**2)
-                    solref[number] = -stiffness, -min(damping, most)
+        if not self._bodies:
+            return
+        nominal = _stiffness_damping(self._nominal["pair_solref"][0])  # the same for all pairs
+        critical = 2 * math.sqrt(nominal[0])
+        own = restitution_of(nominal[1] / critical)
+        for i, pairs in enumerate(self._pairs_of):
+            bounce = _changed(changes, "restitution", own, i)
+            if bounce != own:
+                ratio = _damping_ratio(bounce, most / critical)
+                solref[pairs & self._with_table] = -nominal[0], -ratio * critical
+        stiffness = _changed(changes, "contact_stiffness", nominal[0])
+        damping = _changed(changes, "contact_damping", nominal[1])
+        if (stiffness, damping) != nominal:
+            stiffness = min(stiffness, _MOST_STIFFNESS / step**2)
+            solref[self._with_fingers] = -stiffness, -min(damping, most)
 
     def _change_motors(self, changes: Mapping[str, Change]) -> None:
         model, robot = self._model, self._robot
@@ -193,7 +188,7 @@ class MujocoRandomizable:
         model.actuator_gainprm[_GRIPPER, 0] *= gripper
         model.actuator_biasprm[_GRIPPER, 1] *= gripper
         for i, joint in enumerate(self._joints):
-            damping = float(model.dof_damping[joint])
+            damping = model.dof_damping[joint]
             model.dof_damping[joint] = _changed(changes, "joint_damping", damping, i)
         seconds = _changed(changes, "latency", self._latency * robot.dt)
         robot.latency = max(0, round(seconds / robot.dt))
@@ -229,9 +224,10 @@ def _stiffness_damping(solref: np.ndarray) -> tuple[float, float]:
 
 
 def _changed(
-    changes: Mapping[str, Change], name: str, nominal: float, index: int | None = None
-) -> float:
+    changes: Mapping[str, Change], name: str, nominal: Any, index: int | None = None
+) -> Any:
+    """A nominal value, or an array of them, after the change of that name."""
     if name not in changes:
-        return float(nominal)
+        return nominal
     operation, value = changes[name]
-    return changed(operation, float(nominal), value if index is None else value[index])
+    return changed(operation, nominal, value if index is None else value[index])
