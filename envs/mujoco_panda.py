@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
 HAND_LINK = "panda_hand"
-HAND_LINKS = ("panda_link7", "panda_link8", HAND_LINK)  # one link in PyBullet's cell
+_HAND_LINKS = ("panda_link7", "panda_link8", HAND_LINK)  # one link in PyBullet's cell
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's manual
 
 
@@ -304,7 +304,7 @@ class MujocoPanda(Robot):
 
     def palm_touches(self) -> bool:
         """Whether anything presses on the hand itself, not only on its fingers."""
-        hand = [self._links[name] for name in HAND_LINKS]
+        hand = [self._links[name] for name in _HAND_LINKS]
         numbers = self._robot_contacts()
         bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
         palm = numbers[np.isin(bodies, hand).any(axis=1)]

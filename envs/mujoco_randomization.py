@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from envs.mujoco_panda import ARM_JOINTS, FINGERS, HAND_LINKS, MujocoPanda, load_mujoco
+from envs.mujoco_panda import ARM_JOINTS, FINGERS, MujocoPanda, load_mujoco
 from utils.config_types import Change, changed
 from utils.transforms import pose_matrix
 
@@ -71,10 +71,13 @@ class MujocoRandomizable:
         self._colours = model.geom_rgba.copy()
         self._gravity, self._latency = float(model.opt.gravity[2]), robot.latency
         self._damping_time = robot.damping_time
-        links = [[f"panda_link{i}"] for i in range(1, len(ARM_JOINTS))] + [list(HAND_LINKS)]
-        self._links = [[model.body(name).id for name in names] for names in links]
+        joints = [model.joint(name) for name in ARM_JOINTS]
+        self._joints = [joint.dofadr[0] for joint in joints]
+        # Each link with what is fixed to it: the hand belongs to the last one, as in PyBullet.
+        self._links = [
+            np.flatnonzero(model.body_weldid == model.jnt_bodyid[joint.id]) for joint in joints
+        ]
         self._gravcomp = model.body_gravcomp.copy()
-        self._joints = [model.joint(name).dofadr[0] for name in ARM_JOINTS]
         fingers = [model.body(name).id for name in FINGERS]
         ends = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
         self._with_table = (ends == table).any(axis=1)
@@ -126,7 +129,7 @@ class MujocoRandomizable:
             )  # fmt: skip
             model.body_gravcomp[links] = self._gravcomp[links] * known
 
-    def _scale_mass(self, bodies: list[int], mass: float) -> None:
+    def _scale_mass(self, bodies: Sequence[int] | np.ndarray, mass: float) -> None:
         """Make bodies together as heavy as `mass` kg, with the inertia that belongs to it."""
         factor = mass / self._nominal["body_mass"][bodies].sum()
         self._model.body_mass[bodies] *= factor

@@ -12,7 +12,6 @@ import mujoco
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
 from envs.mujoco_cell import MujocoCell
-from envs.mujoco_panda import INERTIALS
 from envs.mujoco_randomization import MujocoRandomizable, restitution_of
 
 G = 9.81
@@ -236,13 +235,13 @@ def test_the_controller_knows_the_nominal_masses_alone(cell):
     robot, excess = cell.robot, 1.2
     factors = [1.0] * 7
     factors[3] = excess
+    model, data = robot.model, robot.data
+    body, joint = model.body("panda_link4").id, model.joint("panda_joint2").id
+    weight = np.array([0.0, 0.0, -(excess - 1) * model.body_mass[body] * G])
     robot.place(cell.home)
     apply(cell, robot_mass=("scale", factors))
     cell.step(240)
-    model, data = robot.model, robot.data
-    joint = model.joint("panda_joint2").id
-    lever = data.xipos[model.body("panda_link4").id] - data.xanchor[joint]
-    weight = np.array([0.0, 0.0, -(excess - 1) * INERTIALS["panda_link4"].mass * G])
+    lever = data.xipos[body] - data.xanchor[joint]
     torque = data.xaxis[joint] @ np.cross(lever, weight)
     assert robot.q[1] - cell.home[1] == pytest.approx(torque / 4500.0, rel=0.01)
     apply(cell)
