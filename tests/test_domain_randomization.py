@@ -15,6 +15,7 @@ from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import ARM, FINGERS
+from envs.randomized_env import RandomizedGraspingEnv
 from envs.rounds import run_round
 from envs.simulators import SIMULATORS, make_cell
 from envs.vector_env import training_envs
@@ -43,14 +44,14 @@ def scene(wild):
     return make_scene("pile", objects, 1, wild)
 
 
-@pytest.fixture(params=list(SIMULATORS))
+@pytest.fixture(scope="module", params=list(SIMULATORS))
 def simulator(request):
     if importlib.util.find_spec(request.param) is None:
         pytest.skip(f"{request.param} is not installed")
     return request.param
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def make(simulator):
     """A cell for a config, in either simulator."""
     return SIMULATORS[simulator]
@@ -539,17 +540,16 @@ def episode(env, seed=None, options=None, steps=6):
 
 
 @pytest.fixture(scope="module")
-def env():
+def env(make):
     config = load_config(
         None,
         [*EXTREME, "randomization.physics.arm_velocity_gain=0.9,1,uniform,scale,step",
          "randomization.vision.camera_shift=-0.01,0.01,normal,add,step"],
     )  # fmt: skip
-    env = gymnasium.make(
-        "RandomizedGrasping-v0", config=config, resolution=48, control="ee_planar", max_steps=6
-    )
-    yield env
-    env.close()
+    with make(config) as cell:
+        yield RandomizedGraspingEnv(
+            config=config, cell=cell, resolution=48, control="ee_planar", max_steps=6
+        )
 
 
 def test_an_episode_is_replayed_bit_for_bit(env):
@@ -641,18 +641,21 @@ def test_physics_alone_does_not_change_the_picture(wild, cell):
     assert np.array_equal(before.rgb, after.rgb) and np.array_equal(before.depth, after.depth)
 
 
-def test_an_evaluation_meets_the_same_world_for_every_policy(scene):
-    config = load_config(None, [*EXTREME, "evaluate.randomise=true"])
+def test_an_evaluation_meets_the_same_world_for_every_policy(scene, simulator):
+    config = load_config(None, [*EXTREME, "evaluate.randomise=true", f"simulator={simulator}"])
     with make_cell(config) as cell:
-        frictions = []
+        dynamics = []
         for _ in range(2):
             cell.build(scene)
-            frictions.append(pybullet.getDynamicsInfo(cell.bodies[0], -1, cell.client)[1])
-    assert frictions[0] == frictions[1] != scene.placements[0].model.friction
+            dynamics.append(object_dynamics(cell, 0))
+    assert dynamics[0] == dynamics[1]
+    assert dynamics[0]["mass"] != scene.placements[0].model.mass
 
 
-def test_the_record_of_a_round_replays_its_world(tmp_path):
-    config = load_config(None, ["sim.renderer=tiny", "evaluate.randomise=true"])
+def test_the_record_of_a_round_replays_its_world(tmp_path, simulator, make):
+    config = load_config(
+        None, ["sim.renderer=tiny", "evaluate.randomise=true", f"simulator={simulator}"]
+    )
     boxes = load_object_set("box", cache_dir=config.cache_folder)
     scene = make_scene("isolated", boxes, 3, config)
     with make_cell(config) as cell:
@@ -660,13 +663,12 @@ def test_the_record_of_a_round_replays_its_world(tmp_path):
     append_round(tmp_path / "rounds.jsonl", record)
     (kept,) = read_rounds(tmp_path / "rounds.jsonl")
     assert kept == record and kept.randomization["physics"]["object_mass"]
-    with PybulletCell(config) as cell:
+    with make(config) as cell:
         plain = run_round(cell, scene, lambda frame: [], policy="p", objects="box", max_failures=1)
         assert plain.randomization is None
         randomizer = DomainRandomizer(cell, config.randomization)
         cell.on_build = lambda cell: randomizer.replay(kept.randomization)
         cell.load(scene)
-        (body,) = cell.bodies
-        mass = pybullet.getDynamicsInfo(body, -1, physicsClientId=cell.client)[0]
+        mass = object_dynamics(cell, 0)["mass"]
     _, (factor,) = kept.randomization["physics"]["object_mass"]
     assert mass == pytest.approx(factor * scene.placements[0].model.mass)

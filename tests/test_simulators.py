@@ -121,5 +121,5 @@ def test_a_simulator_that_does_not_implement_randomisation_is_refused(monkeypatc
     config = load_config(None, ["simulator=mujoco", "evaluate.randomise=true"])
     check_simulator(config)
     monkeypatch.setitem(SIMULATORS, "mujoco", Own)
-    with pytest.raises(UserError, match="simulator=mujoco: its cell does not implement rand"):
+    with pytest.raises(UserError, match="simulator=mujoco: its cell cannot be randomised"):
         check_simulator(config)
