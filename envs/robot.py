@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -155,7 +156,7 @@ class Robot(ABC):
         self._clock += count
         return count
 
-    def _send(self, command: Callable[..., object], *args, **kwargs) -> None:
+    def _send(self, command: Callable[..., object], *args: Any, **kwargs: Any) -> None:
         """Give a motor command, or delay it by the latency; commands arrive in the order given."""
         if self.latency or self._underway:
             due = self._clock + self.latency
