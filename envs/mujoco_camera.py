@@ -102,7 +102,9 @@ class MujocoCamera(Camera):
         for shape in self._scene.geoms[: self._scene.ngeom]:
             if shape.segid >= 0 and shape.objtype == self._mujoco.mjtObj.mjOBJ_GEOM:
                 body_of[shape.segid + 1] = self._model.geom_bodyid[shape.objid]
-        return body_of[colours.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16])]
+        # Red and green hold the number, of which there are fewer than _MOST_SHAPES.
+        red, green = colours[..., 0].astype(np.int32), colours[..., 1].astype(np.int32)
+        return body_of[red + (green << 8)]
 
     def close(self) -> None:
         if self._context is not None:
