@@ -410,7 +410,8 @@ class Cell(ABC):
 def not_randomizable(config: Config) -> UserError:
     """The error for a simulator whose cells do not implement `Cell.randomizable`."""
     return UserError(
-        f"simulator={config.simulator}: its cell cannot be randomised; use simulator=pybullet"
+        f"simulator={config.simulator}: its cell cannot be randomised; set "
+        "evaluate.randomise=false, or use simulator=pybullet or simulator=mujoco"
     )
 
 

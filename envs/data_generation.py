@@ -304,9 +304,7 @@ def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:
     return replace(scene, placements=tuple(placements))
 
 
-def execute_pairs(
-    cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator
-) -> list[Trial]:
+def execute_pairs(cell: Cell, scene: Scene, frame, labels, rng: np.random.Generator) -> list[Trial]:
     """Execute labelled pairs of every quality, each on the freshly loaded scene. A grasp during
     which the simulation blows up has failed."""
     trials = []

@@ -1,16 +1,21 @@
-"""Scenes laid out in MuJoCo: an empty table on which objects come to rest.
+"""Bodies in a MuJoCo model: table, walls, objects and boards, and the physics that they share.
 
-`envs.cell_scenes` decides what is put where. This module knows no cell, robot or camera.
+`MujocoTable` is the empty table on which scenes are laid out before any cell is built;
+`envs.cell_scenes` decides what is put where. MuJoCo describes a model by an `MjSpec`, which is then
+compiled. This module knows no cell, robot or camera.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from typing_extensions import Self
 
+from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
+    GRAVITY,
     REST_CHECK_STEPS,
     REST_SPEED,
     TABLE_COLOUR,
@@ -20,11 +25,117 @@ from envs.cell_layout import (
     ObjectModel,
     table_box,
 )
-from envs.mujoco_cell import SUBSTEPS, add_box, add_object, set_up_physics
 from envs.mujoco_panda import load_mujoco
+from envs.object_primitives import NativeShape
 from utils.config import Config
+from utils.transforms import position_quaternion
+
+if TYPE_CHECKING:
+    import mujoco
 
 _PARKED = (0.0, 0.0, -10.0)  # m in W, where an object is that is not on the table
+
+
+# --- Physics and shapes -----------------------------------------------------------------------
+
+# MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
+# fingers: with nothing on these here, the object's own coefficient counts in both.
+NO_FRICTION = 1e-5
+# m and dimensionless lengths of torsional and rolling friction, MuJoCo's defaults.
+TORSION, ROLLING = 0.005, 1e-4
+# s, in which a contact gets rid of a penetration. MuJoCo's default, 20 ms, is so soft that objects
+# of 30 g creep and turn in a grip of 10 N (by 1.6 mm in half a second, with this by 0.5 mm).
+CONTACT_TIME = 0.005
+
+
+# MuJoCo's steps in one of the cell's steps: a grip lasts through about one millisecond.
+SUBSTEPS = 4
+
+
+def set_up_physics(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Set gravity and the friction solver of a model; returns it."""
+    mujoco = load_mujoco()
+    spec.option.gravity = [0, 0, -GRAVITY]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 100  # of friction's stiffness: grasped objects creep less
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return spec
+
+
+def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
+    """Add an immovable box."""
+    mujoco = load_mujoco()
+    body = spec.worldbody.add_body(name=name, pos=list(box.position))
+    geom = body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=list(box.half_size), rgba=list(colour)
+    )
+    geom.friction = [NO_FRICTION, TORSION, ROLLING]
+    geom.solref[0] = CONTACT_TIME
+
+
+def add_object(
+    spec: mujoco.MjSpec, name: str, model: ObjectModel, position, quaternion
+) -> mujoco.MjsBody:
+    """Add an object with its centre of mass at position (3,) in W, turned by a quaternion (4,);
+    returns MuJoCo's specification of its body."""
+    body = spec.worldbody.add_body(
+        name=name, pos=list(position), quat=np.roll(quaternion, 1).tolist()
+    )
+    body.add_freejoint(name=name)
+    body.mass, body.inertia, body.ipos = model.mass, model.inertia, [0, 0, 0]
+    body.explicitinertial = True
+    for geom in _add_shapes(spec, body, name, model):
+        geom.rgba = list(model.color)
+        geom.friction = [model.friction, TORSION, max(model.rolling_friction, ROLLING)]
+        geom.condim = 6 if model.rolling_friction else 4
+        geom.solref[0] = CONTACT_TIME
+    return body
+
+
+def _add_shapes(spec: mujoco.MjSpec, body, name: str, model: ObjectModel) -> list:
+    """Give a body its object's shape: a native one, or a mesh for each convex part."""
+    mujoco = load_mujoco()
+    if isinstance(model.collision, NativeShape):
+        kind, size = _native(mujoco, model.collision)
+        return [body.add_geom(type=kind, size=size)]
+    geoms = []
+    for i, part in enumerate(model.parts):
+        mesh = spec.add_mesh(name=f"{name}_{i}")
+        mesh.uservert = np.asarray(part, dtype=np.float32).ravel()
+        geoms.append(body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name))
+    return geoms
+
+
+def _native(mujoco, shape: NativeShape) -> tuple[Any, list[float]]:
+    """MuJoCo's type and size, in half lengths, of a native shape."""
+    kinds = mujoco.mjtGeom
+    if shape.kind == "box":
+        return kinds.mjGEOM_BOX, [side / 2 for side in shape.size]
+    if shape.kind == "sphere":
+        return kinds.mjGEOM_SPHERE, [shape.size[0], 0, 0]
+    radius, length = shape.size
+    kind = kinds.mjGEOM_CYLINDER if shape.kind == "cylinder" else kinds.mjGEOM_CAPSULE
+    return kind, [radius, length / 2, 0]
+
+
+def add_board(spec: mujoco.MjSpec, board: Board, T_WO: np.ndarray) -> None:
+    """Add a board that stays at T_WO (4, 4) and collides with nothing."""
+    mujoco = load_mujoco()
+    position, quaternion = position_quaternion(T_WO)
+    body = spec.worldbody.add_body(
+        name="board", pos=list(position), quat=np.roll(quaternion, 1).tolist()
+    )
+    half, middle = board.white()
+    white = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=middle, rgba=list(WHITE))
+    vertices, triangles = board.black()
+    mesh = spec.add_mesh(name="board", uservert=np.ravel(vertices), userface=triangles)
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a plane has no volume
+    black = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, rgba=list(BLACK))
+    for geom in (white, black):
+        geom.contype = geom.conaffinity = 0
+
+
+# --- The table on which scenes are laid out ---------------------------------------------------
 
 
 class MujocoTable(LayoutTable):

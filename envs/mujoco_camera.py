@@ -1,7 +1,7 @@
-"""The RGB-D camera in MuJoCo: images drawn without a window by MuJoCo's OpenGL renderer.
+"""The RGB-D camera in MuJoCo, and a window for people.
 
-Camera model, depth and light settings are those of `envs.cell`. This module knows nothing of
-robots, objects or tasks.
+MuJoCo's OpenGL renderer draws the camera's images without a window. Camera model, depth and light
+settings are those of `envs.cell`. This module knows nothing of robots, objects or tasks.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import atexit
 import functools
 import os
 import sys
+import threading
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 CAMERA, LIGHT = "camera", "light"  # names in the model
 _MOST_SHAPES = 2000  # in one picture
+# The window's first view: degrees, and metres in W.
+SCENIC_VIEW = {"azimuth": 150.0, "elevation": -30.0, "distance": 1.6, "lookat": (0.4, -0.1, 0.15)}
 
 
 def add_view(spec: mujoco.MjSpec) -> None:
@@ -98,13 +102,73 @@ class MujocoCamera(Camera):
         for shape in self._scene.geoms[: self._scene.ngeom]:
             if shape.segid >= 0 and shape.objtype == self._mujoco.mjtObj.mjOBJ_GEOM:
                 body_of[shape.segid + 1] = self._model.geom_bodyid[shape.objid]
-        return body_of[colours.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16])]
+        # Red and green hold the number, of which there are fewer than _MOST_SHAPES.
+        red, green = colours[..., 0].astype(np.int32), colours[..., 1].astype(np.int32)
+        return body_of[red + (green << 8)]
 
     def close(self) -> None:
         if self._context is not None:
             _gl_context().make_current()
             self._context.free()
             self._context = None
+
+
+class Window:
+    """A window that shows a model while it moves: MuJoCo's viewer, in a thread of its own.
+
+    Raises UserError where no window can be opened.
+    """
+
+    def __init__(self) -> None:
+        self._viewer = None
+        self._threads: set[threading.Thread] = set()
+        self._view: dict | None = None
+        _check_display()
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Open the window on another model; the direction of view stays."""
+        from mujoco.viewer import launch_passive
+
+        self.close()
+        others = set(threading.enumerate())
+        try:
+            self._viewer = launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        except RuntimeError as error:  # macOS
+            raise UserError(
+                f"the window needs MuJoCo's own interpreter here: run mjpython instead of python "
+                f"({error})"
+            ) from error
+        self._threads = set(threading.enumerate()) - others
+        with self._viewer.lock():
+            for name, value in (self._view or SCENIC_VIEW).items():
+                setattr(self._viewer.cam, name, value)
+
+    def update(self) -> None:
+        """Show the state that the data have now; nothing happens once the user has closed it."""
+        if self._viewer is not None and self._viewer.is_running():
+            self._viewer.sync()
+
+    def close(self) -> None:
+        """Close the window and wait for its thread; may be called again."""
+        if self._viewer is None:
+            return
+        self._view = {name: getattr(self._viewer.cam, name) for name in SCENIC_VIEW}
+        self._viewer.close()
+        for thread in self._threads:  # OpenGL must not end before it
+            thread.join()
+        self._viewer = None
+
+
+def _check_display() -> None:
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the sentence below says it
+        if not glfw.init():
+            raise UserError(
+                "simulator=mujoco: a window needs a display, and there is none here; "
+                "render pictures without a window instead (render_mode='rgb_array')"
+            )
 
 
 def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:

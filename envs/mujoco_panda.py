@@ -124,7 +124,8 @@ class MujocoPanda(Robot):
     """The Panda in a MuJoCo model; `model` and `data` are MuJoCo's.
 
     spec: a model made from `panda_spec`. dt: s, a control period, in which MuJoCo takes `substeps`
-    steps of its own. Raises UserError without MuJoCo.
+    steps of its own. damping_time: s, the arm's servos' damping over their stiffness. Raises
+    UserError without MuJoCo.
     """
 
     def __init__(
@@ -140,6 +141,7 @@ class MujocoPanda(Robot):
         self._mujoco = load_mujoco()
         spec.option.timestep = dt / substeps
         self.substeps = substeps
+        self.damping_time = _DAMPING_RATIO_OF_STIFFNESS
         self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
         joints = [self.model.joint(name) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
@@ -190,8 +192,7 @@ class MujocoPanda(Robot):
         opening = self.max_opening if opening is None else opening
         self.data.qpos[self._places] = [*q, opening / 2, opening / 2]
         self.data.qvel[:] = 0
-        self._stay(q)
-        self.command_gripper(opening)
+        self._stay_placed(q, opening)
         self.data.ctrl[:7], self.data.ctrl[7] = q, opening
         self._mujoco.mj_forward(self.model, self.data)
 
@@ -200,21 +201,31 @@ class MujocoPanda(Robot):
         self._fastest = np.minimum(JOINT_VELOCITY, speed)
 
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
-        self._goal, self._speed = np.asarray(q, dtype=float), None
+        self._send(self._follow, np.array(q, dtype=float), np.array(velocity, dtype=float))
+
+    def _follow(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        self._goal, self._speed = q, None
         # The servo's damping brakes the desired motion, too: stiffness x this takes it back.
-        self._reference = self._goal + _DAMPING_RATIO_OF_STIFFNESS * np.asarray(velocity)
+        self._reference = q + self.damping_time * velocity
 
     def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
-        self._goal = np.asarray(q, dtype=float)
+        self._send(self._drive, np.array(q, dtype=float), speeds)
+
+    def _drive(self, q: np.ndarray, speeds: list[float]) -> None:
+        self._goal = q
         self._reference, self._speed = self.q, np.minimum(self._fastest, speeds)
 
     def _send_gripper(self, opening: float, force: float) -> None:
+        self._send(self._drive_fingers, opening, force)
+
+    def _drive_fingers(self, opening: float, force: float) -> None:
         self.model.actuator_forcerange[7] = [-force, force]
         self._opening = opening
 
     def step(self, count: int = 1) -> None:
         """Advance by so many control periods."""
         for _ in range(count):
+            self.receive(1)
             control, reach = self.data.ctrl, 2 * FINGER_SPEED * self.dt
             control[7] += min(max(self._opening - control[7], -reach), reach)
             control[:7] = self._arm_target()
@@ -226,7 +237,7 @@ class MujocoPanda(Robot):
         way = self._goal - self._reference
         step = np.clip(way, -self._speed * self.dt, self._speed * self.dt)
         self._reference = self._reference + step
-        return self._reference + _DAMPING_RATIO_OF_STIFFNESS * step / self.dt
+        return self._reference + self.damping_time * step / self.dt
 
     # --- Contacts -----------------------------------------------------------------------------
 

@@ -7,9 +7,7 @@ move.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +34,6 @@ class PybulletPanda(Robot):
 
     urdf: the model that `envs.panda_urdf.write_panda` has written for this gripper.
     position_gain, velocity_gain, gripper_gain: factors on the motors' gains, 1 unless changed.
-    latency: physics steps after which a motor command arrives, 0 unless changed.
     """
 
     def __init__(
@@ -51,9 +48,6 @@ class PybulletPanda(Robot):
         super().__init__(dt, gripper, grip_force, gate)
         self.client = client
         self.position_gain = self.velocity_gain = self.gripper_gain = 1.0
-        self.latency = 0
-        self._clock = 0  # physics steps
-        self._underway: deque[tuple[int, Callable[[], object]]] = deque()  # by time of arrival
         self.body = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
         )
@@ -103,11 +97,7 @@ class PybulletPanda(Robot):
         opening = self.max_opening if opening is None else opening
         for joint, value in zip([*ARM, *FINGERS], [*q, opening / 2, opening / 2]):
             pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
-        self._underway.clear()
-        latency, self.latency = self.latency, 0
-        self._stay(q)
-        self.command_gripper(opening)
-        self.latency = latency
+        self._stay_placed(q, opening)
 
     # --- Motors -------------------------------------------------------------------------------
 
@@ -118,24 +108,6 @@ class PybulletPanda(Robot):
         Bullet has one such limit for all joints of a body.
         """
         pybullet.changeDynamics(self.body, -1, maxJointVelocity=speed, physicsClientId=self.client)
-
-    def receive(self, count: int) -> int:
-        """Carry out the commands that have arrived, and advance the motors' clock by up to `count`
-        physics steps; returns by how many, because no command arrives in between."""
-        while self._underway and self._underway[0][0] <= self._clock:
-            self._underway.popleft()[1]()
-        if self._underway:
-            count = min(count, self._underway[0][0] - self._clock)
-        self._clock += count
-        return count
-
-    def _send(self, command: Callable[..., object], *args, **kwargs) -> None:
-        """Give a motor command, or delay it by the latency; commands arrive in the order given."""
-        if self.latency or self._underway:
-            due = self._clock + self.latency
-            self._underway.append((due, partial(command, *args, **kwargs)))
-        else:
-            command(*args, **kwargs)
 
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
         self._send(

@@ -8,7 +8,10 @@ same for all. This module knows no simulator, object, camera or task.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,13 +43,17 @@ class Robot(ABC):
 
     dt: s, a control period. grip_force: N a finger, unless a command names another force. gate:
     every command to the arm passes it. gripper: the hand. links: the numbers under which the robot
-    appears in an `Image`.
+    appears in an `Image`. latency: physics steps after which a motor command arrives, 0 unless
+    changed.
     """
 
     links: list[int]
 
     def __init__(self, dt: float, gripper: GripperGeometry, grip_force: float, gate: ArmGate):
         self.dt, self.gripper, self.grip_force, self.gate = dt, gripper, grip_force, gate
+        self.latency = 0
+        self._clock = 0  # physics steps
+        self._underway: deque[tuple[int, Callable[[], object]]] = deque()  # by time of arrival
 
     # --- State --------------------------------------------------------------------------------
 
@@ -136,6 +143,35 @@ class Robot(ABC):
     @abstractmethod
     def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
         """Let the motors go to q (7,), rad, at up to `speeds`, seven in rad/s."""
+
+    # --- Latency ------------------------------------------------------------------------------
+
+    def receive(self, count: int) -> int:
+        """Carry out the commands that have arrived, and advance the motors' clock by up to `count`
+        physics steps; returns by how many, because no command arrives in between."""
+        while self._underway and self._underway[0][0] <= self._clock:
+            self._underway.popleft()[1]()
+        if self._underway:
+            count = min(count, self._underway[0][0] - self._clock)
+        self._clock += count
+        return count
+
+    def _send(self, command: Callable[..., object], *args: Any, **kwargs: Any) -> None:
+        """Give a motor command, or delay it by the latency; commands arrive in the order given."""
+        if self.latency or self._underway:
+            due = self._clock + self.latency
+            self._underway.append((due, partial(command, *args, **kwargs)))
+        else:
+            command(*args, **kwargs)
+
+    def _stay_placed(self, q: np.ndarray, opening: float) -> None:
+        """Have the motors stay where `place` has put the robot, at once whatever the latency; what
+        was underway never arrives."""
+        self._underway.clear()
+        latency, self.latency = self.latency, 0
+        self._stay(q)
+        self.command_gripper(opening)
+        self.latency = latency
 
     # --- Motions ------------------------------------------------------------------------------
 

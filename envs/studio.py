@@ -49,10 +49,12 @@ class Studio:
 
     def picture(self) -> np.ndarray:
         """(H, W, 3) uint8 picture of the cell as it is now."""
-        if self._twin is None:
-            return self._cell.image(self._intrinsics, self._T_WC, _LIGHT).rgb
-        self._twin.mirror(self._cell)
-        return self._twin.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
+        shown = self._cell
+        if self._twin is not None:
+            self._twin.mirror(self._cell)
+            shown = self._twin
+        # Not `Cell.image`: a randomised view belongs to the cell's camera and counts its pictures.
+        return shown.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
 
     def close(self) -> None:
         if self._twin is not None:

@@ -93,8 +93,10 @@ def taught_cell(request, config: Config):
 
 @pytest.fixture(scope="module")
 def bullet_cell(config: Config):
-    """An empty PyBullet cell."""
-    with SIMULATORS["pybullet"](config) as cell:
+    """An empty cell, in PyBullet where it is installed."""
+    from envs.simulators import cell_class
+
+    with cell_class(INSTALLED[0])(config) as cell:
         yield cell
 
 

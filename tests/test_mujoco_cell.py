@@ -1,5 +1,7 @@
 """The cell in MuJoCo beside PyBullet's: its bodies, what is gripped, what is a success."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from envs.mujoco_cell import MujocoCell
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from models.planners import make_planner
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import position_quaternion
 
@@ -109,6 +112,27 @@ def test_diverged_physics_is_reported(held_box):
     cell.step(2)
     with pytest.raises(PhysicsError):
         cell.check_physics()
+
+
+@pytest.mark.skipif("DISPLAY" in os.environ, reason="there is a display")
+def test_without_a_display_no_window_opens(config):
+    with pytest.raises(UserError, match="needs a display, and there is none here"):
+        MujocoCell(config, gui=True)
+
+
+@pytest.mark.skipif("DISPLAY" not in os.environ, reason="there is no display")
+def test_a_window_changes_nothing(config, box_set):
+    """Two scenes after each other, shown and not shown; the camera draws beside the window."""
+    one = make_scene("isolated", box_set, 0, config)
+    ends = []
+    for gui in (True, False):
+        with MujocoCell(config, gui=gui) as cell:
+            for _ in range(2):
+                cell.build(one)
+                cell.robot.drive_arm_to(cell.home + 0.1)
+                cell.step(10)
+            ends.append((cell.robot.q.tolist(), cell.frame().rgb.tolist()))
+    assert ends[0] == ends[1]
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,7 @@ def test_the_pandas_own_hand_opens_eight_centimetres(simulator, box_set):
 # Public methods that only the simulator's own modules call, between a cell and its robot; `mirror`
 # belongs to what `Cell.detailed_twin` returns.
 OWN = {
-    "pybullet": {"mirror", "receive"},
+    "pybullet": {"mirror"},
     "mujoco": {"meet", "pose", "step"},
 }
 
