@@ -77,15 +77,20 @@ def kept(make: Callable[..., Result]) -> Callable[..., Result]:
     return known
 
 
+def forget() -> None:
+    """Close and forget what the process keeps."""
+    for made in _kept.values():
+        if hasattr(made, "close"):
+            made.close()
+    _kept.clear()
+
+
 def _begin(job: Job) -> None:
     """Forget the job before, and check that this process can work for the new one."""
     global _begun
     if job == _begun:
         return
-    for made in _kept.values():
-        if hasattr(made, "close"):
-            made.close()
-    _kept.clear()
+    forget()
     cv2.setNumThreads(1)  # the workers fill the cores
     if job.facts is not None:
         _check(job.facts)
