@@ -194,9 +194,6 @@ def test_resume_runs_only_what_is_missing(finished, monkeypatch, played_here):
     }
 
 
-<<<<<<< HEAD
-@pytest.mark.slow
-=======
 @pytest.fixture(params=["local", "cluster"])
 def engine(request):
     """Overrides that choose the engine, and a function that lists its worker processes."""
@@ -245,7 +242,7 @@ def test_rounds_are_the_same_when_a_worker_is_killed(finished, engine, tmp_path,
     assert rows[0] == rows[1]
 
 
->>>>>>> 45bc427 (A test that kills a worker of each engine in mid-evaluation)
+@pytest.mark.slow
 def test_ctrl_c_writes_what_was_measured(tmp_path):
     process = subprocess.Popen(
         [sys.executable, REPOSITORY / "evaluate.py", *SMALL, "evaluate.rounds=400",
