@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser.parse_intermixed_args(argv)
     scenes, kills, calls, repeats = options.scenes, options.kills, 500, 5
     if options.quick:
-        scenes, kills, calls, repeats = 2, 1, 20, 1
+        scenes, kills, calls, repeats = 2, 1, 200, 1
     quick = QUICK if options.quick else ()
     config = load_config(
         None,
@@ -218,10 +218,10 @@ def _survived(
     dead: list[int] = []
 
     def kill(finished: int) -> None:
-        alive = worker_processes()
-        if finished % EACH == 0 and len(dead) < kills and alive:
-            dead.append(alive[len(dead) % len(alive)].pid)
-            psutil.Process(dead[-1]).kill()
+        if finished % EACH == 0 and len(dead) < kills:
+            oldest = worker_processes()[0]  # so that they die in turn
+            oldest.kill()
+            dead.append(oldest.pid)
 
     got = rounds(workers, config, plan, kill)
     different = len(differing_rounds(expected, got)) + abs(len(expected) - len(got))

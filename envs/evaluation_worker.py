@@ -52,11 +52,10 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
             new_planner(name, config, key)
     make_cell(config).close()
     check_bin(config)
+    sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
     with open_executor(config.compute, config.evaluate.workers) as workers:
-        for name in config.evaluate.object_sets:
-            objects = load_objects(name, config)
-            if name not in OBJECT_SETS:
-                prepare(objects, workers)
+        for name in [name for name in sets if name not in OBJECT_SETS]:
+            prepare(sets[name], workers)
 
 
 def privileged_policies(config: Config) -> set[str]:

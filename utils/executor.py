@@ -9,10 +9,12 @@ what the calls compute.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import pickle
 import signal
+import time
 import uuid
 from abc import abstractmethod
 from collections import deque
@@ -36,10 +38,11 @@ from utils.config_schema import ComputeConfig
 from utils.errors import UserError
 from utils.plugins import loaded_modules
 from utils.runs import REPOSITORY
-from utils.worker_process import SOURCES, Job, facts_of, work
+from utils.worker_process import SOURCES, Job, check, facts_of, work
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
+COUNT_SECONDS = 1.0  # between two looks at how many workers a cluster has
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -187,29 +190,29 @@ class _Cluster(Workers):
     def __init__(self, client: Any, most: int | None, job: Job) -> None:
         self._client, self._most, self._job = client, most, job
         self._executor = client.get_executor(pure=False)
+        self._count, self._counted = 0, -math.inf
+        client.run(pickle.loads, _packed(partial(check, job.facts)))
 
     def size(self) -> int:
-        return self._most or max(1, len(self._client.nthreads()))
+        if self._most is None and time.monotonic() > self._counted + COUNT_SECONDS:
+            self._count, self._counted = len(self._client.nthreads()), time.monotonic()
+        return self._most or max(1, self._count)
 
     def _submit(self, call: Call) -> Future:
-        return self._executor.submit(pickle.loads, self._packed(call))
-
-    def check(self) -> None:
-        """Raise what an empty call raises in any of the workers."""
-        self._client.run(pickle.loads, self._packed(bool))
-
-    def _packed(self, call: Call) -> bytes:
-        return pickle.dumps(_Packed(partial(work, self._job, call)))
+        return self._executor.submit(pickle.loads, _packed(partial(work, self._job, call)))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Cancel the calls under way: after an error there may be no worker that ends them."""
         self._executor.shutdown(wait=False)
 
 
-class _Packed:
-    """A call that happens when its pickle is loaded. The scheduler hands the bytes on as they are;
-    it would load a function, and so would have to know this project."""
+def _packed(call: Call) -> bytes:
+    """A pickle whose loading is the call. The scheduler hands the bytes on as they are; it would
+    load a function, and so would have to know this project."""
+    return pickle.dumps(_Packed(call))
 
+
+class _Packed:
     def __init__(self, call: Call) -> None:
         self._call = call
 
@@ -237,7 +240,6 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
         ) from error
     try:
         with client, _Cluster(client, most, Job(job.name, job.seconds, facts)) as cluster:
-            cluster.check()
             yield cluster
     except KilledWorker as error:
         raise _lost(job) from error

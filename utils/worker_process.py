@@ -93,7 +93,7 @@ def _begin(job: Job) -> None:
     forget()
     cv2.setNumThreads(1)  # the workers fill the cores
     if job.facts is not None:
-        _check(job.facts)
+        check(job.facts)
     _begun = job
 
 
@@ -108,7 +108,9 @@ def facts_of(modules: Sequence[str]) -> dict[str, str]:
     return facts | {f"the source of {name}": _digest(name) for name in modules}
 
 
-def _check(expected: Mapping[str, str]) -> None:
+def check(expected: Mapping[str, str]) -> None:
+    """Raise UserError where this process would not compute what one with the facts `expected` does.
+    Changes nothing, so that it may be called while a call of another job is under way."""
     modules = [name.rpartition(" ")[2] for name in expected if name.startswith("the source of")]
     ours = facts_of(modules)
     different = [name for name in expected if expected[name] != ours[name]]
