@@ -29,9 +29,10 @@ from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.evaluation_worker import work
 from utils.config import Config, load_config, with_settings
 from utils.evaluation import Task, tasks
-from utils.executor import Workers, completed, open_executor, worker_environment
+from utils.executor import Workers, completed, open_executor
 from utils.result_records import RoundRecord, append_round, differing_rounds
 from utils.runs import run_script
+from utils.worker_process import worker_environment
 
 SCENES = ("evaluate.policies=heuristic", "evaluate.scenarios=pile",
           "evaluate.object_sets=primitives", "evaluate.videos=0")  # fmt: skip

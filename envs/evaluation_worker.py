@@ -54,8 +54,9 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     check_bin(config)
     sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
     with open_executor(config.compute, config.evaluate.workers) as workers:
-        for name in [name for name in sets if name not in OBJECT_SETS]:
-            prepare(sets[name], workers)
+        for name, objects in sets.items():
+            if name not in OBJECT_SETS:
+                prepare(objects, workers)
 
 
 def privileged_policies(config: Config) -> set[str]:

@@ -28,8 +28,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from utils.config import Config
 from utils.errors import UserError
-from utils.executor import worker_environment
 from utils.runs import REPOSITORY
+from utils.worker_process import worker_environment
 
 RANDOMIZED = "RandomizedGrasping-v0"
 OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # take the whole config as an argument

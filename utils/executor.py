@@ -37,8 +37,7 @@ from typing import Any, TypeVar
 from utils.config_schema import ComputeConfig
 from utils.errors import UserError
 from utils.plugins import loaded_modules
-from utils.runs import REPOSITORY
-from utils.worker_process import SOURCES, Job, check, facts_of, work
+from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_environment
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
@@ -135,7 +134,10 @@ class _Processes(Workers):
 
     def _try(self, call: Call) -> Any:
         for _ in range(MOST_LOSSES):
-            process = self._idle.pop() if self._idle else _new_process()
+            try:
+                process = self._idle.pop()
+            except IndexError:
+                process = _new_process()
             try:
                 return process.submit(work, self._job, call).result()
             except BrokenProcessPool:
@@ -161,24 +163,6 @@ def _new_process() -> ProcessPoolExecutor:
         initializer=signal.signal,
         initargs=(signal.SIGINT, signal.SIG_IGN),
     )
-
-
-@contextmanager
-def worker_environment() -> Iterator[None]:
-    """Processes started within this context find this project, and compute with one thread each,
-    because there are as many of them as cores."""
-    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
-    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 # --- A cluster ------------------------------------------------------------------------------------
@@ -246,7 +230,7 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     except (CancelledError, CommClosedError) as error:
         raise UserError(f"{where}: the scheduler was lost; start it again and go on") from error
     except ModuleNotFoundError as error:
-        if error.name not in SOURCES:
+        if (error.name or "").partition(".")[0] not in SOURCES:
             raise
         raise UserError(
             f"{where}: a worker does not find this project (no module {error.name!r}); install it "

@@ -1,4 +1,4 @@
-"""What a worker process does with a call: checks, a time limit, and what it keeps between calls.
+"""What a worker process does with a call: its environment, a time limit, what it keeps, and checks.
 
 `utils.executor` sends the calls. This module knows neither its engines nor what the calls compute.
 """
@@ -9,8 +9,10 @@ import faulthandler
 import functools
 import hashlib
 import importlib.util
+import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +20,7 @@ from typing import Any, TypeVar
 import cv2
 
 from utils.errors import UserError
-from utils.runs import PACKAGES, package_version
+from utils.runs import PACKAGES, REPOSITORY, package_version
 
 SOURCES = ("envs", "models", "utils")  # this project's packages
 
@@ -54,6 +56,24 @@ def work(job: Job, call: Callable[[], Result]) -> Result:
         raise
     finally:
         faulthandler.cancel_dump_traceback_later()
+
+
+@contextmanager
+def worker_environment() -> Iterator[None]:
+    """Processes started within this context find this project, and compute with one thread each,
+    because there are as many of them as cores."""
+    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
+    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 # --- What a process keeps -------------------------------------------------------------------------
