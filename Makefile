@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
-.PHONY: run quick test test-fast lint typecheck bench results clean
+.PHONY: run quick cluster test test-fast lint typecheck bench results clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
 # tests/conftest.py orders the files.
@@ -21,6 +21,14 @@ quick: $(VENV)/.installed
 	mkdir -p runs
 	$(BIN)/python train_graspnet.py --config configs/quick.yaml --weights runs/quick.pt
 	$(BIN)/python evaluate.py --config configs/quick.yaml
+
+# A Dask scheduler and WORKERS workers on this machine, for compute.scheduler=tcp://127.0.0.1:8786 (docs/scaling.md).
+WORKERS ?= $(shell getconf _NPROCESSORS_ONLN)
+cluster: export PYTHONPATH := $(CURDIR)
+cluster: export OMP_NUM_THREADS := 1
+cluster: $(VENV)/.installed-cluster
+	$(BIN)/dask scheduler --host 127.0.0.1 --port 8786 & trap "kill $$! 2>/dev/null" EXIT INT TERM; \
+	$(BIN)/dask worker tcp://127.0.0.1:8786 --nworkers $(WORKERS) --nthreads 1
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q $(PARALLEL) --durations=10 $(ARGS)
@@ -51,6 +59,10 @@ $(VENV)/bin/python:
 
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -r requirements.txt
+	touch $@
+
+$(VENV)/.installed-cluster: $(VENV)/.installed
+	$(BIN)/python -m pip install "distributed>=2025.1"
 	touch $@
 
 $(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed

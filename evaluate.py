@@ -21,12 +21,11 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a worker; the workers fill the cores
 
 import argparse
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from envs.evaluation_worker import check_everything, privileged_policies, set_up, work
+from envs.evaluation_worker import check_everything, privileged_policies, work
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
@@ -36,11 +35,11 @@ from utils.evaluation import (
     FREE_TO_CHANGE,
     check_controllers,
     check_rounds,
+    describe_workers,
     interruption,
     play,
     policies_of,
     replay,
-    worker_count,
 )
 from utils.report import balanced, write_failures, write_report
 from utils.result_formats import (
@@ -85,13 +84,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
     announce(config, run)
 
-    outcome = play(config, run, work, set_up)
+    outcome = play(config, run, work)
 
     rows = summarise(outcome.rounds, config.seed)
     comparisons = compare(outcome.rounds, config.seed)
     stops = format_stop_reasons(stop_reasons(outcome.rounds))
     print(*filter(None, [format_table(rows), stops, format_comparisons(comparisons)]), sep="\n\n")
-    unfinished, device = interruption(len(outcome.rounds), config), device_of(config)
+    unfinished, device = interruption(len(outcome.rounds), config), describe_workers(config)
     for path in filter(None, [run / "results.json", options.results]):
         write_results(path, rows, comparisons, config, device, unfinished is None)
     write_csv(run / "results.csv", rows)
@@ -146,13 +145,10 @@ def announce(config: Config, run: Path) -> None:
         f"{', '.join(policy_name(*pair) for pair in policies_of(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
         f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, in {config.simulator}, on {device_of(config)}; results in {run}",
+        f"seed {config.seed}, in {config.simulator}, on {describe_workers(config)}; results in "
+        f"{run}",
         flush=True,
     )
-
-
-def device_of(config: Config) -> str:
-    return f"{platform.machine()} CPU, {worker_count(config)} workers"
 
 
 # --- Two runs, and published rounds ---------------------------------------------------------
@@ -188,7 +184,7 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
     for name, version in sample.versions.items():
         if version != ours.get(name):
             print(f"{name} is {ours.get(name)} here, the rounds were played with {version}")
-    different = differing_rounds(sample.rounds, replay(sample, config, work, set_up))
+    different = differing_rounds(sample.rounds, replay(sample, config, work))
     for record in different:
         print(f"different: {record.policy}, {record.scenario}, scene {record.seed}")
     print(f"{len(sample.rounds) - len(different)} of {len(sample.rounds)} rounds are the same")
@@ -214,7 +210,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
         folder = run / evaluation.column / evaluation.scenes.folder
         folder.mkdir(parents=True, exist_ok=True)
         announce(evaluation.config, folder)
-        outcome = play(evaluation.config, folder, work, set_up)
+        outcome = play(evaluation.config, folder, work)
         write_failures(folder / "failures.png", outcome.gallery)
         for row in evaluation.rows:
             scores[row][evaluation.column] = score_of(outcome.rounds, row.planner)
@@ -226,7 +222,8 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
 
     lines, complete = transfer_lines(config, scores), error is None and not interrupted
     print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
-    write_transfer(run, lines, columns, config, device_of(config), complete, options.results)
+    device = describe_workers(config)
+    write_transfer(run, lines, columns, config, device, complete, options.results)
     print(f"picture: {run / 'transfer.png'}")
     if not complete:
         print(f"interrupted; go on with --resume {run}")

@@ -59,7 +59,7 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
-from utils.config import Config
+from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
@@ -75,7 +75,7 @@ from utils.runs import (
 
 WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
-FREE_TO_CHANGE = ("train.name", "train.device", "train.workers", "data.workers")
+FREE_TO_CHANGE = (*COMPUTE_KEYS, "train.name", "train.device", "train.workers", "data.workers")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

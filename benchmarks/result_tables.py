@@ -18,7 +18,7 @@ from typing import Any
 from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
-PAGES = ("README.md", "README.zh-CN.md", "docs/results.md")
+PAGES = ("README.md", "README.zh-CN.md", "docs/results.md", "docs/scaling.md")
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
@@ -129,6 +129,16 @@ def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
     rows = [header, ["---"] * len(header), *lines]
     return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+
+
+def metrics_table(metrics: Figures) -> str:
+    """What a benchmark reports, as a Markdown table."""
+    lines = [
+        [f"`{name}`", f"{one['value']:.3g} {one['unit']}", one["target"] or "-",
+         {True: "yes", False: "no", None: "-"}[one["holds"]]]
+        for name, one in metrics.items()
+    ]  # fmt: skip
+    return table(["what", "measured", "aim", "reached"], lines)
 
 
 def origin(say: Say, *parts: Figures) -> str:
@@ -269,14 +279,30 @@ def cornell(say: Say, part: Figures) -> str:
 
 
 def speed(say: Say, part: Figures) -> str:
+    commands = part["commands"].values()
+    metrics = {name: one for command in commands for name, one in command["metrics"].items()}
+    return "\n\n".join([metrics_table(metrics), origin(say, part)])
+
+
+def scaling(say: Say, part: Figures) -> str:
+    metrics = part["commands"]["scaling"]["metrics"]
+    measured = {name: one for name, one in metrics.items() if not name.startswith("model_")}
+    return "\n\n".join([metrics_table(measured), origin(say, part)])
+
+
+def scaling_model(say: Say, part: Figures) -> str:
+    """A line for each number of workers, and what does not depend on it."""
+    metrics = part["commands"]["scaling"]["metrics"]
+    model = {name: one for name, one in metrics.items() if name.startswith("model_")}
+    sizes = [name.split("_")[1] for name in model if name.endswith("_workers_rate")]
+    columns = {"rate": "scenes/h", "scheduler_load": "scheduler, % CPU", "main_load":
+               "script, % CPU", "network": "Mbit/s", "million": "a million scenes, h"}  # fmt: skip
     lines = [
-        [f"`{name}`", f"{one['value']:.3g} {one['unit']}", one["target"] or "-",
-         {True: "yes", False: "no", None: "-"}[one["holds"]]]
-        for command in part["commands"].values()
-        for name, one in command["metrics"].items()
-    ]  # fmt: skip
-    header = ["what", "measured", "aim", "reached"]
-    return "\n\n".join([table(header, lines), origin(say, part)])
+        [size, *(f"{model.pop(f'model_{size}_workers_{key}')['value']:.3g}" for key in columns)]
+        for size in sizes
+    ]
+    by_workers = table(["workers", *columns.values()], lines)
+    return "\n\n".join([by_workers, metrics_table(model), origin(say, part)])
 
 
 # Name of a table: the parts that it needs, and what writes it.
@@ -293,6 +319,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "ppo": (("ppo",), ppo),
     "cornell": (("cornell",), cornell),
     "speed": (("speed",), speed),
+    "scaling": (("scaling",), scaling),
+    "scaling_model": (("scaling",), scaling_model),
 }
 
 

@@ -138,6 +138,9 @@ PARTS = (
         Command("environment", "bench_env", ""),
         Command("planning", "bench_planning", ""),
     )),
+    Part("scaling", "workers of this machine, of a cluster and of two nodes, and killed ones", 30, (
+        Command("scaling", "bench_scaling", f"seed={SEED}"),
+    )),
 )  # fmt: skip
 
 

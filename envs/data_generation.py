@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +29,12 @@ from envs.simulators import cell_class
 from utils.config import Config, dump_config, with_settings
 from utils.config_types import changed, draw
 from utils.errors import UserError
-from utils.executor import process_pool
+from utils.executor import LostWorkerError, completed, open_executor
 from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
 from utils.runs import write_atomic
+from utils.worker_process import kept
 
 SPLITS = ("train", "validation")
 HELD_OUT = 10  # every tenth training object is kept for validation
@@ -90,8 +89,8 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
 
     rank, ranks: this process makes every ranks-th shard (`torchrun`).
     Raises UserError if the folder holds data of another config, if labels cannot be executed, or if
-    a worker died. However the generation ends, it finishes the shards under way and begins no
-    others.
+    the workers died or wrote elsewhere. However the generation ends, it finishes the shards under
+    way and begins no others.
     """
     folder = data_folder(config)
     _claim(folder, config)
@@ -101,34 +100,35 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     object_sets(config)  # an unusable set raises here, not in a worker
     if config.data.executed_share:
         check_bin(config)
-    workers = config.data.workers or max(1, (os.cpu_count() or 1) // ranks)
-    workers = min(workers, len(missing))
-    pool = process_pool(workers, _set_up, config)
-    jobs = []
+    make = partial(_make_shard, config, folder.absolute())
     try:
         with (
-            pool,
+            open_executor(config.compute, config.data.workers, ranks) as workers,
             tqdm(
                 total=len(missing) * SCENES_PER_SHARD * FRAMES_PER_SCENE, unit="frame", desc="data"
             ) as progress,
         ):
             try:
-                jobs = [pool.submit(_make_shard, folder, *job) for job in missing]
-                for job in as_completed(jobs):
-                    progress.update(job.result())
+                for frames in completed(workers, make, missing):
+                    progress.update(frames)
             except BaseException:  # Ctrl-C, or an error in a worker such as a full disk
                 progress.write("stopping: finishing the shards under way")
-                pool.shutdown(cancel_futures=True)
+                workers.shutdown()
                 progress.write(
                     f"{_frames_kept(config, folder)} frames are kept in {folder}; the same command "
                     "goes on from there"
                 )
                 raise
-    except BrokenProcessPool as error:
+    except LostWorkerError as error:
         raise UserError(
-            f"a worker process died (out of memory?); the finished shards are safe in {folder}: "
-            "start again, perhaps with data.workers=1"
+            f"{error}; the finished shards are safe in {folder}: start again, perhaps with "
+            "data.workers=1"
         ) from error
+    if missing_shards(config, folder, rank, ranks):
+        raise UserError(
+            f"data.root {folder}: the workers have written shards that are not here; on a cluster "
+            "it must be in a folder that all machines share"
+        )
     return folder
 
 
@@ -175,28 +175,25 @@ def _claim(folder: Path, config: Config) -> None:
 
 # --- In a worker process --------------------------------------------------------------------
 
-_worker_config: Config
-_worker_cell: Cell
-_worker_sets: dict[tuple[str, str], ObjectSet]
+
+@kept
+def _cell_of(config: Config) -> Cell:
+    return cell_class(config.simulator)(config)
 
 
-def _set_up(config: Config) -> None:
-    global _worker_config, _worker_cell, _worker_sets
-    _worker_config, _worker_cell = config, cell_class(config.simulator)(config)
-    _worker_sets = object_sets(config)
-
-
-def _make_shard(folder: Path, split: str, number: int) -> int:
+def _make_shard(config: Config, folder: Path, shard: tuple[str, int]) -> int:
+    """Write a shard, given by its split and number; returns how many frames it holds."""
+    (split, number), cell, sets = shard, _cell_of(config), _sets_of(config)
     frames: list[LabelledFrame] = []
     trials: list[Trial] = []
     first = number * SCENES_PER_SHARD
     for scene_number in range(first, first + SCENES_PER_SHARD):
         seed = _FIRST_SEED[split] + scene_number
-        scene, name = draw_scene(_worker_config, split, seed, _worker_sets)
-        for frame, more_trials in label_scene(_worker_config, scene, name, _worker_cell):
+        scene, name = draw_scene(config, split, seed, sets)
+        for frame, more_trials in label_scene(config, scene, name, cell):
             frames.append(frame)
             trials += more_trials
-    write_shard(shard_path(folder, split, number), frames, trials, _worker_cell.gripper.max_opening)
+    write_shard(shard_path(folder, split, number), frames, trials, cell.gripper.max_opening)
     return len(frames)
 
 
@@ -217,6 +214,9 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
         parts[name, "validation"] = ObjectPart(whole, sorted(held_out))
         parts[name, "train"] = ObjectPart(whole, sorted(set(range(len(whole))) - held_out))
     return parts
+
+
+_sets_of = kept(object_sets)
 
 
 def draw_scene(

@@ -6,11 +6,10 @@ which is reset for every round.
 
 from __future__ import annotations
 
-import functools
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
@@ -27,17 +26,19 @@ from envs.simulators import make_cell
 from envs.studio import Film
 from models.planners import Planner, make_planner, needs_truth
 from utils.config import Config
-from utils.evaluation import Task, TaskResult, policies_of, worker_count
+from utils.evaluation import FilmFile, Task, TaskResult, policies_of
+from utils.executor import open_executor
 from utils.geometry import Workspace
 from utils.report import picture
 from utils.result_records import policy_name
 from utils.transforms import Grasp, RGBDFrame
+from utils.worker_process import kept
 
 # --- In the main process, before any work is done --------------------------------------------
 
 
 def check_everything(config: Config, key: str = "evaluate.policies") -> None:
-    """Raise UserError for a policy, a cell or an object set that cannot be used.
+    """Raise UserError for a policy, a cell, an object set or a cluster that cannot be used.
 
     key: of the config, where the policies' names stand; for errors.
     The user's own meshes are read and cut into convex parts here, so that the error names a broken
@@ -51,10 +52,11 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
             new_planner(name, config, key)
     make_cell(config).close()
     check_bin(config)
-    for name in config.evaluate.object_sets:
-        objects = load_objects(name, config)
-        if name not in OBJECT_SETS:
-            prepare(objects, min(worker_count(config), len(objects)))
+    sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
+    with open_executor(config.compute, config.evaluate.workers) as workers:
+        for name, objects in sets.items():
+            if name not in OBJECT_SETS:
+                prepare(objects, workers)
 
 
 def privileged_policies(config: Config) -> set[str]:
@@ -63,7 +65,7 @@ def privileged_policies(config: Config) -> set[str]:
     return {name for name in planned if needs_truth(new_planner(name, config))}
 
 
-@functools.cache
+@kept
 def load_objects(name: str, config: Config) -> ObjectSet:
     return load_object_set(
         name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder,
@@ -78,54 +80,47 @@ def new_planner(name: str, config: Config, key: str = "evaluate.policies") -> Pl
 
 # --- In a worker process ----------------------------------------------------------------------
 
-_config: Config
-_cell: Cell
-_planners: dict[str, Planner]  # each is made once and reset for every round
-_approaches: dict[str, PolicyApproach]  # of learned policies, each made once for the cell
+cell_of = kept(make_cell)
+planner_of = kept(new_planner)  # is reset for every round
 
 
-def set_up(config: Config) -> None:
-    global _config, _cell, _planners, _approaches
-    _config, _cell, _planners, _approaches = config, make_cell(config), {}, {}
+@kept
+def approach_of(name: str, config: Config) -> PolicyApproach:
+    """A learned policy in the process's cell."""
+    return learned_approach(name, cell_of(config))
 
 
-def work(task: Task) -> TaskResult:
+def work(config: Config, task: Task) -> TaskResult:
     """Let each policy of a task work on its scene."""
-    objects, layout = load_objects(task.objects, _config), SCENARIOS[task.scenario].layout
-    scene = make_scene(layout, objects, task.seed, _config)
+    cell, objects = cell_of(config), load_objects(task.objects, config)
+    scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
     for name, controller in task.policies:
         policy, approach, planner = policy_name(name, controller), None, placeholder
         if is_learned(name):
-            if name not in _approaches:
-                _approaches[name] = learned_approach(name, _cell)
-            approach = _approaches[name]
+            approach = approach_of(name, config)
         else:
-            if name not in _planners:
-                _planners[name] = new_planner(name, _config)
-            planner = _planners[name]
+            planner = planner_of(name, config)
 
         def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
             if task.keep_pictures or not outcome.success:
                 shown = picture(frame, grasp, policy, task.scenario, outcome.reason)
                 result.gallery.append(shown)
 
-        film = Film(_cell) if task.film_folder is not None else None
+        film = Film(cell) if task.filmed else None
         result.rounds.append(
             run_round(
-                _cell, scene, planner, policy=name, objects=task.objects,
-                max_failures=_config.evaluate.max_failures, scenario=task.scenario,
+                cell, scene, planner, policy=name, objects=task.objects,
+                max_failures=config.evaluate.max_failures, scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )
         )  # fmt: skip
         if film is not None:
-            path = task.film_folder / _film_name(task, policy)
-            film.write(path)
-            result.films.append((path, f"{policy} on {task.scenario}"))
+            who = policy.replace(os.sep, "_")  # a checkpoint's path
+            name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
+            name = f"{name}.{config.evaluate.film_format}"
+            with TemporaryDirectory() as folder:  # the run's folder may be on another machine
+                film.write(Path(folder) / name)
+                content = (Path(folder) / name).read_bytes()
+            result.films.append(FilmFile(name, content, f"{policy} on {task.scenario}"))
     return result
-
-
-def _film_name(task: Task, policy: str) -> str:
-    who = policy.replace(os.sep, "_")  # a checkpoint's path
-    name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
-    return f"{name}.{_config.evaluate.film_format}"

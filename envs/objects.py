@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +25,7 @@ from envs.object_meshes import ObjectError, decompose, mass_properties, write_pa
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
 from utils.errors import UserError, did_you_mean
-from utils.executor import process_pool
+from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
@@ -178,20 +179,18 @@ def _no_objects(path: str, found: object, where: str) -> ObjectError:
     )
 
 
-def prepare(objects: ObjectSet, workers: int) -> None:
-    """Make every object of a set, in parallel processes, so that the cache holds it."""
-    if workers <= 1:
-        for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
-            objects[index]
-        return
-    with process_pool(workers) as pool:
-        models = pool.map(objects.__getitem__, range(len(objects)), chunksize=4)
-        bar = tqdm(models, total=len(objects), desc=f"objects {objects.name}")
-        try:
-            objects._models.update(enumerate(bar))
-        except BaseException:  # Ctrl-C, or an object that cannot be made: begin no others
-            pool.shutdown(cancel_futures=True)
-            raise
+def prepare(objects: ObjectSet, workers: Workers) -> None:
+    """Make every object of a set, in parallel, so that the cache holds it."""
+    made: Iterable[tuple[int, ObjectModel]]
+    if min(workers.size(), len(objects)) > 1:
+        made = completed(workers, partial(_make, objects), range(len(objects)))
+    else:  # no process has to be started
+        made = map(partial(_make, objects), range(len(objects)))
+    objects._models.update(tqdm(made, total=len(objects), desc=f"objects {objects.name}"))
+
+
+def _make(objects: ObjectSet, index: int) -> tuple[int, ObjectModel]:
+    return index, objects[index]
 
 
 # --- the sets -------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ policies of train_rl.py (`ppo`, `ppo:FILE.pt`) and of Stable-Baselines3 (`sb3:FI
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.result_records import OPEN_LOOP
 from utils.transforms import Grasp, RGBDFrame
+from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
@@ -101,7 +101,7 @@ def is_learned(name: str) -> bool:
     return name == "ppo" or name.partition(":")[0] in LEARNED and ":" in name
 
 
-@functools.cache
+@kept
 def load_learned(name: str) -> SavedPolicy | Sb3Policy:
     """Load `ppo` (the shipped one), `ppo:FILE.pt` or `sb3:FILE.zip`. Raises UserError."""
     kind, _, file = name.partition(":")

@@ -9,7 +9,6 @@ knows no policy.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import sys
 import traceback
@@ -29,10 +28,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from utils.config import Config
 from utils.errors import UserError
+from utils.runs import REPOSITORY
+from utils.worker_process import worker_environment
 
 RANDOMIZED = "RandomizedGrasping-v0"
 OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # take the whole config as an argument
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Gymnasium reports a worker's error in several warnings; a WorkerError says it all once.
 warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
@@ -189,24 +189,6 @@ def loaded_here() -> list[str]:
     own = {path.stem for path in REPOSITORY.iterdir() if path.suffix in ("", ".py")}
     names = [name for name in sys.modules if name.partition(".")[0] in own]
     return [*names, "torch.utils.tensorboard"]
-
-
-@contextmanager
-def worker_environment() -> Iterator[None]:
-    """Processes started within this context find this project, and compute with one thread each,
-    because there are as many of them as cores."""
-    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
-    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> gymnasium.Env:

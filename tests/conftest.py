@@ -63,21 +63,12 @@ def tiny_data(tmp_path_factory):
 @pytest.fixture
 def played_here(monkeypatch):
     """Evaluations play their rounds in this process instead of worker processes."""
-    from envs import evaluation_worker
     from tests.helpers.played_here import CallingExecutor
+    from utils.worker_process import forget
 
-    monkeypatch.setattr("utils.evaluation.process_pool", CallingExecutor)
-    cells = []
-
-    def set_up(config: Config) -> None:
-        set_up_worker(config)
-        cells.append(evaluation_worker._cell)
-
-    set_up_worker = evaluation_worker.set_up
-    monkeypatch.setattr("evaluate.set_up", set_up)
+    monkeypatch.setattr("utils.evaluation.open_executor", CallingExecutor)
     yield
-    for cell in cells:
-        cell.close()
+    forget()
 
 
 @pytest.fixture(scope="module", params=INSTALLED)

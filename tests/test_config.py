@@ -110,7 +110,7 @@ def test_override_values(text, expected):
         ("rounds=5", ["did you mean evaluate.rounds?"]),
         ("lift_height=1", ["execution.lift_height or env.lift_height"]),
         ("round=5", ["did you mean evaluate.rounds?"]),
-        ("zzz=5", ["zzz", "allowed here: seed, cache_dir, simulator, sim"]),
+        ("zzz=5", ["zzz", "allowed here: seed, cache_dir, simulator, compute, sim"]),
         ("sim.zzz=5", ["sim.zzz", "frequency, solver_iterations, renderer"]),
         ("seed.x=5", ["seed.x", "unknown"]),
         ("evaluate.rounds=0", ["evaluate.rounds", "got 0", "command line", "whole number >= 1"]),

@@ -123,17 +123,19 @@ def test_every_shard_has_one_owner_whatever_is_there_already(tmp_path):
 def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch):
     begun = []
 
-    def make_shard(folder, split, number):
-        begun.append(number)
-        if number == 0:
+    class OneThread(ThreadPoolExecutor):
+        def size(self):
+            return 1
+
+    def make_shard(config, folder, shard):
+        begun.append(shard)
+        if shard == ("train", 0):
             raise OSError(errno.ENOSPC, "no space")
         time.sleep(0.2)  # under way when the error is met
         return 32
 
     # A thread in place of the process, which would not know of the replaced functions.
-    monkeypatch.setattr(
-        data_generation, "process_pool", lambda workers, *_: ThreadPoolExecutor(workers)
-    )
+    monkeypatch.setattr(data_generation, "open_executor", lambda *_: OneThread(1))
     monkeypatch.setattr(data_generation, "_make_shard", make_shard)
     config = load_config(None, [f"data.root={tmp_path / 'data'}", "data.frames=960",
                                 "data.object_sets=primitives", "data.workers=1"])  # fmt: skip

@@ -1,11 +1,13 @@
 """The scoreboard from end to end, small."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from envs.rounds import run_round
 from models.planners import make_planner
 from utils.config import DEFAULTS
 from utils.geometry import GripperGeometry, Workspace
-from utils.result_records import read_rounds, write_sample
+from utils.result_records import differing_rounds, read_rounds, write_sample
 from utils.runs import run_script as end_like_a_script
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -192,6 +194,54 @@ def test_resume_runs_only_what_is_missing(finished, monkeypatch, played_here):
     }
 
 
+@pytest.fixture(params=["local", "cluster"])
+def engine(request):
+    """Overrides that choose the engine, and a function that lists its worker processes."""
+    if request.param == "local":
+        yield [], lambda: [process.pid for process in multiprocessing.active_children()]
+        return
+    distributed = pytest.importorskip("distributed", reason="pip install distributed")
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        override = f"compute.scheduler={cluster.scheduler_address}"
+        yield [override], lambda: [worker.pid for worker in cluster.workers.values()]
+
+
+@pytest.mark.slow
+def test_rounds_are_the_same_when_a_worker_is_killed(finished, engine, tmp_path, monkeypatch):
+    """With kill -9 in the middle of a scene. The journal of `finished` is continued with nothing
+    killed, for the rounds to compare with."""
+    (first, _), (overrides, workers) = finished, engine
+    undisturbed = tmp_path / "undisturbed"
+    shutil.copytree(only_run(first), undisturbed)
+    monkeypatch.chdir(tmp_path)
+    assert evaluate.main(["--resume", str(undisturbed), "evaluate.rounds=4"]) == 0
+
+    def kill_one():
+        deadline = time.monotonic() + 300
+        while time.monotonic() < deadline:
+            journals = list(tmp_path.glob("runs/evaluate/*/rounds.jsonl"))
+            if journals and workers():
+                killed.append(workers()[0])
+                os.kill(killed[0], signal.SIGKILL)
+                return
+            time.sleep(0.02)
+
+    killed: list[int] = []
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    policies = ["evaluate.policies=heuristic,random", "evaluate.scenarios=isolated"]
+    assert evaluate.main([*SMALL, *policies, "evaluate.rounds=4", *overrides]) == 0
+    killer.join()
+    assert len(killed) == 1
+    runs = [undisturbed, only_run(tmp_path)]
+    expected, got = (read_rounds(run / "rounds.jsonl") for run in runs)
+    assert len(got) == len(expected) == 8 and differing_rounds(expected, got) == []
+    rows = [json.loads((run / "results.json").read_text())["rows"] for run in runs]
+    for row in [*rows[0], *rows[1]]:
+        del row["plan_ms_median"]  # time by the clock
+    assert rows[0] == rows[1]
+
+
 @pytest.mark.slow
 def test_ctrl_c_writes_what_was_measured(tmp_path):
     process = subprocess.Popen(
@@ -239,6 +289,7 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
             ["transfer.policies=[[a, b, no_such_module:plan, null, null]]"],
             "transfer.policies: 'no_such_module:plan' cannot be loaded",
         ),
+        (["compute.scheduler=nowhere"], "compute.scheduler=nowhere: cannot reach a scheduler"),
         (["camera.depth_noise=kinec"], "camera.depth_noise: got 'kinec'"),
         (["camera.depth_noise=no_module:noise"], "there is no module 'no_module'"),
         (["--replay", "none.jsonl"], "none.jsonl: cannot read this sample"),

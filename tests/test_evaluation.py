@@ -1,7 +1,5 @@
 """The plan of an evaluation, and playing it."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.helpers.played_here import CallingExecutor
@@ -24,14 +22,14 @@ from utils.runs import new_run_folder
 
 def test_tasks_cover_the_plan_once(config):
     plan = config.evaluate
-    listed = list(tasks(config, [], Path("run")))
+    listed = list(tasks(config, []))
     assert len(listed) == plan.rounds * len(plan.scenarios) * len(plan.object_sets)
     pairs = tuple((policy, "open_loop") for policy in plan.policies)
     assert all(task.policies == pairs for task in listed)
 
 
 def test_only_missing_rounds_are_left_to_do():
-    (task,) = tasks(CONFIG, ROUNDS[1:], Path("run"))
+    (task,) = tasks(CONFIG, ROUNDS[1:])
     assert (task.seed, task.policies) == (0, (("heuristic", "open_loop"),))
 
 
@@ -59,41 +57,36 @@ def test_an_evaluation_can_only_grow(tmp_path):
 # --- Played by workers that know the records by heart -------------------------------------------
 
 
-def known_round(task):
+def known_round(config, task):
     rounds = [r for r in ROUNDS if r.seed == task.seed and (r.policy, "open_loop") in task.policies]
     return TaskResult(rounds)
 
 
-def no_second_scene(task):
+def no_second_scene(config, task):
     if task.seed == 1:
         raise UserError("the second scene cannot be made")
-    return known_round(task)
-
-
-def nothing(config):
-    pass
+    return known_round(config, task)
 
 
 def test_a_resumed_evaluation_plays_the_rest(tmp_path, monkeypatch):
-    monkeypatch.setattr("utils.evaluation.process_pool", CallingExecutor)
+    monkeypatch.setattr("utils.evaluation.open_executor", CallingExecutor)
     config = load_config(None, [*_overrides(), "evaluate.workers=1"])
     append_round(tmp_path / "rounds.jsonl", ROUNDS[2])
-    outcome = play(config, tmp_path, known_round, nothing)
+    outcome = play(config, tmp_path, known_round)
     assert outcome.rounds == ROUNDS and outcome.error is None and not outcome.interrupted
     assert len(read_rounds(tmp_path / "rounds.jsonl")) == 4
 
 
 def test_a_scene_that_cannot_be_made_ends_the_run_but_not_the_results(tmp_path):
     config = load_config(None, [*_overrides(), "evaluate.workers=1"])
-    outcome = play(config, tmp_path, no_second_scene, nothing)
+    outcome = play(config, tmp_path, no_second_scene)
     assert "second scene" in str(outcome.error)
     assert outcome.rounds == [ROUNDS[0], ROUNDS[2]] == read_rounds(tmp_path / "rounds.jsonl")
 
 
 def test_a_sample_is_played_again():
     sample = Sample(None, {}, [], ROUNDS[:3])
-    again = replay(sample, load_config(None, [*_overrides(), "evaluate.workers=1"]), known_round,
-                   nothing)  # fmt: skip
+    again = replay(sample, load_config(None, [*_overrides(), "evaluate.workers=1"]), known_round)
     assert again == ROUNDS[:3]
 
 

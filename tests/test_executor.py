@@ -1,32 +1,32 @@
-"""Calls in an executor: their results, the limit on those under way, and an early end."""
+"""Calls in local processes and on a cluster: results, errors, workers that are lost or hang."""
 
+import os
+import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import takewhile
 
 import pytest
 
-from utils.executor import completed, process_pool
+from utils import executor
+from utils.config import load_config
+from utils.errors import UserError
+from utils.executor import LostWorkerError, completed, open_executor
+from utils.worker_process import kept
 
-SET_UP = None
-
-
-def set_up(value):
-    global SET_UP
-    SET_UP = value
-
-
-def plus_set_up(number):
-    return number + SET_UP
+# --- In threads, which have the same interface --------------------------------------------------
 
 
-def test_processes_are_set_up_first():
-    with process_pool(2, set_up, 100) as pool:
-        assert sorted(completed(pool, plus_set_up, range(3), limit=2)) == [100, 101, 102]
+class Threads(ThreadPoolExecutor):
+    def size(self):
+        return self._max_workers
 
 
-def test_no_more_items_are_read_than_the_limit():
-    """Of an endless supply, in any executor with the interface of concurrent.futures."""
+def test_no_more_items_are_read_than_there_are_workers():
+    """Of an endless supply."""
     read, stop = [], []
 
     def supply():
@@ -34,9 +34,9 @@ def test_no_more_items_are_read_than_the_limit():
             read.append(len(read))
             yield read[-1]
 
-    with ThreadPoolExecutor(4) as pool:
+    with Threads(2) as workers:
         results = []
-        for result in completed(pool, abs, takewhile(lambda _: not stop, supply()), limit=2):
+        for result in completed(workers, abs, takewhile(lambda _: not stop, supply())):
             results.append(result)
             assert len(read) - len(results) <= 2
             if len(results) == 5:
@@ -49,10 +49,154 @@ def test_results_arrive_as_they_are_finished():
         time.sleep(seconds)
         return seconds
 
-    with ThreadPoolExecutor(2) as pool:
-        assert list(completed(pool, nap, [0.3, 0.0], limit=2)) == [0.0, 0.3]
+    with Threads(2) as workers:
+        assert list(completed(workers, nap, [0.3, 0.0])) == [0.0, 0.3]
 
 
 def test_an_error_of_a_call_is_raised():
-    with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
-        list(completed(pool, lambda x: 1 / x, [0], limit=1))
+    with Threads(1) as workers, pytest.raises(ZeroDivisionError):
+        list(completed(workers, lambda x: 1 / x, [0]))
+
+
+# --- In processes -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["local", "cluster"])
+def compute(request):
+    """The section `compute` of each engine; the cluster has two workers."""
+    if request.param == "local":
+        yield load_config(None, ["compute.timeout=20"]).compute
+        return
+    distributed = pytest.importorskip("distributed", reason="pip install distributed")
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        overrides = [f"compute.scheduler={cluster.scheduler_address}", "compute.timeout=20"]
+        yield load_config(None, overrides).compute
+
+
+@kept
+def slowly_made(value):
+    return [value]
+
+
+def plus_kept(number):
+    """Counts in what the process keeps how often it was called."""
+    slowly_made(100).append(number)
+    return os.getpid(), len(slowly_made(100)) - 1, number + slowly_made(100)[0]
+
+
+def first_time(folder, then, number):
+    """Do something terrible in the first call with this number, and square it in the next."""
+    begun = folder / str(number)
+    if not begun.exists():
+        begun.touch()
+        then()
+    return number**2
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(path):
+    raise UserError(f"{path} does not exist")
+
+
+def test_a_process_keeps_what_it_has_made_for_one_executor(compute):
+    for _ in range(2):
+        with open_executor(compute, 2) as workers:
+            calls = list(completed(workers, plus_kept, range(6)))
+        assert sorted(result for _, _, result in calls) == list(range(100, 106))
+        processes = {process for process, _, _ in calls}
+        assert os.getpid() not in processes and len(processes) <= 2
+        for process in processes:  # each counts from 1, in both executors
+            counts = [count for one, count, _ in calls if one == process]
+            assert counts == list(range(1, len(counts) + 1))
+
+
+def test_calls_of_workers_that_die_are_repeated(compute, tmp_path):
+    with open_executor(compute, 2) as workers:
+        function = partial(first_time, tmp_path, die)
+        assert sorted(completed(workers, function, range(3))) == [0, 1, 4]
+
+
+def test_a_call_that_hangs_is_repeated(compute, tmp_path):
+    hurried = compute.model_copy(update={"timeout": 1.0})
+    with open_executor(hurried, 2) as workers:
+        function = partial(first_time, tmp_path, partial(time.sleep, 60))
+        assert sorted(completed(workers, function, range(2))) == [0, 1]
+
+
+def test_a_call_that_ends_every_worker_is_an_error(compute):
+    with (
+        pytest.raises(LostWorkerError, match=r"4 worker processes in a row died.*compute\.timeout"),
+        open_executor(compute, 2) as workers,
+    ):
+        workers.submit(die).result()
+
+
+def test_an_error_for_the_user_says_where(compute):
+    with (
+        pytest.raises(UserError, match=r"^weights.pt does not exist") as raised,
+        open_executor(compute, 1) as workers,
+    ):
+        list(completed(workers, refuse, ["weights.pt"]))
+    assert ("worker's machine" in str(raised.value)) is (compute.scheduler is not None)
+
+
+# --- A cluster that cannot be used --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "no address"])
+def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch):
+    pytest.importorskip("distributed", reason="pip install distributed")
+    monkeypatch.setattr(executor, "CONNECT_SECONDS", 0.5)
+    compute = load_config(None, [f"compute.scheduler={address}"]).compute
+    with (
+        pytest.raises(UserError, match=f"compute.scheduler={address}: cannot reach a scheduler"),
+        open_executor(compute),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("fact", ["Python", "numpy", "the source of utils"])
+def test_a_worker_that_would_compute_otherwise_is_refused(compute, fact, monkeypatch):
+    if compute.scheduler is None:
+        pytest.skip("local processes are of this installation")
+    actual = executor.facts_of
+    monkeypatch.setattr(executor, "facts_of", lambda names: actual(names) | {fact: "2.0"})
+    with (
+        pytest.raises(UserError, match=f"{fact} is .* there and 2.0 here; bring both to the same"),
+        open_executor(compute),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_a_worker_without_the_project_is_refused(tmp_path):
+    """Dask's own commands, started elsewhere; the scheduler needs no more than that."""
+    distributed = pytest.importorskip("distributed", reason="pip install distributed")
+    commands = [sys.executable, "-m", "dask"]
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    file = tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen(
+        [*commands, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+         "--scheduler-file", file], cwd=tmp_path, env=environment,
+    )  # fmt: skip
+    worker = subprocess.Popen(
+        [*commands, "worker", "--scheduler-file", file, "--nthreads", "1", "--no-dashboard"],
+        cwd=tmp_path, env=environment,
+    )  # fmt: skip
+    try:
+        with distributed.Client(scheduler_file=str(file), timeout=30) as client:
+            client.wait_for_workers(1, timeout=60)
+            compute = load_config(None, [f"compute.scheduler={client.scheduler.address}"]).compute
+            with (
+                pytest.raises(UserError, match="a worker does not find this project.*PYTHONPATH"),
+                open_executor(compute),
+            ):
+                pass
+    finally:
+        for process in (worker, scheduler):
+            process.terminate()
+        for process in (worker, scheduler):
+            process.wait(30)

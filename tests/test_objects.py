@@ -14,7 +14,9 @@ import trimesh
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
 from envs.pybullet_bodies import spawn
+from utils.config import load_config
 from utils.errors import UserError
+from utils.executor import open_executor
 
 DATA = Path(pybullet_data.getDataPath())
 IDENTITY = (0, 0, 0, 1)
@@ -223,8 +225,9 @@ def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
     _write_folder(tmp_path / "things")
     serial = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "a")
     parallel = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "b")
-    prepare(serial, workers=1)
-    prepare(parallel, workers=2)
+    for objects, count in ((serial, 1), (parallel, 2)):
+        with open_executor(load_config().compute, count) as workers:
+            prepare(objects, workers)
     for a, b in zip(serial, parallel, strict=True):
         assert a.name == b.name and a.mass == b.mass
         assert Path(b.collision).parent == tmp_path / "b" and b.collision.exists()

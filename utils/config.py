@@ -23,6 +23,7 @@ from utils.config_schema import (
     AdaptationConfig,
     CameraConfig,
     ClosedLoopConfig,
+    ComputeConfig,
     Config,
     EnvConfig,
     EvaluateConfig,
@@ -44,6 +45,7 @@ __all__ = [
     "DEFAULTS",
     "AdaptationConfig",
     "CameraConfig",
+    "ComputeConfig",
     "Config",
     "ConfigError",
     "EnvConfig",
@@ -77,6 +79,9 @@ RENAMED_KEYS = {
     "transfer.worlds": "transfer.columns",
     "closed_loop.blind_seconds": "closed_loop.final_seconds",
 }
+
+# Keys of where a run computes, which change no result.
+COMPUTE_KEYS = ("compute.scheduler", "compute.timeout")
 
 # Removed dotted keys and sections, and what to do instead.
 REMOVED_KEYS = {

@@ -43,6 +43,11 @@ from utils.geometry import GripperGeometry
 from utils.transforms import look_at
 
 
+class ComputeConfig(Section):
+    scheduler: Name | None
+    timeout: Positive
+
+
 class SimConfig(Section):
     frequency: Annotated[int, Field(ge=60, le=2000)]
     solver_iterations: Annotated[int, Field(ge=1, le=1000)]
@@ -389,6 +394,7 @@ class Config(Section):
     seed: Annotated[int, Field(ge=0, lt=2**32)]
     cache_dir: Annotated[Path, Field(strict=False)] | None
     simulator: SimulatorName
+    compute: ComputeConfig
     sim: SimConfig
     robot: RobotConfig
     gripper: GripperConfig

@@ -8,18 +8,20 @@ is an argument: this module knows neither cells nor planners.
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from typing import NamedTuple
 
 from tqdm import tqdm
 
-from utils.config import Config, load_config
+from utils.config import COMPUTE_KEYS, Config, load_config
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
-from utils.executor import completed, process_pool
+from utils.executor import LostWorkerError, completed, open_executor
 from utils.report import GalleryItem
 from utils.result_records import (
     OPEN_LOOP,
@@ -29,10 +31,13 @@ from utils.result_records import (
     policy_name,
     read_rounds,
 )
+from utils.runs import write_atomic
 
 # Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
-FREE_TO_CHANGE = tuple(
-    f"evaluate.{key}" for key in ("rounds", "workers", "name", "videos", "gallery", "film_format")
+FREE_TO_CHANGE = (
+    *COMPUTE_KEYS,
+    *(f"evaluate.{key}" for key in ("rounds", "workers", "name", "videos", "gallery")),
+    "evaluate.film_format",
 )
 
 
@@ -41,7 +46,7 @@ class Task:
     """One scene, on which every policy that is still to be scored works in turn.
 
     policies: planner and controller of each. keep_pictures: whether pictures of successes are kept
-    as well as those of failures. film_folder: where a film of each policy goes, None for no films.
+    as well as those of failures. filmed: whether each policy is filmed.
     """
 
     objects: str
@@ -49,28 +54,34 @@ class Task:
     seed: int
     policies: tuple[tuple[str, str], ...]
     keep_pictures: bool = False
-    film_folder: Path | None = None
+    filmed: bool = False
+
+
+class FilmFile(NamedTuple):
+    """A film: the name and the bytes of its file, and its caption."""
+
+    name: str
+    content: bytes
+    caption: str
 
 
 @dataclass
 class TaskResult:
-    """The rounds, pictures and films (file, caption) of one task or of many."""
+    """The rounds, pictures and films of one task."""
 
     rounds: list[RoundRecord] = field(default_factory=list)
     gallery: list[GalleryItem] = field(default_factory=list)
-    films: list[tuple[Path, str]] = field(default_factory=list)
-
-    def add(self, other: TaskResult) -> None:
-        self.rounds += other.rounds
-        self.gallery += other.gallery
-        self.films += other.films
+    films: list[FilmFile] = field(default_factory=list)
 
 
 @dataclass
-class Outcome(TaskResult):
-    """What an evaluation has played. interrupted: by Ctrl-C. error: what ended the work early, to
-    be raised once the results have been written."""
+class Outcome:
+    """What an evaluation has played. films: file and caption of each. interrupted: by Ctrl-C.
+    error: what ended the work early, to be raised once the results have been written."""
 
+    rounds: list[RoundRecord]
+    gallery: list[GalleryItem] = field(default_factory=list)
+    films: list[tuple[Path, str]] = field(default_factory=list)
     interrupted: bool = False
     error: UserError | None = None
 
@@ -86,7 +97,7 @@ def policies_of(config: Config) -> list[tuple[str, str]]:
     ]
 
 
-def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Task]:
+def tasks(config: Config, done: Sequence[RoundRecord]) -> Iterator[Task]:
     """The tasks that are not in `done` yet; every policy gets the same seeds."""
     plan = config.evaluate
     known = {(r.policy, r.scenario, r.objects, r.seed) for r in done}
@@ -101,8 +112,7 @@ def tasks(config: Config, done: Sequence[RoundRecord], run: Path) -> Iterator[Ta
                 )
                 if policies:
                     filmed = number < plan.videos and scenario == plan.scenarios[-1]
-                    film = run / "films" if filmed else None
-                    yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
+                    yield Task(objects, scenario, seed, policies, number < plan.gallery, filmed)
 
 
 def in_order(rounds: Sequence[RoundRecord], config: Config) -> list[RoundRecord]:
@@ -160,43 +170,47 @@ def check_rounds(config: Config, run: Path | None) -> None:
 # --- Running it ---------------------------------------------------------------------------------
 
 
-def worker_count(config: Config) -> int:
-    return config.evaluate.workers or os.cpu_count() or 1
+def describe_workers(config: Config) -> str:
+    """Where the rounds are played, such as 'x86_64 CPU, 8 workers'."""
+    scheduler, count = config.compute.scheduler, config.evaluate.workers
+    if scheduler is None:
+        return f"{platform.machine()} CPU, {count or os.cpu_count() or 1} workers"
+    return f"the cluster of {scheduler}, {count or 'all'} workers"
 
 
-def play(
-    config: Config, run: Path, work: Callable[[Task], TaskResult], set_up: Callable[[Config], None]
-) -> Outcome:
+def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) -> Outcome:
     """Play every round that rounds.jsonl in `run` does not hold yet, and add it there.
 
-    work: plays one task. set_up: called with the config first, once in each process.
-    Ctrl-C, a scene that cannot be made and a process that dies end the work early; the tasks under
-    way are finished after Ctrl-C, and the outcome holds everything that was played.
+    work: plays one task, in a worker process.
+    Ctrl-C, a scene that cannot be made and a task that no process survives end the work early; the
+    tasks under way are finished after Ctrl-C, and the outcome holds everything that was played.
     """
     journal = run / "rounds.jsonl"
     outcome = Outcome(rounds=read_rounds(journal))
-    todo = tasks(config, outcome.rounds, run)
-    workers = worker_count(config)
-    pool = process_pool(workers, set_up, config)
+    todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:
         with (
             progress,
-            pool,
+            open_executor(config.compute, config.evaluate.workers) as workers,
             stop_on_interrupt("interrupted: finishing the tasks under way") as stop,
         ):
             # No more than one scene a worker is under way, so that the work ends soon.
             wanted = takewhile(lambda _: not stop.is_set(), todo)
-            for result in completed(pool, work, wanted, limit=workers):
+            for result in completed(workers, partial(work, config), wanted):
                 for record in result.rounds:
                     append_round(journal, record)
-                outcome.add(result)
+                outcome.rounds += result.rounds
+                outcome.gallery += result.gallery
+                for film in result.films:
+                    write_atomic(run / "films" / film.name, film.content)
+                    outcome.films.append((run / "films" / film.name, film.caption))
                 progress.update(len(result.rounds))
             outcome.interrupted = stop.is_set()
-    except BrokenProcessPool:
+    except LostWorkerError as error:
         outcome.error = UserError(
-            f"a worker process died (out of memory?); {len(outcome.rounds)} rounds are safe in "
-            f"{journal}: go on with --resume {run}, perhaps with evaluate.workers=1"
+            f"{error}; {len(outcome.rounds)} rounds are safe in {journal}: go on with --resume "
+            f"{run}, perhaps with evaluate.workers=1"
         )
     except UserError as error:  # a scene that cannot be made, an object that cannot be used
         outcome.error = error
@@ -207,19 +221,15 @@ def play(
 
 
 def replay(
-    sample: Sample,
-    config: Config,
-    work: Callable[[Task], TaskResult],
-    set_up: Callable[[Config], None],
+    sample: Sample, config: Config, work: Callable[[Config, Task], TaskResult]
 ) -> list[RoundRecord]:
     """Play the rounds of a sample again; `config` is made of the sample's overrides."""
     todo = [
         Task(record.objects, record.scenario, record.seed, ((record.planner, record.controller),))
         for record in sample.rounds
     ]
-    workers = min(worker_count(config), max(len(todo), 1))
-    with process_pool(workers, set_up, config) as pool:
-        results = completed(pool, work, todo, limit=workers)
+    with open_executor(config.compute, config.evaluate.workers) as workers:
+        results = completed(workers, partial(work, config), todo)
         return [
             record
             for result in tqdm(results, total=len(todo), unit="round")

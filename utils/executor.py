@@ -1,65 +1,238 @@
-"""Worker processes with the interface of `concurrent.futures`.
+"""Executors with the interface of `concurrent.futures`: processes of this machine, or a cluster.
 
-An evaluation plays its scenes through an `Executor`. `process_pool` makes one of local processes;
-any other with the same interface, such as a cluster's, takes its place. This module knows nothing
-of what the processes compute.
+Evaluation, data generation and the preparation of objects submit their calls to what
+`open_executor` gives. A call is repeated if its worker process dies, so that it must be a pure
+function of its arguments. What a process needs for many calls, it makes once
+(`utils.worker_process.kept`). Only this module knows Dask, the cluster's engine. It does not know
+what the calls compute.
 """
 
 from __future__ import annotations
 
+import math
 import multiprocessing
+import os
+import pickle
 import signal
+import time
+import uuid
+from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-import cv2
+from utils.config_schema import ComputeConfig
+from utils.errors import UserError
+from utils.plugins import loaded_modules
+from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_environment
+
+MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
+CONNECT_SECONDS = 10.0
+COUNT_SECONDS = 1.0  # between two looks at how many workers a cluster has
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Call = Callable[[], Any]
 
 
-def process_pool(
-    workers: int, set_up: Callable[..., None] | None = None, *arguments: Any
-) -> Executor:
-    """Local processes, each of which first calls `set_up(*arguments)`, if one is given.
+class LostWorkerError(UserError):
+    """A call has lost its worker process each time that it was tried."""
 
-    The processes are spawned, because a forked copy of a process that runs physics or threads of
-    torch may hang. They ignore Ctrl-C, which the main process handles.
+
+class Workers(Executor):
+    """An executor that knows how many calls may be under way at a time."""
+
+    def submit(self, function: Callable, /, *arguments: Any, **keywords: Any) -> Future:
+        return self._submit(partial(function, *arguments, **keywords))
+
+    @abstractmethod
+    def _submit(self, call: Call) -> Future: ...
+
+    @abstractmethod
+    def size(self) -> int:
+        """The number of worker processes, which may change; at least 1."""
+
+
+@contextmanager
+def open_executor(
+    compute: ComputeConfig, workers: int | None = None, ranks: int = 1
+) -> Iterator[Workers]:
+    """Give an executor: the scheduler's cluster, or local processes where no scheduler is named.
+
+    workers: calls under way at a time; None for all workers of the cluster, or one for each CPU.
+    ranks: main processes, of which this is one, that share the CPUs.
+    At the end of the context local processes finish the calls under way; a cluster forgets them.
+    Raises UserError for a scheduler that cannot be reached or is lost, and for a worker that would
+    not compute what this process computes; LostWorkerError for a call that ends every worker.
     """
-    return ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(set_up, arguments),
-    )
-
-
-def _start_worker(set_up: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)  # the workers fill the cores
-    if set_up is not None:
-        set_up(*arguments)
+    job = Job(uuid.uuid4().hex, compute.timeout)
+    if compute.scheduler is None:
+        count = workers or max(1, (os.cpu_count() or 1) // ranks)
+        with worker_environment(), _Processes(count, job) as processes:
+            yield processes
+    else:
+        with _cluster(compute.scheduler, workers, job) as cluster:
+            yield cluster
 
 
 def completed(
-    executor: Executor,
-    function: Callable[[Item], Result],
-    items: Iterable[Item],
-    limit: int,
+    workers: Workers, function: Callable[[Item], Result], items: Iterable[Item]
 ) -> Iterator[Result]:
     """Yield function(item) of every item as soon as it is there, whatever the order.
 
-    No more than `limit` items are submitted at a time, and `items` is read only as far as that, so
-    that an iterable that ends early ends the work soon. Raises what a call has raised.
+    No more items are submitted at a time than there are workers, and `items` is read only as far as
+    that, so that an iterable that ends early ends the work soon. Raises what a call has raised.
     """
     waiting, pending = iter(items), set()
     while True:
-        more = islice(waiting, limit - len(pending))
-        pending |= {executor.submit(function, item) for item in more}
+        more = islice(waiting, max(0, workers.size() - len(pending)))
+        pending |= {workers.submit(function, item) for item in more}
         if not pending:
             return
         finished, pending = wait(pending, return_when=FIRST_COMPLETED)
         for future in finished:
             yield future.result()
+
+
+def _lost(job: Job) -> LostWorkerError:
+    return LostWorkerError(
+        f"{MOST_LOSSES} worker processes in a row died of the same task, killed, out of memory or "
+        f"after {job.seconds:g} s without a result (compute.timeout)"
+    )
+
+
+# --- Processes of this machine --------------------------------------------------------------------
+
+
+class _Processes(Workers):
+    """Local processes. Each stands in a pool of its own, so that one that dies is replaced alone
+    and only its call is repeated. A thread waits for each of them."""
+
+    def __init__(self, count: int, job: Job) -> None:
+        self._count, self._job = count, job
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: deque[ProcessPoolExecutor] = deque()
+
+    def size(self) -> int:
+        return self._count
+
+    def _submit(self, call: Call) -> Future:
+        return self._threads.submit(self._try, call)
+
+    def _try(self, call: Call) -> Any:
+        for _ in range(MOST_LOSSES):
+            try:
+                process = self._idle.pop()
+            except IndexError:
+                process = _new_process()
+            try:
+                return process.submit(work, self._job, call).result()
+            except BrokenProcessPool:
+                process.shutdown()
+                process = None
+            finally:
+                if process is not None:
+                    self._idle.append(process)
+        raise _lost(self._job)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        while self._idle:
+            self._idle.pop().shutdown(wait)
+
+
+def _new_process() -> ProcessPoolExecutor:
+    """One process that ignores Ctrl-C, which the main process handles. It is spawned, because a
+    forked copy of a process that runs physics or threads of torch may hang."""
+    return ProcessPoolExecutor(
+        1,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
+
+
+# --- A cluster ------------------------------------------------------------------------------------
+
+
+class _Cluster(Workers):
+    """The workers of a Dask scheduler, which repeats the calls of a worker that is lost."""
+
+    def __init__(self, client: Any, most: int | None, job: Job) -> None:
+        self._client, self._most, self._job = client, most, job
+        self._executor = client.get_executor(pure=False)
+        self._count, self._counted = 0, -math.inf
+        client.run(pickle.loads, _packed(partial(check, job.facts)))
+
+    def size(self) -> int:
+        if self._most is None and time.monotonic() > self._counted + COUNT_SECONDS:
+            self._count, self._counted = len(self._client.nthreads()), time.monotonic()
+        return self._most or max(1, self._count)
+
+    def _submit(self, call: Call) -> Future:
+        return self._executor.submit(pickle.loads, _packed(partial(work, self._job, call)))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Cancel the calls under way: after an error there may be no worker that ends them."""
+        self._executor.shutdown(wait=False)
+
+
+def _packed(call: Call) -> bytes:
+    """A pickle whose loading is the call. The scheduler hands the bytes on as they are; it would
+    load a function, and so would have to know this project."""
+    return pickle.dumps(_Packed(call))
+
+
+class _Packed:
+    def __init__(self, call: Call) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[Call, tuple[()]]:
+        return self._call, ()
+
+
+@contextmanager
+def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
+    """Connect to a scheduler, and put Dask's errors in this project's words."""
+    where = f"compute.scheduler={address}"
+    try:
+        from distributed import Client, KilledWorker
+        from distributed.comm import CommClosedError
+    except ModuleNotFoundError as error:
+        install = 'pip install "distributed>=2025.1"'
+        raise UserError(f"{where}: a cluster needs Dask: {install}") from error
+    facts = facts_of((*SOURCES, *loaded_modules()))
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{where}: cannot reach a scheduler there ({error}); start one with `make cluster`, or "
+            "leave the key null for processes of this machine"
+        ) from error
+    try:
+        with client, _Cluster(client, most, Job(job.name, job.seconds, facts)) as cluster:
+            yield cluster
+    except KilledWorker as error:
+        raise _lost(job) from error
+    except (CancelledError, CommClosedError) as error:
+        raise UserError(f"{where}: the scheduler was lost; start it again and go on") from error
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in SOURCES:
+            raise
+        raise UserError(
+            f"{where}: a worker does not find this project (no module {error.name!r}); install it "
+            "there with `pip install -e .`, or start the workers with its folder in PYTHONPATH"
+        ) from error

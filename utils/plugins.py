@@ -18,6 +18,14 @@ from utils.errors import UserError, did_you_mean
 IMPORT_PATH = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$"
 
 
+_loaded: set[str] = set()
+
+
+def loaded_modules() -> list[str]:
+    """The modules of all plug-ins that this process has loaded."""
+    return sorted(_loaded)
+
+
 def is_import_path(name: str) -> bool:
     """Whether `name` has the form `module:name`; it need not exist. `ppo:model.pt` has it too."""
     return re.fullmatch(IMPORT_PATH, name) is not None
@@ -38,6 +46,7 @@ def load_plugin(path: str, what: str, must_be_callable: bool = True) -> Any:
         )
     module_name, _, name = path.partition(":")
     module = _import(module_name, path, what)
+    _loaded.add(module_name)
     found: Any = module
     for part in name.split("."):
         if not hasattr(found, part):

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from typing import Any
 
+from utils.executor import Call, Workers
 
-class CallingExecutor(Executor):
-    """Calls what is submitted at once, in this process; takes the place of `process_pool`."""
 
-    def __init__(
-        self, workers: int, set_up: Callable[..., None] | None = None, *arguments: Any
-    ) -> None:
-        if set_up is not None:
-            set_up(*arguments)
+class CallingExecutor(Workers):
+    """Calls what is submitted at once, in this process; takes the place of `open_executor`."""
 
-    def submit(self, function: Callable, /, *arguments: Any, **options: Any) -> Future:
+    def __init__(self, *_: Any) -> None:
+        pass
+
+    def size(self) -> int:
+        return 1
+
+    def _submit(self, call: Call) -> Future:
         future = Future()
         try:
-            future.set_result(function(*arguments, **options))
+            future.set_result(call())
         except Exception as error:  # raised where the result is asked for
             future.set_exception(error)
         return future

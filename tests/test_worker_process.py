@@ -1,0 +1,49 @@
+"""What a worker process keeps, and what it must have in common with the main process."""
+
+import pytest
+
+from utils import worker_process
+from utils.errors import UserError
+from utils.worker_process import Job, facts_of, kept, work
+
+
+class Cell:
+    open = 0
+
+    def __init__(self, name):
+        self.name = name
+        Cell.open += 1
+
+    def close(self):
+        Cell.open -= 1
+
+
+cell_of = kept(Cell)
+
+
+@pytest.fixture(autouse=True)
+def new_process(monkeypatch):
+    monkeypatch.setattr(worker_process, "_begun", None)
+    monkeypatch.setattr(worker_process, "_kept", {})
+
+
+def test_what_is_kept_is_made_once_for_a_job_and_closed_after_it():
+    cells = [work(Job("a", 60.0), lambda: cell_of("x")) for _ in range(2)]
+    assert cells[0] is cells[1] and Cell.open == 1
+    other = work(Job("a", 60.0), lambda: cell_of("y"))
+    assert other.name == "y" and Cell.open == 2
+    assert work(Job("b", 60.0), lambda: cell_of("x")) is not cells[0]
+    assert Cell.open == 1
+
+
+def test_a_plug_in_is_known_by_the_content_of_its_module(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "planner_of_mine.py").write_text("def plan(frame): return []\n")
+    names = ["utils", "planner_of_mine", "no_such.module"]
+    facts = facts_of(names)
+    assert facts["the source of no_such.module"] == "missing"
+    assert work(Job("a", 60.0, facts), lambda: 3) == 3
+    worker_process._digest.cache_clear()  # as in a process that starts now
+    (tmp_path / "planner_of_mine.py").write_text("def plan(frame): return None\n")
+    with pytest.raises(UserError, match="the source of planner_of_mine is .* there and .* here"):
+        work(Job("b", 60.0, facts), lambda: 3)

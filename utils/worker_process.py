@@ -1,0 +1,160 @@
+"""What a worker process does with a call: its environment, a time limit, what it keeps, and checks.
+
+`utils.executor` sends the calls. This module knows neither its engines nor what the calls compute.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import functools
+import hashlib
+import importlib.util
+import os
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+
+from utils.errors import UserError
+from utils.runs import PACKAGES, REPOSITORY, package_version
+
+SOURCES = ("envs", "models", "utils")  # this project's packages
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What comes with each call of one executor.
+
+    name: differs from that of any other executor. seconds: after which a call counts as hung.
+    facts: `facts_of` the main process, if the worker has to share them.
+    """
+
+    name: str
+    seconds: float
+    facts: Mapping[str, str] | None = None
+
+
+def work(job: Job, call: Callable[[], Result]) -> Result:
+    """Carry out a call.
+
+    A process in which the call takes too long is ended, even if it hangs outside Python.
+    Raises UserError where the process would not compute what the main process computes.
+    """
+    _begin(job)
+    faulthandler.dump_traceback_later(job.seconds, exit=True)
+    try:
+        return call()
+    except UserError as error:
+        if job.facts is not None:  # such as a file that is missing there
+            error.args = (f"{error} (on the worker's machine, {platform.node()})",)
+        raise
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+@contextmanager
+def worker_environment() -> Iterator[None]:
+    """Processes started within this context find this project, and compute with one thread each,
+    because there are as many of them as cores."""
+    path = os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")]))
+    changes = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+# --- What a process keeps -------------------------------------------------------------------------
+
+_begun: Job | None = None
+_kept: dict[tuple[Any, ...], Any] = {}
+
+
+def kept(make: Callable[..., Result]) -> Callable[..., Result]:
+    """Call `make` once for the same arguments, as functools.cache does, until the process works for
+    another executor: by then a file that was read may have changed. What has a method `close` is
+    closed then."""
+
+    @functools.wraps(make)
+    def known(*arguments: Any) -> Result:
+        key = (make, *arguments)
+        if key not in _kept:
+            _kept[key] = make(*arguments)
+        return _kept[key]
+
+    return known
+
+
+def forget() -> None:
+    """Close and forget what the process keeps."""
+    for made in _kept.values():
+        if hasattr(made, "close"):
+            made.close()
+    _kept.clear()
+
+
+def _begin(job: Job) -> None:
+    """Forget the job before, and check that this process can work for the new one."""
+    global _begun
+    if job == _begun:
+        return
+    forget()
+    cv2.setNumThreads(1)  # the workers fill the cores
+    if job.facts is not None:
+        check(job.facts)
+    _begun = job
+
+
+# --- The same bits on another machine -------------------------------------------------------------
+
+
+def facts_of(modules: Sequence[str]) -> dict[str, str]:
+    """What two processes must have in common to compute the same bits: the versions of Python and
+    of the packages, and the sources of `modules`, the project's packages or plug-ins."""
+    facts = {"Python": ".".join(platform.python_version_tuple()[:2])}
+    facts |= {name: package_version(name) or "missing" for name in PACKAGES}
+    return facts | {f"the source of {name}": _digest(name) for name in modules}
+
+
+def check(expected: Mapping[str, str]) -> None:
+    """Raise UserError where this process would not compute what one with the facts `expected` does.
+    Changes nothing, so that it may be called while a call of another job is under way."""
+    modules = [name.rpartition(" ")[2] for name in expected if name.startswith("the source of")]
+    ours = facts_of(modules)
+    different = [name for name in expected if expected[name] != ours[name]]
+    if different:
+        name = different[0]
+        raise UserError(
+            f"a worker of the cluster on {platform.node()} would not compute the same: {name} is "
+            f"{ours[name]} there and {expected[name]} here; bring both to the same commit and "
+            "packages, and restart the workers"
+        )
+
+
+@functools.cache  # a process keeps the modules that it has imported, whatever is edited later
+def _digest(module: str) -> str:
+    try:
+        found = importlib.util.find_spec(module)
+    except ModuleNotFoundError:  # of the package that should hold it
+        found = None
+    if found is None:
+        return "missing"
+    files = [Path(found.origin)] if found.origin else []
+    for folder in found.submodule_search_locations or ():
+        files += sorted(Path(folder).glob("*.py"))
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()[:10]
