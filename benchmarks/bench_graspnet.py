@@ -21,7 +21,7 @@ import torch
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import make_cell
 from models.graspnet import GraspNet, create_model, to_input
 from models.graspnet_backbones import BACKBONES
 from models.graspnet_decoding import PeakSettings, decode_grasps, find_peaks
@@ -77,7 +77,7 @@ def example_frame() -> RGBDFrame:
     """A pile of five objects on the table."""
     config = load_config(None, ["sim.renderer=tiny"])
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         cell.load(make_scene("pile", objects, 0, config))
         return cell.frame()
 
@@ -194,7 +194,7 @@ def label_metrics(model: GraspNet, count: int) -> list[Metric]:
     ]
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     images = []
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         for number in range(count):
             layout = LAYOUTS[number // 2 % len(LAYOUTS)]
             cell.load(make_scene(layout, sets[number % 2], FIRST_SEED + number, config))

@@ -18,7 +18,7 @@ from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
 from envs.data_generation import execute_pairs
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import make_cell
 from utils.config import Config, load_config
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import GraspLabels, Trial, dense_labels, label_truth
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     config = load_config(None, ["sim.renderer=tiny", "objects.split=train"])
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     count = 2 if options.quick else options.scenes
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         scenes = training_scenes(config, count, options.seed)
         frames = [frame_of(cell, scene) for scene in scenes]
         labels, rates = zip(*(timed_labels(frame, workspace) for frame in frames))
@@ -55,7 +55,7 @@ def training_scenes(config: Config, count: int, first_seed: int) -> list[Scene]:
     ]
 
 
-def frame_of(cell: PybulletCell, scene: Scene) -> RGBDFrame:
+def frame_of(cell: Cell, scene: Scene) -> RGBDFrame:
     cell.load(scene)
     return cell.frame(with_truth=True)
 
@@ -70,7 +70,7 @@ def timed_labels(frame: RGBDFrame, workspace: Workspace) -> tuple[GraspLabels, f
     return labels, labels.quality.size / best
 
 
-def execute(cell: PybulletCell, scene: Scene, frame: RGBDFrame, labels: GraspLabels) -> list[Trial]:
+def execute(cell: Cell, scene: Scene, frame: RGBDFrame, labels: GraspLabels) -> list[Trial]:
     return execute_pairs(cell, scene, frame, labels, np.random.default_rng([scene.seed, 1]))
 
 

@@ -20,7 +20,7 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import make_cell
 from envs.robot_kinematics import UnreachableError, choose_posture, moved
 from models.planners import make_planner
 from utils.config import load_config
@@ -56,13 +56,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     scenes, views = (2, 1) if options.quick else (options.scenes, options.views)
     config = load_config(None, options.overrides)
     metrics = []
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         for objects in OBJECT_SETS:
             metrics += figures(objects, measure(cell, objects, scenes, views))
     report(metrics, options.json)
 
 
-def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[float, Errors]:
+def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Errors]:
     """Errors by height over the grasp, on `scenes` scenes of an object set."""
     config = cell.config
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
@@ -95,7 +95,7 @@ def measure(cell: PybulletCell, objects: str, scenes: int, views: int) -> dict[f
 
 
 def sightings(
-    cell: PybulletCell,
+    cell: Cell,
     camera: WristCamera,
     tracker: TemplateMatcher,
     T_WB: np.ndarray,

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pybullet
 import pytest
+
+pytest.importorskip("pybullet")
+
+import pybullet
 
 from envs.board import Board
 from envs.cell import Intrinsics

@@ -12,8 +12,8 @@ import torch
 from benchmarks.depth_loops import FB, by_loops, steps_and_slopes
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
 from envs.registries import check_names
+from envs.simulators import make_cell
 from models.graspnet_data import NoisyShare
 from tests.helpers.box_frames import boxes_frame
 from utils.config import ConfigError, changed_keys, load_config, with_settings
@@ -223,17 +223,17 @@ def frames(config):
     noisy = with_settings(config, "camera", {"depth_noise": "kinect"})
     own = {"depth_noise": "tests.test_depth:gaussian", "depth_noise_args": {"sigma": 0.01}}
     scene, other = (make_scene("pile", objects, seed, config) for seed in (1, 2))
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         cell.load(scene)
         clean = [cell.frame(with_truth=True), cell.frame()]
-    with PybulletCell(noisy) as cell:
+    with make_cell(noisy) as cell:
         cell.load(scene)
         first = [cell.frame(with_truth=True), cell.frame()]
         cell.load(other)
         cell.frame()
         cell.load(scene)
         again = [cell.frame(), cell.frame()]
-    with PybulletCell(with_settings(config, "camera", own)) as cell:
+    with make_cell(with_settings(config, "camera", own)) as cell:
         cell.load(scene)
         spread = [cell.frame()]
     return clean, first, again, spread

@@ -6,20 +6,17 @@ from functools import cache
 
 import gymnasium
 import numpy as np
-import pybullet
 import pytest
 
 import envs  # noqa: F401 - registers the environments
 from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
-from envs.pybullet_panda import ARM, FINGERS
 from envs.randomized_env import RandomizedGraspingEnv
 from envs.rounds import run_round
 from envs.simulators import cell_class, make_cell
 from envs.vector_env import training_envs
-from tests.helpers.simulators import INSTALLED
+from tests.helpers.simulators import INSTALLED, needs_pybullet, pybullet
 from utils.config import load_config
 from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
@@ -104,7 +101,7 @@ def everything(cell: Cell) -> list:
     """Dynamics, gravity, colours, motors, and what the camera sees."""
     image = cell.frame()
     seen = [image.rgb.tolist(), image.depth.tolist(), image.T_WC.tolist()]
-    return [*(in_pybullet(cell) if isinstance(cell, PybulletCell) else in_mujoco(cell)), *seen]
+    return [*(in_pybullet(cell) if cell.config.simulator == "pybullet" else in_mujoco(cell)), *seen]
 
 
 def in_mujoco(cell: Cell) -> list:
@@ -125,8 +122,10 @@ def in_mujoco(cell: Cell) -> list:
     ]
 
 
-def in_pybullet(cell: PybulletCell) -> list:
+def in_pybullet(cell: Cell) -> list:
     """All that PyBullet says of the world, joint damping apart."""
+    from envs.pybullet_panda import ARM, FINGERS
+
     client, robot = cell.client, cell.robot
     links = [(body, -1) for body in (*cell.bodies, cell.table, *cell.bin)]
     links += [(robot.body, link) for link in (-1, *ARM, *FINGERS)]
@@ -251,7 +250,7 @@ def test_a_depth_noise_of_the_camera_replaces_the_randomised_one(cell, monkeypat
 def object_dynamics(cell: Cell, index: int) -> dict:
     """What a simulator says of an object."""
     body = cell.bodies[index]
-    if isinstance(cell, PybulletCell):
+    if cell.config.simulator == "pybullet":
         return dynamics(cell, body)
     model = cell.robot.model
     pairs = (model.geom_bodyid[model.pair_geom1] == body) | (
@@ -264,7 +263,7 @@ def object_dynamics(cell: Cell, index: int) -> dict:
     }  # fmt: skip
 
 
-def dynamics(cell: PybulletCell, body: int, link: int = -1) -> dict:
+def dynamics(cell: Cell, body: int, link: int = -1) -> dict:
     info = pybullet.getDynamicsInfo(body, link, physicsClientId=cell.client)
     places = {"mass": 0, "friction": 1, "inertia": 2, "restitution": 5, "rolling": 6,
               "spinning": 7, "damping": 8, "stiffness": 9}  # fmt: skip
@@ -286,6 +285,7 @@ def test_mass_takes_inertia_with_it(scene, make):
             }
 
 
+@needs_pybullet
 def test_fingers_table_and_gravity_as_pybullet_reports_them(scene):
     config = only(
         contact_stiffness="0.5,0.5,uniform,scale,episode",
@@ -296,7 +296,9 @@ def test_fingers_table_and_gravity_as_pybullet_reports_them(scene):
         gravity="-0.19,-0.19,uniform,add,episode",
         restitution="0.1,0.1,uniform,set,episode",
     )
-    with PybulletCell(config) as cell:
+    from envs.pybullet_panda import FINGERS
+
+    with cell_class("pybullet")(config) as cell:
         cell.build(scene)
         randomizer_of(cell).randomize(0)
         for finger in FINGERS:  # panda.urdf: friction 1, spinning 0.1, 30000 N/m, 1000 N s/m
@@ -332,12 +334,13 @@ def _height_after_a_step(cell: Cell) -> float:
     return float(cell.object_position(0)[2])
 
 
+@needs_pybullet
 def test_joint_damping_slows_a_free_joint_in_pybullet(scene):
     """PyBullet cannot be asked for it, so let the last joint spin: w falls as exp(-b t / I)."""
     speeds = {}
     for damping in (0.0, 0.01):
         config = only(joint_damping=f"{damping},{damping},uniform,add,episode")
-        with PybulletCell(config) as cell:
+        with cell_class("pybullet")(config) as cell:
             cell.build(scene)
             randomizer = randomizer_of(cell)
             randomizer.randomize(0)
@@ -348,7 +351,7 @@ def test_joint_damping_slows_a_free_joint_in_pybullet(scene):
     assert speeds[0.01, "restored"] == pytest.approx(speeds[0.0], rel=1e-6)
 
 
-def _speed_after_spin(cell: PybulletCell) -> float:
+def _speed_after_spin(cell: Cell) -> float:
     robot, client = cell.robot, cell.client
     robot.place(cell.home)
     pybullet.setJointMotorControl2(
@@ -398,7 +401,7 @@ def test_actions_get_bias_and_noise(scene):
         action_noise="0.05,0.05,uniform,set,episode",
         action_bias="0.1,0.1,uniform,set,episode",
     )
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         cell.build(scene)
         randomizer = randomizer_of(cell)
         assert randomizer.act(np.ones(7)).tolist() == [1.0] * 7  # before any sample
@@ -435,7 +438,7 @@ def test_parameters_drawn_at_every_step(scene, make):
 
 
 def gravity(cell: Cell) -> float:
-    if not isinstance(cell, PybulletCell):
+    if cell.config.simulator != "pybullet":
         return float(cell.robot.model.opt.gravity[2])
     parameters = pybullet.getPhysicsEngineParameters(physicsClientId=cell.client)
     return parameters["gravityAccelerationZ"]
@@ -501,7 +504,7 @@ def test_brightness_and_saturation(scene, make):
 
 def test_depth_noise_comes_and_goes(scene):
     config = only(camera_fov="1,1,uniform,scale,episode", depth_noise_share=1.0)
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         cell.build(scene)
         randomizer = randomizer_of(cell)
         randomizer.randomize(0)

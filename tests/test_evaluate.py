@@ -11,16 +11,17 @@ import threading
 import time
 from pathlib import Path
 
-import pybullet_data
 import pytest
 import trimesh
 
 import evaluate
 from envs.cell_scenes import make_scene
 from envs.evaluation_worker import load_objects
-from envs.pybullet_cell import PybulletCell
+from envs.pybullet_files import data_folder
 from envs.rounds import run_round
+from envs.simulators import make_cell
 from models.planners import make_planner
+from tests.helpers.simulators import needs_pybullet
 from utils.config import DEFAULTS
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
@@ -363,7 +364,7 @@ def test_piles_of_unseen_objects_are_cleared(config):
     objects = load_objects("random_urdfs", config)
     scenes = [make_scene("pile", objects, 700_000 + i, config) for i in range(8)]
     rates = {}
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         for policy in ("random", "heuristic", "oracle"):
             rounds = []
             for scene in scenes:
@@ -379,9 +380,10 @@ def test_piles_of_unseen_objects_are_cleared(config):
 
 
 @pytest.mark.slow
+@needs_pybullet
 def test_meshes_from_pybullet_data_are_picked(tmp_path, monkeypatch, played_here):
     """As they are found: one in convex pieces, one with a handle that bounds no solid."""
-    data = Path(pybullet_data.getDataPath())
+    data = data_folder()
     (tmp_path / "toys").mkdir()
     for name in ("duck_vhacd.obj", "objects/mug.obj"):
         shutil.copy(data / name, tmp_path / "toys")

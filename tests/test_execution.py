@@ -1,13 +1,12 @@
 """Grasps carried out by the whole arm, and how each failure is named."""
 
 import numpy as np
-import pybullet
 import pytest
 
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
 from envs.execution import execute_grasp
-from envs.pybullet_panda import FINGERS
 from tests.helpers.cubes import cube_grasp, cube_scene
+from tests.helpers.simulators import needs_pybullet, pybullet
 from utils.transforms import Grasp
 
 
@@ -44,8 +43,11 @@ def test_failures_are_named(cell, box_set, grasp, reason):
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
+@needs_pybullet
 def test_a_frictionless_object_slips(cell, box_set):
     cell.load(cube_scene(box_set))
+    from envs.pybullet_panda import FINGERS
+
     # Pads and cube without any friction: the lift leaves the cube behind.
     for body, link in ((cell.bodies[0], -1), *((cell.robot.body, f) for f in FINGERS)):
         pybullet.changeDynamics(

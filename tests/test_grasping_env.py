@@ -12,7 +12,6 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import psutil
-import pybullet
 import pytest
 import torch
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
@@ -22,10 +21,10 @@ from envs.cell import PhysicsError
 from envs.env_observations import INFO_OBSERVATIONS
 from envs.env_rewards import Outline
 from envs.grasping_env import RobotGraspingEnv
-from envs.pybullet_bodies import settle
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scripted_pick import scripted_pick
 from tests.helpers.shapes import cube_corners
+from tests.helpers.simulators import move, needs_pybullet, pybullet
 from utils.config import with_settings
 from utils.errors import UserError
 
@@ -290,10 +289,13 @@ def make_awake(make, monkeypatch):
 
 def settle_only(cell) -> bool:
     """What `PybulletCell.enable_sleeping` does before it decides."""
+    from envs.pybullet_bodies import settle
+
     settle(cell.client, cell.bodies, cell.config, checks=5)
     return False
 
 
+@needs_pybullet
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_free_arm_moves_as_with_full_precision(make, make_awake, control):
     """Up to 0.5 mrad, 5 mrad/s and 0.2 mm of the gripper's opening, all in full motion. Against
@@ -352,6 +354,7 @@ def test_what_is_let_go_falls_however_long_it_was_held(picked):
     assert not info["grasped"] and info["object_position"][2] < 0.05
 
 
+@needs_pybullet
 def test_objects_on_the_move_are_not_put_to_sleep(make, monkeypatch):
     env = make()
     load = env.cell.load
@@ -544,8 +547,7 @@ def test_success_needs_the_object_held_up_for_a_while(picked):
 def test_a_flung_object_is_no_success(make):
     env = make(hold_seconds=0.0)
     env.reset(seed=0)
-    cube = env.cell.bodies[0]
-    pybullet.resetBaseVelocity(cube, [0, 0, 2.5], [0, 0, 0], physicsClientId=env.cell.client)
+    move(env.cell, 0, velocity=(0, 0, 2.5))
     highest, succeeded = 0.0, False
     for _ in range(8):
         _, _, terminated, _, info = env.step(np.zeros(7))
@@ -556,19 +558,14 @@ def test_a_flung_object_is_no_success(make):
 def test_an_object_off_the_table_ends_the_episode(make):
     env = make()
     env.reset(seed=0)
-    pybullet.resetBasePositionAndOrientation(
-        env.cell.bodies[0], [0.5, 2.0, 0.1], [0, 0, 0, 1], physicsClientId=env.cell.client
-    )
+    move(env.cell, 0, [0.5, 2.0, 0.1])
     _, reward, terminated, truncated, info = env.step(np.zeros(7))
     assert terminated and not truncated and info["reason"] == "off_table"
     assert not info["is_success"] and reward < 0
 
 
 def blow_up_the_object(env, monkeypatch):
-    nowhere = [float("nan")] * 3
-    pybullet.resetBasePositionAndOrientation(
-        env.cell.bodies[0], nowhere, [0, 0, 0, 1], physicsClientId=env.cell.client
-    )
+    move(env.cell, 0, [np.nan] * 3)
 
 
 def blow_up_the_robot(env, monkeypatch):

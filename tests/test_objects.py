@@ -6,9 +6,12 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
 import pybullet
 import pybullet_data
-import pytest
 import trimesh
 
 from envs.object_primitives import FAMILIES, make_primitive

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import pybullet
 import pytest
 import torch
 
@@ -17,10 +16,10 @@ from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
 from envs.policy_approach import PolicyApproach, placeholder
-from envs.pybullet_cell import PybulletCell
 from envs.simulators import make_cell
 from envs.vector_env import make_env
 from models.grasp_policy import load_policy
+from tests.helpers.simulators import move
 from utils.config import load_config
 
 CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
@@ -78,13 +77,8 @@ def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
     observation, _ = env.reset(seed=1)
     before = policy.layout.read_one(observation)
     cell, inner = env.unwrapped.cell, env.unwrapped
-    position, quaternion = pybullet.getBasePositionAndOrientation(
-        cell.bodies[0], physicsClientId=cell.client
-    )
-    elsewhere = np.array(position) + [0.06, -0.05, 0.0]
-    pybullet.resetBasePositionAndOrientation(
-        cell.bodies[0], elsewhere, quaternion, physicsClientId=cell.client
-    )
+    elsewhere = cell.object_position(0) + [0.06, -0.05, 0.0]
+    move(cell, 0, elsewhere)
     inner._seen.read()
     info = inner._info(None)
     seen = {**info, **inner._seen.observation(info)}
@@ -99,7 +93,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
     """In the cell of evaluate.py, whose own camera hangs overhead."""
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         approach, outcomes = PolicyApproach(cell, policy, policy.config), []
         for seed in range(3):
             cell.load(make_scene("isolated", objects, seed, config))
@@ -113,7 +107,7 @@ def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
 def test_a_policy_that_grips_nothing_is_stopped(box, config):
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config)
         cell.load(make_scene("isolated", objects, 0, config))
         outcome = execute_grasp(cell, placeholder(cell.frame())[0], approach)
@@ -178,7 +172,7 @@ def test_an_evaluated_policy_s_actions_get_the_bias_and_noise_of_the_sample():
 
 
 def test_without_noise_an_evaluated_policy_s_actions_are_its_own(config):
-    with randomised() as cell, PybulletCell(config) as plain:
+    with randomised() as cell, make_cell(config) as plain:
         sent, q = driven(cell, ACTIONS)
         assert cell.on_action is not None and plain.on_action is None
         expected, q_plain = driven(plain, ACTIONS)

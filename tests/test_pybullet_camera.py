@@ -1,8 +1,11 @@
 """Cameras: intrinsics by hand, rendered pixels against the pinhole model."""
 
 import numpy as np
-import pybullet
 import pytest
+
+pytest.importorskip("pybullet")
+
+import pybullet
 
 from envs.cell import Intrinsics
 from envs.pybullet_bodies import static_box

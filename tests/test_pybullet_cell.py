@@ -1,8 +1,11 @@
 """The cell in PyBullet: frames, physics steps, and what counts as gripped and lifted."""
 
 import numpy as np
-import pybullet
 import pytest
+
+pytest.importorskip("pybullet")
+
+import pybullet
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.pybullet_cell import PybulletCell

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
 import pybullet
 import pybullet_data
-import pytest
 from scipy.spatial.transform import Rotation
 
 from envs.panda_model import ARM_LINKS, BASE, INERTIALS

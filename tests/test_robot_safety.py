@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from envs.cell_scenes import make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.grasping_env import RobotGraspingEnv
-from envs.pybullet_cell import PybulletCell
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
@@ -22,6 +21,7 @@ from envs.robot_kinematics import (
     tip_position,
 )
 from envs.robot_safety import ArmGate, ArmStoppedError, SafetyGate
+from envs.simulators import make_cell
 from utils.config import load_config
 from utils.errors import UserError
 from utils.transforms import Grasp
@@ -38,7 +38,7 @@ def arm_gate(*overrides: str, floor: float = 0.009) -> ArmGate:
 def narrow():
     """A cell whose workspace ends before the bin, which is 48 cm to the right."""
     config = load_config(None, ["sim.renderer=tiny", "safety.box_lower=[0.15,-0.3,0.02]"])
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         yield cell
 
 
@@ -223,7 +223,7 @@ def test_a_home_outside_the_box_is_refused():
     """Home's fingertips are 0.485 m up: the arm could leave, and never come back."""
     config = load_config(None, ["sim.renderer=tiny", "safety.box_upper=[0.8,0.55,0.4]"])
     with pytest.raises(UserError, match="robot.home has the fingertips at .*0.485.* widen the box"):
-        PybulletCell(config)
+        make_cell(config)
 
 
 def test_a_harmless_velocity_passes_unchanged():

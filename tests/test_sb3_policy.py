@@ -10,8 +10,8 @@ from gymnasium import spaces
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.policy_approach import check_learned, is_learned, learned_approach, placeholder
-from envs.pybullet_cell import PybulletCell
 from envs.rounds import run_round
+from envs.simulators import make_cell
 from models.sb3_policy import load_sb3
 from utils.config import load_config
 from utils.errors import UserError
@@ -53,7 +53,7 @@ def test_a_trained_policy_is_scored(files):
     assert is_learned(name) and not is_learned("sb3")
     check_learned(name, ["isolated"], ["open_loop"], CONFIG)
     objects = load_object_set("box", cache_dir=CONFIG.cache_folder)
-    with PybulletCell(CONFIG) as cell:
+    with make_cell(CONFIG) as cell:
         record = run_round(
             cell, make_scene("isolated", objects, 0, CONFIG), placeholder, policy=name,
             objects="box", max_failures=1, approach_by=learned_approach(name, cell),

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pybullet
 import pytest
+
+pytest.importorskip("pybullet")
+
+import pybullet
 
 from envs.cell_layout import Scene
 from envs.pybullet_bodies import static_box

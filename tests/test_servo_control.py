@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
 import pybullet
 import pybullet_data
-import pytest
 from hypothesis import given
 from pybullet_utils.bullet_client import BulletClient
 

@@ -8,7 +8,7 @@ import pytest
 from envs.cell import Intrinsics
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import make_cell
 from models import photographs
 from models.graspnet_adaptation import DISTINCT
 from models.photographs import K
@@ -189,7 +189,7 @@ def test_depths_rendered_in_the_cell_are_told_from_distances(config, tilt):
     angle, middle = np.radians(tilt), np.array([0.5, 0.0, 0.0])
     eye = middle + 0.75 * np.array([-np.sin(angle), 0.0, np.cos(angle)])
     objects = load_object_set("primitives", cache_dir=config.cache_folder)
-    with PybulletCell(config) as cell:
+    with make_cell(config) as cell:
         cell.load(make_scene("pile", objects, 1, config))
         T_WC = look_at(eye, middle, (0.0, 1.0, 0.0))
         clean = cell.image(Intrinsics(640, 480, vertical, 0.1, 2.0), T_WC).depth

@@ -13,8 +13,9 @@ import pytest
 import torch
 from torch import nn
 
+from envs.cell import Cell
 from envs.cell_layout import Placement, Scene
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import make_cell
 from models import graspnet_backbones
 from models.graspnet import GraspNet
 from utils.transforms import look_at
@@ -77,12 +78,12 @@ def hand_made(max_width: float = 0.08) -> GraspNet:
     return model
 
 
-def cell_of_cubes(config, box_set) -> PybulletCell:
+def cell_of_cubes(config, box_set) -> Cell:
     """A cell with the cubes on its table; the caller closes it."""
     placements = tuple(
         Placement(box_set[0], np.array([*xy, 0.03]), np.array([0, 0, np.sin(a / 2), np.cos(a / 2)]))
         for xy, a in CUBES.items()
     )
-    cell = PybulletCell(config)
+    cell = make_cell(config)
     cell.load(Scene("isolated", 0, placements))
     return cell
