@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, report
+from envs.cell import Cell
 from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
 from envs.data_generation import execute_pairs

@@ -17,11 +17,12 @@ import numpy as np
 import pybullet
 
 from benchmarks.metrics import Metric, benchmark_parser, report
+from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
 from envs.objects import load_object_set
-from envs.simulators import make_cell
 from envs.robot_kinematics import UnreachableError, choose_posture, moved
+from envs.simulators import make_cell
 from models.planners import make_planner
 from utils.config import load_config
 from utils.errors import TargetLostError

@@ -16,7 +16,7 @@ from envs.randomized_env import RandomizedGraspingEnv
 from envs.rounds import run_round
 from envs.simulators import cell_class, make_cell
 from envs.vector_env import training_envs
-from tests.helpers.simulators import INSTALLED, needs_pybullet, pybullet
+from tests.helpers.simulators import INSTALLED, is_pybullet, needs_pybullet, pybullet
 from utils.config import load_config
 from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
@@ -101,7 +101,7 @@ def everything(cell: Cell) -> list:
     """Dynamics, gravity, colours, motors, and what the camera sees."""
     image = cell.frame()
     seen = [image.rgb.tolist(), image.depth.tolist(), image.T_WC.tolist()]
-    return [*(in_pybullet(cell) if cell.config.simulator == "pybullet" else in_mujoco(cell)), *seen]
+    return [*(in_pybullet(cell) if is_pybullet(cell) else in_mujoco(cell)), *seen]
 
 
 def in_mujoco(cell: Cell) -> list:
@@ -250,7 +250,7 @@ def test_a_depth_noise_of_the_camera_replaces_the_randomised_one(cell, monkeypat
 def object_dynamics(cell: Cell, index: int) -> dict:
     """What a simulator says of an object."""
     body = cell.bodies[index]
-    if cell.config.simulator == "pybullet":
+    if is_pybullet(cell):
         return dynamics(cell, body)
     model = cell.robot.model
     pairs = (model.geom_bodyid[model.pair_geom1] == body) | (
@@ -438,7 +438,7 @@ def test_parameters_drawn_at_every_step(scene, make):
 
 
 def gravity(cell: Cell) -> float:
-    if cell.config.simulator != "pybullet":
+    if not is_pybullet(cell):
         return float(cell.robot.model.opt.gravity[2])
     parameters = pybullet.getPhysicsEngineParameters(physicsClientId=cell.client)
     return parameters["gravityAccelerationZ"]

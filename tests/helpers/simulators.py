@@ -15,6 +15,10 @@ else:
 needs_pybullet = pytest.mark.skipif(pybullet is None, reason="PyBullet is not installed")
 
 
+def is_pybullet(cell: Cell) -> bool:
+    return type(cell).__module__ == "envs.pybullet_cell"
+
+
 def move(cell: Cell, index: int, position=None, velocity=(0.0, 0.0, 0.0), turn_rate=0.0) -> None:
     """Put an object's centre at position (3,) in W, None for where it is, with a velocity (3,) in
     m/s and a turn rate in rad/s about +z."""
