@@ -1,6 +1,6 @@
 """Every table of README and docs/results.md, measured and written there: make results
 
-    make results                                  # all parts, about three hours on two cores
+    make results                                  # all parts, some hours: --list says how long
     make results PARTS=scoreboard,servo           # some of them
     make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
     make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
@@ -34,7 +34,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.result_tables import write_tables
+from utils.config import load_config
 from utils.errors import UserError
+from utils.evaluation import in_order
 from utils.result_records import read_rounds, write_sample
 from utils.results import compare
 from utils.runs import environment, run_script, write_json_atomic
@@ -103,12 +105,12 @@ def _policy(objects: str, file: str) -> Command:
 
 
 PARTS = (
-    Part("scoreboard", "four planners on single objects, packed scenes and piles", 85, (
+    Part("scoreboard", "four planners on single objects, packed scenes and piles", 100, (
         _evaluation("scoreboard", 100, f"evaluate.policies={ALL} "
                     "evaluate.scenarios=isolated,packed,pile "
                     "evaluate.object_sets=random_urdfs,primitives"),
     )),
-    Part("clutter15", "four planners on piles of 15 objects", 35, (
+    Part("clutter15", "four planners on piles of 15 objects", 50, (
         _evaluation("clutter15", 60, f"scene.count=15 evaluate.policies={ALL} "
                     "evaluate.scenarios=pile evaluate.object_sets=random_urdfs"),
     )),
@@ -336,7 +338,9 @@ def figures_of(run: Path) -> dict[str, Any]:
         return {key: results[key] for key in ("correct", "images", "accuracy_ci95")}
     figures: dict[str, Any] = {"rows": results["rows"]}
     if (run / "rounds.jsonl").exists():
-        comparisons = compare(read_rounds(run / "rounds.jsonl"), SEED)
+        # In the order of the plan: an interval by resampling depends on the order of the rounds.
+        rounds = in_order(read_rounds(run / "rounds.jsonl"), load_config(run / "config.yaml"))
+        comparisons = compare(rounds, SEED)
         figures |= {"comparisons": [asdict(pair) for pair in comparisons], "run": str(run)}
     return figures
 

@@ -161,6 +161,9 @@ def epoch_loader(
     config: Config, data: TrainingData, team: Team, epoch: int, skip: int
 ) -> DataLoader:
     """Return this process's part of the batches of one epoch, without the first `skip`."""
+    # Imported before the workers are forked: each would import it in every epoch.
+    import torchvision.transforms.v2  # noqa: F401
+
     sampler = EpochBatches(
         len(data.train), config.train.batch_size, config.seed, epoch, skip, team.rank, team.ranks
     )

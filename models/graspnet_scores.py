@@ -177,7 +177,7 @@ def write_curves(writer: SummaryWriter, row: Mapping[str, float]) -> None:
 
 def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
     """Draw one small plot for every loss (training) and score (validation) over the epochs."""
-    import matplotlib.pyplot as plt  # takes long to import, and few need it
+    import matplotlib.pyplot as plt  # slow to import, and few callers need it
 
     names = [name for name in history[-1] if name not in NO_CURVES]
     columns = 4
@@ -201,7 +201,7 @@ def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
 
 def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count: int = 8) -> None:
     """Draw rows of: colour with the best grasps, depth, labelled and predicted quality."""
-    import matplotlib.pyplot as plt  # takes long to import, and few need it
+    import matplotlib.pyplot as plt  # slow to import, and few callers need it
 
     chosen = np.linspace(0, len(images) - 1, min(count, len(images))).astype(int)
     titles = ("grasps", "depth", "labelled quality", "predicted quality")

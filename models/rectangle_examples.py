@@ -216,7 +216,7 @@ def draw_rectangles(
 ) -> None:
     """Draw a grid of images with their labels (green) and the prediction (blue if correct, else
     red); the thick sides are the plates."""
-    import matplotlib.pyplot as plt  # takes long to import, and few need it
+    import matplotlib.pyplot as plt  # slow to import, and few callers need it
 
     chosen = np.unique(np.linspace(0, len(judged) - 1, min(shown, len(judged))).astype(int))
     rows = -(-len(chosen) // COLUMNS)

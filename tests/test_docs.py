@@ -55,7 +55,7 @@ def anchor(heading: str) -> str:
 def test_every_table_is_measured(page):
     """`with_tables` writes the command of `make results` in place of a table without figures."""
     for body in re.findall(
-        r"<!-- results:\w+ -->\n(.*?)<!-- /results -->", text_of(page), re.DOTALL
+        r"<!-- results:[\w-]+ -->\n(.*?)<!-- /results -->", text_of(page), re.DOTALL
     ):
         assert body.startswith("|"), body
 

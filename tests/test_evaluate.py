@@ -382,10 +382,10 @@ def test_piles_of_unseen_objects_are_cleared(config):
 @pytest.mark.slow
 @needs_pybullet
 def test_meshes_from_pybullet_data_are_picked(tmp_path, monkeypatch, played_here):
-    """As they are found: one in convex pieces, one with a handle that bounds no solid."""
+    """As they are found: one scanned and not convex, one with a handle that bounds no solid."""
     data = data_folder()
     (tmp_path / "toys").mkdir()
-    for name in ("duck_vhacd.obj", "objects/mug.obj"):
+    for name in ("duck.obj", "objects/mug.obj"):
         shutil.copy(data / name, tmp_path / "toys")
     monkeypatch.chdir(tmp_path)
     arguments = ["evaluate.object_sets=toys", "objects.fit=0.055", "evaluate.policies=heuristic",

@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.helpers.played_here import CallingExecutor
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import load_config
 from utils.errors import UserError
@@ -68,8 +67,7 @@ def no_second_scene(config, task):
     return known_round(config, task)
 
 
-def test_a_resumed_evaluation_plays_the_rest(tmp_path, monkeypatch):
-    monkeypatch.setattr("utils.evaluation.open_executor", CallingExecutor)
+def test_a_resumed_evaluation_plays_the_rest(tmp_path):
     config = load_config(None, [*_overrides(), "evaluate.workers=1"])
     append_round(tmp_path / "rounds.jsonl", ROUNDS[2])
     outcome = play(config, tmp_path, known_round)

@@ -39,9 +39,6 @@ def write_cornell(folder: Path, number: int, positives=SQUARE, negatives="", **i
 
 def write_jacquard(folder: Path, grasps="10.5;8.0;-30.0;12.0;4.0\n", name=JACQUARD_ID) -> Path:
     write_images(folder / f"{name}_RGB.png", folder / f"{name}_perfect_depth.tiff")
-    depth = np.full((24, 32), 1.5, np.float32)
-    depth[3, 4] = -1
-    Image.fromarray(depth).save(folder / f"{name}_stereo_depth.tiff")
     (folder / f"{name}_grasps.txt").write_text(grasps)
     return folder
 

@@ -116,7 +116,7 @@ def prediction_panel(
     numbered in that order, the best is green. quality, angle, width: (H, W); image angles in
     radians, widths in metres. max_width: metres at the top of the width's scale.
     """
-    from matplotlib.cm import ScalarMappable  # takes long to import, and few need it
+    from matplotlib.cm import ScalarMappable  # slow to import, and few callers need it
     from matplotlib.figure import Figure
 
     scaling = _to_picture(K, rgb.shape[:2])

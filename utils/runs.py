@@ -132,7 +132,7 @@ def write_json_atomic(path: Path, content: Mapping) -> None:
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a matplotlib figure as a PNG file and close it."""
-    import matplotlib.pyplot as plt  # takes long to import, and few need it
+    import matplotlib.pyplot as plt  # slow to import, and few callers need it
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)

@@ -79,7 +79,7 @@ class ServoHistory:
     def plot(self, path: Path | str | None = None, title: str = "") -> Figure:
         """A figure of errors, velocities, condition number, image trajectories and the camera's
         path in 3-D; also written to `path`, unless that is None."""
-        from matplotlib.figure import Figure  # takes long to import, and few need it
+        from matplotlib.figure import Figure  # slow to import, and few callers need it
 
         figure = Figure(figsize=(13, 7.5), layout="constrained")
         figure.suptitle(f"{title}: {self.reason}" if title else self.reason)
@@ -161,7 +161,7 @@ class ServoHistory:
 def plot_histories(histories: Mapping[str, ServoHistory], path: Path | str | None = None) -> Figure:
     """A figure that compares runs to one goal, each under its name: the distance and the angle
     between camera and goal, and both speeds, over time. Also written to `path`, unless None."""
-    from matplotlib.figure import Figure  # takes long to import, and few need it
+    from matplotlib.figure import Figure  # slow to import, and few callers need it
 
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)

@@ -223,7 +223,7 @@ def write_transfer(
 def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:
     """The bytes of a PNG file: one small panel for each column with the rows' rates and 95 %
     intervals, and below them one panel for each pair of columns that agree or do not."""
-    from matplotlib.figure import Figure  # takes long to import, and few need it
+    from matplotlib.figure import Figure  # slow to import, and few callers need it
 
     shown = [line for line in lines if line.scores]
     rows = 0.27 * max(len(shown), 4)

@@ -1,7 +1,11 @@
-"""Evaluations without worker processes, whose start takes longer than a few short rounds."""
+"""Evaluations without worker processes, whose start takes longer than a few short rounds.
+
+What would cross the boundary between two processes is pickled and read back.
+"""
 
 from __future__ import annotations
 
+import pickle
 from concurrent.futures import Future
 from typing import Any
 
@@ -20,7 +24,11 @@ class CallingExecutor(Workers):
     def _submit(self, call: Call) -> Future:
         future = Future()
         try:
-            future.set_result(call())
+            future.set_result(_crossed(_crossed(call)()))
         except Exception as error:  # raised where the result is asked for
-            future.set_exception(error)
+            future.set_exception(_crossed(error))
         return future
+
+
+def _crossed(thing: Any) -> Any:
+    return pickle.loads(pickle.dumps(thing))
