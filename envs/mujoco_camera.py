@@ -142,8 +142,8 @@ def _gl_context():
     environment variable MUJOCO_GL says otherwise when it is imported.
     """
     mujoco = load_mujoco()
-    # Mesa's driver and Triton, which torch loads when a network is first trained, each bring an LLVM:
-    # if Triton's comes second, the process ends by a segmentation fault.
+    # Mesa's driver and Triton, which torch loads when a network is first trained, each bring an
+    # LLVM: if Triton's comes second, the process ends by a segmentation fault.
     with contextlib.suppress(ImportError):
         import triton  # noqa: F401
     headless = not (os.environ.get("DISPLAY") or os.environ.get("MUJOCO_GL"))
