@@ -7,6 +7,7 @@ settings are those of `envs.cell`. This module knows nothing of robots, objects 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import os
 import sys
@@ -205,6 +206,10 @@ def _gl_context():
     environment variable MUJOCO_GL says otherwise when it is imported.
     """
     mujoco = load_mujoco()
+    # Mesa's driver and Triton, which torch loads when a network is first trained, each bring an
+    # LLVM: if Triton's comes second, the process ends by a segmentation fault.
+    with contextlib.suppress(ImportError):
+        import triton  # noqa: F401
     headless = not (os.environ.get("DISPLAY") or os.environ.get("MUJOCO_GL"))
     try:
         if headless and sys.platform == "linux":

@@ -372,6 +372,7 @@ class Sources(list):
         return type(batch)(batch.image[0], type(batch.targets)(*(t[0] for t in batch.targets)))
 
 
+@pytest.mark.slow
 def test_pairs_are_functions_of_seed_epoch_and_index(photographs):
     config = target_config(photographs)
     plain = TrainingData(Sources([0] * 7), [], lambda model: {}, "label_quality", 0.004, 0.08)

@@ -182,6 +182,7 @@ def test_the_faster_copy_gives_the_same_maps(backbone):
 # --- ONNX -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backbone", ["ggcnn", "tutorial_skip"])
 def test_onnx_returns_what_pytorch_returns(tmp_path, backbone):
     torch.manual_seed(0)

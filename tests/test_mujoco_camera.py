@@ -1,5 +1,8 @@
 """Images of both simulators show the same scene; skipped where MuJoCo is missing."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -95,3 +98,32 @@ def test_pictures_of_several_sizes(cells, pile):
         image = mujoco.image(Intrinsics(width, height, 28.0), mujoco.camera_pose("overhead"))
         assert image.rgb.shape == (height, width, 3) and image.depth.shape == (height, width)
         assert image.depth[0, 0] == pytest.approx(0.8, abs=1e-4)
+
+
+TRAIN_AFTER_AN_IMAGE = """
+import torch
+from envs.cell import camera_intrinsics
+from envs.cell_layout import EMPTY
+from envs.simulators import make_cell
+from utils.config import load_config
+
+config = load_config(None, ["simulator=mujoco"])
+with make_cell(config) as cell:
+    cell.build(EMPTY)
+    cell.image(camera_intrinsics(config.camera), cell.camera_pose())
+parameter = torch.nn.Parameter(torch.ones(1))
+optimiser = torch.optim.SGD([parameter], lr=0.5)
+parameter.sum().backward()
+optimiser.step()
+print(parameter.item())
+"""
+
+
+@pytest.mark.slow
+def test_a_network_is_trained_in_a_process_that_has_drawn():
+    """Both load an LLVM of their own, which ended the process by a segmentation fault."""
+    done = subprocess.run(
+        [sys.executable, "-c", TRAIN_AFTER_AN_IMAGE], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.splitlines()[-1]) == 0.5

@@ -37,6 +37,7 @@ def test_the_policy_of_the_box_lifts_it(box):
     assert sum(reason == "success" for reason, _ in ends) >= 9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objects", ["random_urdfs", "primitives"])
 def test_policies_lift_what_they_have_never_seen(objects):
     """176 and 171 of 200 in docs/ppo.md: fewer than 6 of 10 would be chance once in a hundred."""

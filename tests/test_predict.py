@@ -461,6 +461,7 @@ def test_a_bad_input_ends_with_status_2():
 # --- Export ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_export_replaces_its_own_file_and_no_other(tmp_path, capsys):
     save_graspnet(tmp_path / "net.pt", GraspNet(backbone="ggcnn"), PIXEL)
     path = tmp_path / "net.onnx"

@@ -25,6 +25,7 @@ def planner_of(grasps):
     return lambda frame: list(grasps)
 
 
+@pytest.mark.slow
 def test_rounds_are_deterministic_whatever_came_before(cell, config):
     primitives = load_object_set("primitives", cache_dir=config.cache_folder)
     scene = make_scene("pile", primitives, 5, config)

@@ -26,6 +26,8 @@ from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
 from utils.grasp_data import shard_path
 
+pytestmark = pytest.mark.slow  # all share one training, which takes most of a minute
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 

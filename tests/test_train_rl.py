@@ -302,6 +302,7 @@ def test_bad_numbers_end_a_run_with_a_sound_checkpoint(tmp_path, monkeypatch, tr
     assert all(torch.isfinite(value).all() for value in weights.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trouble", "message"),
     [
