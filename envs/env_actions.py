@@ -2,13 +2,15 @@
 
 An action changes the commanded pose of the hand a little. `ActionDecoder` decides how much of the
 change the arm may carry out, within joint limits, speeds, workspace and safety, and sends the
-commands. `near_pose` and `pretraining_state` draw where the hand is when an episode does not begin
-at home; their poses are not yet checked for the arm's reach.
+commands. `checked_options` reads the options of `reset`. `near_pose` and `pretraining_state` draw
+where the hand is when an episode does not begin at home; their poses are not yet checked for the
+arm's reach.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from envs.robot_kinematics import (
     rotation_matrix,
 )
 from utils.config import Config
-from utils.errors import unknown_choice
+from utils.errors import UserError, unknown_choice
 
 # What each entry of an action means, by `env.control`.
 ACTION_ENTRIES = {
@@ -32,6 +34,8 @@ ACTION_ENTRIES = {
     "ee_planar": ("dx", "dy", "dz", "dyaw", "gripper"),
     "joint": (*(f"joint {number}" for number in range(1, 8)), "gripper"),
 }
+
+STARTS = ("home", "near", "pretraining")  # of an episode
 
 _LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
@@ -171,6 +175,31 @@ _GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
 _MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
+
+
+def checked_options(
+    options: dict[str, Any] | None,
+) -> tuple[int | None, str | dict[str, Any] | None]:
+    """The scene's seed that reset's options ask for, and where to start; None for what they leave
+    open. Raises UserError."""
+    options = dict(options or {})
+    seed, start = options.pop("scene_seed", None), options.pop("start", None)
+    if options:
+        raise UserError(
+            f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start', "
+            "and for RandomizedGrasping-v0 'randomization'"
+        )
+    known = set(start) == {"q", "opening", "command"} if isinstance(start, dict) else False
+    if not known and start is not None and start not in STARTS:
+        raise UserError(
+            f"reset: start must be 'home', 'near', 'pretraining' or an episode's own (q, opening "
+            f"and command), got {start!r}"
+        )
+    if seed is None:
+        return None, start
+    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+        raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
+    return int(seed), start
 
 
 def near_pose(

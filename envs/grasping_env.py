@@ -20,7 +20,13 @@ from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import on_table
 from envs.cell_scenes import make_scene
-from envs.env_actions import ActionDecoder, action_entries, near_pose, pretraining_state
+from envs.env_actions import (
+    ActionDecoder,
+    action_entries,
+    checked_options,
+    near_pose,
+    pretraining_state,
+)
 from envs.env_observations import Observer, observed_names
 from envs.env_rewards import SHORTEST_LIFT, RewardState, make_reward, progress
 from envs.objects import ObjectSet, check_object_set, load_object_set
@@ -36,8 +42,6 @@ from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
 from utils.runs import run_script
-
-STARTS = ("home", "near", "pretraining")
 
 _STATES_PER_SCENE = 16  # of pretraining: a state is quicker to reach than a scene is to make
 
@@ -199,7 +203,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._running = False
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
-        asked, start = _checked_options(options)
+        asked, start = checked_options(options)
         if start is None:
             share = self.settings.near_share
             start = "near" if share > 0 and self.np_random.random() < share else "home"
@@ -403,31 +407,6 @@ class RobotGraspingEnv(gymnasium.Env):
             "scene_seed": self._scene_seed,
             **self._seen.info(self._actions.opening, self._actions.reachable),
         }
-
-
-def _checked_options(
-    options: dict[str, Any] | None,
-) -> tuple[int | None, str | dict[str, Any] | None]:
-    """The scene's seed that reset's options ask for, and where to start; None for what they leave
-    open. Raises UserError."""
-    options = dict(options or {})
-    seed, start = options.pop("scene_seed", None), options.pop("start", None)
-    if options:
-        raise UserError(
-            f"reset: unknown option {next(iter(options))!r}; allowed are 'scene_seed' and 'start', "
-            "and for RandomizedGrasping-v0 'randomization'"
-        )
-    known = set(start) == {"q", "opening", "command"} if isinstance(start, dict) else False
-    if not known and start is not None and start not in STARTS:
-        raise UserError(
-            f"reset: start must be 'home', 'near', 'pretraining' or an episode's own (q, opening "
-            f"and command), got {start!r}"
-        )
-    if seed is None:
-        return None, start
-    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
-        raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
-    return int(seed), start
 
 
 @functools.lru_cache(maxsize=4)

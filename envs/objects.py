@@ -24,7 +24,7 @@ from envs.object_files import fine_visual, object_files, read_object
 from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
-from utils.errors import UserError, did_you_mean
+from utils.errors import UserError, did_you_mean, one_line
 from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
@@ -159,7 +159,7 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
             raise
         except Exception as error:  # whatever the plug-in raises is its author's to fix
             raise ObjectError(
-                f"objects: {path!r} raised {type(error).__name__}: {' '.join(str(error).split())}"
+                f"objects: {path!r} raised {type(error).__name__}: {one_line(error)}"
             ) from error
     if isinstance(found, ObjectSet):
         return found

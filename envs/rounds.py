@@ -24,7 +24,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from models.planners import Planner, needs_truth, reset_planner
-from utils.errors import TargetLostError
+from utils.errors import TargetLostError, one_line
 from utils.result_records import (
     NO_PLAN,
     OPEN_LOOP,
@@ -156,7 +156,7 @@ def planner_errors(name: str) -> Iterator[None]:
         yield
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        message, place = " ".join(str(error).split()), f"{last.filename}, line {last.lineno}"
+        message, place = one_line(error), f"{last.filename}, line {last.lineno}"
         raise PlannerError(f"{name} raised {type(error).__name__}: {message} ({place})") from error
 
 

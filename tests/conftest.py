@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections import Counter
 
 import hypothesis
 import pytest
+from filelock import FileLock
 
 from tests.helpers.simulators import INSTALLED
 from utils.config import Config, load_config
@@ -54,8 +54,7 @@ def tiny_data(tmp_path_factory):
         "data.frames=32", "data.validation_frames=32", "data.object_sets=primitives",
         "data.max_objects=2", "data.executed_share=0.01", "data.workers=1",
     ]  # fmt: skip
-    with open(shared / "tiny_data.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(shared / "tiny_data.lock"):
         generate(load_config(None, overrides))
     return folder, overrides
 

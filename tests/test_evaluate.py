@@ -61,7 +61,8 @@ def only_run(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """One finished evaluation of the heuristic and the random planner on the cube."""
+    """One finished evaluation of the heuristic and the random planner on the cube, by worker
+    processes: its tests are slow ones."""
     folder = tmp_path_factory.mktemp("evaluation")
     done = run_script(
         [*SMALL, "evaluate.policies=heuristic,random", "evaluate.scenarios=isolated",
@@ -72,6 +73,7 @@ def finished(tmp_path_factory):
     return folder, done
 
 
+@pytest.mark.slow
 def test_results_file_has_the_agreed_format(finished):
     folder, _ = finished
     results = json.loads((only_run(folder) / "results.json").read_text())
@@ -91,6 +93,7 @@ def test_results_file_has_the_agreed_format(finished):
     assert json.loads((folder / "copy.json").read_text()) == results
 
 
+@pytest.mark.slow
 def test_table_csv_report_and_film_are_written(finished):
     folder, done = finished
     run = only_run(folder)
@@ -101,6 +104,7 @@ def test_table_csv_report_and_film_are_written(finished):
     assert list((run / "films").glob("*.mp4"))
 
 
+@pytest.mark.slow
 def test_policies_see_the_same_scenes(finished):
     folder, _ = finished
     rounds = read_rounds(only_run(folder) / "rounds.jsonl")
@@ -108,6 +112,7 @@ def test_policies_see_the_same_scenes(finished):
     assert seeds["heuristic"] == seeds["random"] == {0, 1}
 
 
+@pytest.mark.slow
 def test_a_run_is_compared_with_another(finished, tmp_path, monkeypatch, capsys):
     """Both played by the same code: no difference but that of the policies."""
     folder, _ = finished
@@ -128,6 +133,7 @@ def test_a_run_is_compared_with_another(finished, tmp_path, monkeypatch, capsys)
     assert not (tmp_path / "runs").exists(), "nothing is played"
 
 
+@pytest.mark.slow
 def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, capsys, played_here):
     """A round that is the same, and one whose published outcome was changed."""
     folder, _ = finished
@@ -177,6 +183,7 @@ def test_planners_of_another_module_are_scored(tmp_path, monkeypatch, capsys):
     assert [row["attempts"] for row in rows] == [0, 0]
 
 
+@pytest.mark.slow
 def test_resume_runs_only_what_is_missing(finished, monkeypatch, played_here):
     """Here, with the outcome that the worker processes of the first run had."""
     folder, _ = finished
@@ -396,6 +403,7 @@ def test_meshes_from_pybullet_data_are_picked(tmp_path, monkeypatch, played_here
     assert row["successes"] >= 5
 
 
+@pytest.mark.slow
 def test_resume_refuses_another_experiment(finished, monkeypatch, capsys):
     folder, _ = finished
     changed = ["--resume", only_run(folder), "robot.grip_force=3.0"]

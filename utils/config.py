@@ -39,7 +39,7 @@ from utils.config_schema import (
     WorkspaceConfig,
 )
 from utils.config_types import RandomizationConfig, Section
-from utils.errors import UserError, did_you_mean
+from utils.errors import UserError, did_you_mean, one_line
 
 __all__ = [
     "DEFAULTS",
@@ -214,7 +214,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot read this config file: {error}") from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {_one_line(error)}") from error
+        raise ConfigError(f"{path}: not valid YAML: {one_line(error)}") from error
     if values is None:  # an empty file changes nothing
         return {}
     if not isinstance(values, dict):
@@ -249,7 +249,7 @@ def _parse_override(text: str) -> dict[str, Any]:
             value = yaml.load(f"[{raw}]", _Loader)
     except yaml.YAMLError as error:
         raise ConfigError(
-            f"{key}: cannot read {raw!r} as YAML: {_one_line(error)}; expected {allowed(schema)}"
+            f"{key}: cannot read {raw!r} as YAML: {one_line(error)}; expected {allowed(schema)}"
         ) from error
     if "string" in types and not isinstance(value, str | list | dict | None):
         value = raw.strip()  # evaluate.name=007 is text
@@ -268,10 +268,6 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
             value = _merge(below, value)
         merged[key] = value
     return merged
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 # --- What is wrong with a config -------------------------------------------------------------

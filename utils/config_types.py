@@ -2,7 +2,7 @@
 
 `utils.config_schema` has the sections that are made of them, apart from `randomization`, which
 stands here together with its ranges: what they allow, how a value is drawn from one, and how it
-changes a nominal value. This module does not know what a range's parameter means.
+changes a nominal value.
 """
 
 from __future__ import annotations

@@ -23,6 +23,11 @@ def did_you_mean(value: object, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
+def one_line(error: BaseException) -> str:
+    """An error's message on one line, whatever line breaks it has."""
+    return " ".join(str(error).split())
+
+
 def unknown_choice(where: str, value: object, known: Iterable[str]) -> UserError:
     """The error for a name that is none of `known`, e.g. a planner's name in a config."""
     known = sorted(known)

@@ -13,7 +13,7 @@ import re
 import traceback
 from typing import Any
 
-from utils.errors import UserError, did_you_mean
+from utils.errors import UserError, did_you_mean, one_line
 
 IMPORT_PATH = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$"
 
@@ -80,7 +80,7 @@ def _import(module_name: str, path: str, what: str) -> Any:
 
 def _failed(error: Exception, path: str, what: str) -> UserError:
     last = traceback.extract_tb(error.__traceback__)[-1]
-    reason = " ".join(str(error).split())
+    reason = one_line(error)
     return UserError(
         f"{what}: {path!r} cannot be loaded: its module raised {type(error).__name__}: {reason} "
         f"({last.filename}, line {last.lineno}); correct the module"

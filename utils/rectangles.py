@@ -5,8 +5,8 @@ the part of a labelled image that a network sees.
 
 A grasp rectangle is two gripper plates seen from above. Its image angle is that of the closing
 line, from +u (right) towards +v (down), modulo pi, as in `utils.transforms.ImageGrasp`; lengths
-are pixels. `utils.real_data` reads the images from disk and has the view of each
-format's camera. This module reads no file and knows no network.
+are pixels. `utils.real_data` reads the images from disk and has the view of each format's camera.
+This module reads no file and knows no network.
 """
 
 from __future__ import annotations
