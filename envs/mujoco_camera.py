@@ -198,6 +198,14 @@ def _shine(model: mujoco.MjModel, light: dict) -> None:
         setattr(model.vis.headlight, part, [0.0, 0.0, 0.0])
 
 
+def opengl_renderer() -> str:
+    """The name of what draws: the graphics card, or Mesa's software (llvmpipe)."""
+    _gl_context().make_current()
+    from OpenGL import GL
+
+    return GL.glGetString(GL.GL_RENDERER).decode()
+
+
 @functools.cache
 def _gl_context():
     """One OpenGL context for all cameras of the process.
