@@ -197,7 +197,8 @@ class MujocoPanda(Robot):
         self._mujoco.mj_forward(self.model, self.data)
 
     def limit_speed(self, speed: float) -> None:
-        """No joint is driven faster than `speed` rad/s; the servos themselves are not held back."""
+        """No joint gets faster than `speed` rad/s while `drive_arm_to` moves the arm, whatever else
+        moves it; the servos that follow a trajectory are not held back."""
         self._fastest = np.minimum(JOINT_VELOCITY, speed)
 
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
@@ -230,6 +231,16 @@ class MujocoPanda(Robot):
             control[7] += min(max(self._opening - control[7], -reach), reach)
             control[:7] = self._arm_target()
             self._mujoco.mj_step(self.model, self.data, self.substeps)
+            if self._speed is not None:
+                self._hold_back()
+
+    def _hold_back(self) -> None:
+        """Take away the speed beyond `limit_speed`, as PyBullet does: a quick shoulder or a
+        collision throws the light wrist, which no motor can hold."""
+        velocity = self.data.qvel[self._speeds[:7]]
+        if (abs(velocity) > self._fastest).any():
+            held = np.minimum(np.maximum(velocity, -self._fastest), self._fastest)
+            self.data.qvel[self._speeds[:7]] = held
 
     def _arm_target(self) -> np.ndarray:
         if self._speed is None:
@@ -237,7 +248,11 @@ class MujocoPanda(Robot):
         way = self._goal - self._reference
         step = np.clip(way, -self._speed * self.dt, self._speed * self.dt)
         self._reference = self._reference + step
-        return self._reference + self.damping_time * step / self.dt
+        target = self._reference + self.damping_time * step / self.dt
+        # The servo asks for the velocity (target - q) / damping_time. An arm that is behind, while
+        # it accelerates or after a collision, must not catch up faster than the limit.
+        q, reach = self.q, self.damping_time * self._speed
+        return np.minimum(np.maximum(target, q - reach), q + reach)
 
     # --- Contacts -----------------------------------------------------------------------------
 
