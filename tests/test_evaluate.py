@@ -21,6 +21,7 @@ from envs.pybullet_files import data_folder
 from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.planners import make_planner
+from tests.helpers.cluster import local_cluster
 from tests.helpers.simulators import needs_pybullet
 from utils.config import DEFAULTS
 from utils.geometry import GripperGeometry, Workspace
@@ -208,8 +209,7 @@ def engine(request):
     if request.param == "local":
         yield [], lambda: [process.pid for process in multiprocessing.active_children()]
         return
-    distributed = pytest.importorskip("distributed", reason="pip install distributed")
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with local_cluster(2) as cluster:
         override = f"compute.scheduler={cluster.scheduler_address}"
         yield [override], lambda: [worker.pid for worker in cluster.workers.values()]
 

@@ -7,10 +7,12 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import takewhile
+from itertools import count, repeat
+from threading import Event
 
 import pytest
 
+from tests.helpers.cluster import local_cluster
 from utils import executor
 from utils.config import load_config
 from utils.errors import UserError
@@ -24,31 +26,29 @@ class Threads(ThreadPoolExecutor):
     def size(self):
         return self._max_workers
 
+    def waits(self):
+        return False
+
 
 def test_no_more_items_are_read_than_there_are_workers():
-    """Of an endless supply."""
-    read, stop = [], []
-
-    def supply():
-        while True:
-            read.append(len(read))
-            yield read[-1]
-
+    """Of an endless supply, until the work is stopped."""
+    read, stop = count(), Event()
     with Threads(2) as workers:
         results = []
-        for result in completed(workers, abs, takewhile(lambda _: not stop, supply())):
+        for result in completed(workers, abs, read, stop):
             results.append(result)
-            assert len(read) - len(results) <= 2
             if len(results) == 5:
-                stop.append(True)
+                stop.set()
     assert sorted(results) == list(range(len(results))) and len(results) <= 7
+    assert next(read) == len(results)
+
+
+def nap(seconds):
+    time.sleep(seconds)
+    return seconds
 
 
 def test_results_arrive_as_they_are_finished():
-    def nap(seconds):
-        time.sleep(seconds)
-        return seconds
-
     with Threads(2) as workers:
         assert list(completed(workers, nap, [0.3, 0.0])) == [0.0, 0.3]
 
@@ -67,8 +67,7 @@ def compute(request):
     if request.param == "local":
         yield load_config(None, ["compute.timeout=20"]).compute
         return
-    distributed = pytest.importorskip("distributed", reason="pip install distributed")
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with local_cluster(2) as cluster:
         overrides = [f"compute.scheduler={cluster.scheduler_address}", "compute.timeout=20"]
         yield load_config(None, overrides).compute
 
@@ -141,6 +140,41 @@ def test_an_error_for_the_user_says_where(compute):
     ):
         list(completed(workers, refuse, ["weights.pt"]))
     assert ("worker's machine" in str(raised.value)) is (compute.scheduler is not None)
+
+
+# --- A cluster without workers ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
+    """After all workers have vanished, together with the nannies that replace them."""
+    monkeypatch.setattr(executor, "WAIT_SECONDS", 0.5)
+    results, stop = [], Event()
+
+    def wait_for(condition):
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+    def it_says_so():
+        return "waiting for workers: tcp://127.0.0.1" in capfd.readouterr().err
+
+    with local_cluster(1) as cluster, ThreadPoolExecutor(1) as thread:
+        compute = load_config(None, [f"compute.scheduler={cluster.scheduler_address}"]).compute
+        with open_executor(compute) as workers:
+            rest = thread.submit(results.extend, completed(workers, nap, repeat(0.1), stop))
+            wait_for(lambda: results)
+            cluster.scale(0)
+            wait_for(it_says_so)
+            before = len(results)
+            cluster.scale(1)
+            wait_for(lambda: len(results) > before + 1)
+            cluster.scale(0)
+            wait_for(it_says_so)
+            assert not rest.done()
+            stop.set()
+            rest.result(timeout=10)
 
 
 # --- A cluster that cannot be used --------------------------------------------------------------

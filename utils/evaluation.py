@@ -12,7 +12,6 @@ import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -195,9 +194,7 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
             open_executor(config.compute, config.evaluate.workers) as workers,
             stop_on_interrupt("interrupted: finishing the tasks under way") as stop,
         ):
-            # No more than one scene a worker is under way, so that the work ends soon.
-            wanted = takewhile(lambda _: not stop.is_set(), todo)
-            for result in completed(workers, partial(work, config), wanted):
+            for result in completed(workers, partial(work, config), todo, stop):
                 for record in result.rounds:
                     append_round(journal, record)
                 outcome.rounds += result.rounds

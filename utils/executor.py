@@ -9,11 +9,13 @@ what the calls compute.
 
 from __future__ import annotations
 
+import logging
 import math
 import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import time
 import uuid
 from abc import abstractmethod
@@ -32,6 +34,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
+from threading import Event
 from typing import Any, TypeVar
 
 from utils.config_schema import ComputeConfig
@@ -42,6 +45,7 @@ from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_env
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
 COUNT_SECONDS = 1.0  # between two looks at how many workers a cluster has
+WAIT_SECONDS = 60.0  # between two messages that it has none
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -53,7 +57,7 @@ class LostWorkerError(UserError):
 
 
 class Workers(Executor):
-    """An executor that knows how many calls may be under way at a time."""
+    """An executor that knows how many calls may be under way at a time, and whether any is."""
 
     def submit(self, function: Callable, /, *arguments: Any, **keywords: Any) -> Future:
         return self._submit(partial(function, *arguments, **keywords))
@@ -63,7 +67,11 @@ class Workers(Executor):
 
     @abstractmethod
     def size(self) -> int:
-        """The number of worker processes, which may change; at least 1."""
+        """Calls that may be under way at a time, which may change; at least 1."""
+
+    def waits(self) -> bool:
+        """Whether no call makes progress, because there is no worker at this moment."""
+        return False
 
 
 @contextmanager
@@ -89,22 +97,31 @@ def open_executor(
 
 
 def completed(
-    workers: Workers, function: Callable[[Item], Result], items: Iterable[Item]
+    workers: Workers,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    stop: Event | None = None,
 ) -> Iterator[Result]:
     """Yield function(item) of every item as soon as it is there, whatever the order.
 
     No more items are submitted at a time than there are workers, and `items` is read only as far as
-    that, so that an iterable that ends early ends the work soon. Raises what a call has raised.
+    that. stop: once it is set, no more items are submitted, and the calls under way are finished
+    unless there is no worker for them. Raises what a call has raised.
     """
     waiting, pending = iter(items), set()
     while True:
+        if stop is not None and stop.is_set():
+            waiting = iter(())
+            if workers.waits():
+                return
         more = islice(waiting, max(0, workers.size() - len(pending)))
         pending |= {workers.submit(function, item) for item in more}
         if not pending:
             return
-        finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-        for future in finished:
-            yield future.result()
+        # Not for ever: workers may have joined or left, or `stop` may have been set.
+        finished, pending = wait(pending, COUNT_SECONDS, FIRST_COMPLETED)
+        while finished:  # forgotten at once, or a cluster would compute lost results again
+            yield finished.pop().result()
 
 
 def _lost(job: Job) -> LostWorkerError:
@@ -175,12 +192,33 @@ class _Cluster(Workers):
         self._client, self._most, self._job = client, most, job
         self._executor = client.get_executor(pure=False)
         self._count, self._counted = 0, -math.inf
+        self._told = time.monotonic()
         client.run(pickle.loads, _packed(partial(check, job.facts)))
 
     def size(self) -> int:
-        if self._most is None and time.monotonic() > self._counted + COUNT_SECONDS:
-            self._count, self._counted = len(self._client.nthreads()), time.monotonic()
+        self._look()
         return self._most or max(1, self._count)
+
+    def waits(self) -> bool:
+        self._look()
+        return self._count == 0
+
+    def _look(self) -> None:
+        """Count the workers from time to time, and say so as long as there are none."""
+        now = time.monotonic()
+        if now < self._counted + COUNT_SECONDS:
+            return
+        self._count, self._counted = len(self._client.nthreads()), now
+        if self._count:
+            self._told = now
+        elif now > self._told + WAIT_SECONDS:
+            self._told = now
+            print(
+                f"\nwaiting for workers: {self._client.scheduler.address} has none; start some by "
+                "`dask worker`, or stop with Ctrl-C and go on later",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _submit(self, call: Call) -> Future:
         return self._executor.submit(pickle.loads, _packed(partial(work, self._job, call)))
@@ -214,13 +252,14 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     except ModuleNotFoundError as error:
         install = 'pip install "distributed>=2025.1"'
         raise UserError(f"{where}: a cluster needs Dask: {install}") from error
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are raised here
     facts = facts_of((*SOURCES, *loaded_modules()))
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise UserError(
             f"{where}: cannot reach a scheduler there ({error}); start one with `make cluster`, or "
-            "leave the key null for processes of this machine"
+            "set the key to null for processes of this machine"
         ) from error
     try:
         with client, _Cluster(client, most, Job(job.name, job.seconds, facts)) as cluster:

@@ -1,0 +1,25 @@
+"""A Dask cluster of this machine for one test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+
+@contextmanager
+def local_cluster(count: int) -> Iterator[Any]:
+    """A `distributed.LocalCluster` of `count` workers; skips the test where Dask is missing."""
+    distributed = pytest.importorskip("distributed", reason="pip install distributed")
+    import dask
+
+    # This class alone (`dask worker` does not) gives a worker up for good where none has taken its
+    # place 15 s after it was lost, as it happens to workers that die often on a busy machine.
+    patient = {"distributed.deploy.lost-worker-timeout": "1h"}
+    with (
+        dask.config.set(patient),
+        distributed.LocalCluster(count, threads_per_worker=1, dashboard_address=None) as cluster,
+    ):
+        yield cluster
