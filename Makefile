@@ -6,12 +6,12 @@ BIN := $(VENV)/bin
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
-.PHONY: run quick cluster test test-fast lint typecheck bench results clean
+.PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results lock locked clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
 # tests/conftest.py orders the files.
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
-test test-fast: export OMP_NUM_THREADS := 1
+test test-fast test-oldest: export OMP_NUM_THREADS := 1
 
 run: $(VENV)/.installed
 	$(BIN)/python evaluate.py $(ARGS)
@@ -36,6 +36,18 @@ test: $(VENV)/.installed-dev
 test-fast: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q $(PARALLEL) -m "not slow" $(ARGS)
 
+# The fast suite as where PyBullet has no wheel, in a virtual environment of its own.
+test-mujoco:
+	$(MAKE) .venv-mujoco/.installed-dev VENV=.venv-mujoco
+	.venv-mujoco/bin/python -m pip uninstall --yes pybullet panda-gym
+	$(MAKE) test-fast VENV=.venv-mujoco
+
+# The fast suite with the oldest versions that requirements*.txt admit.
+test-oldest: $(VENV)/.installed-dev
+	$(BIN)/uv venv --allow-existing --python $(BIN)/python .venv-oldest
+	$(BIN)/uv pip install --python .venv-oldest --resolution lowest-direct -r requirements.txt -r requirements-dev.txt
+	.venv-oldest/bin/python -m pytest -q $(PARALLEL) -m "not slow" $(ARGS)
+
 # Style, and who imports whom (pyproject.toml, tests/test_layers.py).
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
@@ -55,7 +67,7 @@ results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell $(CORNELL)) $(ARGS)
 
 $(VENV)/bin/python:
-	@$(PYTHON) -c "$(CHECK_PYTHON)" && $(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -r requirements.txt
@@ -69,5 +81,14 @@ $(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
 	$(BIN)/python -m pip install -r requirements-dev.txt
 	touch $@
 
+# The versions with which CI runs, with hashes for every system and Python, renewed; and installed.
+lock: $(VENV)/.installed-dev
+	$(BIN)/uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-annotate \
+		--custom-compile-command "make lock" --output-file requirements.lock requirements.txt requirements-dev.txt
+
+locked: | $(VENV)/bin/python
+	$(BIN)/python -m pip install --require-hashes --only-binary :all: -r requirements.lock
+	touch $(VENV)/.installed $(VENV)/.installed-dev $(VENV)/.installed-cluster
+
 clean:
-	rm -rf $(VENV)
+	rm -rf .venv .venv-mujoco .venv-oldest

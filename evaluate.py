@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import os
 
+import utils.installation  # noqa: F401 - ends in one sentence where a package is missing
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # one thread a worker; the workers fill the cores
 
 import argparse

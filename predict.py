@@ -24,6 +24,9 @@ there is nothing to grasp the list is empty. Bad input ends with one sentence an
 
 from __future__ import annotations
 
+import utils.installation  # noqa: F401 - ends in one sentence where a package is missing
+
+# isort: split
 import argparse
 import itertools
 import json

@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import os
 
+import utils.installation  # noqa: F401 - ends in one sentence where a package is missing
+
 # The processes that simulate need the cores while a thread waits for another one.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 

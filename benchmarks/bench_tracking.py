@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-import pybullet
 
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.cell import Cell
@@ -29,9 +28,8 @@ from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
 from utils.runs import run_script
-from utils.transforms import Grasp, inverse_pose, planar, planar_part, position_quaternion
+from utils.transforms import Grasp, inverse_pose, planar, planar_part
 
-OBJECT_SETS = ("random_urdfs", "primitives")
 HEIGHTS = (0.25, 0.16, 0.10)  # m over the grasp: far, where the near stage begins, and below that
 SHIFT, TURN = 0.015, np.radians(10)  # most that the object has moved from where it is expected
 _BESIDE, _TILT = 0.015, np.radians(3)  # m and rad off the grasp's axis, of the hand
@@ -58,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     config = load_config(None, options.overrides)
     metrics = []
     with make_cell(config) as cell:
-        for objects in OBJECT_SETS:
+        for objects in config.data.object_sets:
             metrics += figures(objects, measure(cell, objects, scenes, views))
     report(metrics, options.json)
 
@@ -120,9 +118,7 @@ def sightings(
         except UnreachableError:
             continue
         cell.robot.place(q)
-        pybullet.resetBasePositionAndOrientation(
-            cell.bodies[0], *position_quaternion(motion @ T_WB), physicsClientId=cell.client
-        )
+        cell.carry(0, motion @ T_WB, velocity=np.zeros(3), turn_rate=0.0)
         T_WC = cell.camera_pose("wrist")
         T_CW = inverse_pose(T_WC)
         try:

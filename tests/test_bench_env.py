@@ -5,6 +5,8 @@ import operator
 
 import pytest
 
+pytest.importorskip("panda_gym")
+
 from benchmarks import bench_env
 from benchmarks.metrics import Metric, format_metrics, median_ratio
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 
-from benchmarks.bench_tracking import HEIGHTS, OBJECT_SETS, main
+from benchmarks.bench_tracking import HEIGHTS, main
 
 
-def test_a_quick_run_counts_every_sighting(tmp_path):
+def test_a_quick_run_counts_every_sighting(tmp_path, config):
     path = tmp_path / "tracking.json"
     main(["--quick", "--json", str(path), "sim.renderer=tiny"])
     metrics = json.loads(path.read_text())
-    for objects in OBJECT_SETS:
+    for objects in config.data.object_sets:
         for height in HEIGHTS:
             name = f"{objects}_{round(100 * height)}cm"
             tried, found = (metrics[f"{name}_{what}"]["value"] for what in ("tried", "found"))

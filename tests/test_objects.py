@@ -7,26 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pybullet")
-
-import pybullet
-import pybullet_data
 import trimesh
 
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
-from envs.pybullet_bodies import spawn
+from envs.pybullet_files import data_folder
+from tests.helpers.simulators import needs_pybullet, pybullet
 from utils.config import load_config
 from utils.errors import UserError
 from utils.executor import open_executor
 
-DATA = Path(pybullet_data.getDataPath())
+if pybullet is not None:
+    from envs.pybullet_bodies import spawn
+
 IDENTITY = (0, 0, 0, 1)
 
 
 @pytest.fixture
 def client():
+    if pybullet is None:
+        pytest.skip("PyBullet is not installed")
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
     plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
@@ -185,13 +185,18 @@ def test_parts_of_primitives_touch_but_do_not_overlap():
 # --- sets -----------------------------------------------------------------------------------
 
 
-def test_sizes_and_disjoint_splits(tmp_path):
-    for name, train_size in (("primitives", 900), ("random_urdfs", 899)):
-        train = load_object_set(name, split="train", cache_dir=tmp_path)
-        test = load_object_set(name, split="test", cache_dir=tmp_path)
-        assert (len(train), len(test)) == (train_size, 100)
-        key = "indices" if name == "primitives" else "files"
-        assert not set(getattr(train, key)) & set(getattr(test, key))
+@pytest.mark.parametrize(
+    ("name", "train_size", "key"),
+    [
+        ("primitives", 900, "indices"),
+        pytest.param("random_urdfs", 899, "files", marks=needs_pybullet),
+    ],
+)
+def test_sizes_and_disjoint_splits(tmp_path, name, train_size, key):
+    train = load_object_set(name, split="train", cache_dir=tmp_path)
+    test = load_object_set(name, split="test", cache_dir=tmp_path)
+    assert (len(train), len(test)) == (train_size, 100)
+    assert not set(getattr(train, key)) & set(getattr(test, key))
 
 
 def test_families_are_equally_frequent(tmp_path):
@@ -239,6 +244,7 @@ def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
 # --- random_urdfs ---------------------------------------------------------------------------
 
 
+@needs_pybullet
 def test_random_urdfs_are_concave_and_named(tmp_path):
     model = load_object_set("random_urdfs", cache_dir=tmp_path)[0]
     assert model.name == "000" and model.friction == 1.0
@@ -251,9 +257,10 @@ def test_random_urdfs_are_concave_and_named(tmp_path):
     assert np.concatenate(model.parts).max(axis=0) == pytest.approx(shown.max(axis=0), abs=5e-4)
 
 
+@needs_pybullet
 @pytest.mark.parametrize("number", BROKEN_RANDOM_URDFS)
 def test_the_broken_random_urdf_is_broken_and_says_so(tmp_path, number):
-    path = DATA / "random_urdfs" / f"{number}" / f"{number}.urdf"
+    path = data_folder() / "random_urdfs" / f"{number}" / f"{number}.urdf"
     with pytest.raises(ObjectError, match=f"{number}.obj has .* not finite"):
         load_object(path, cache_dir=tmp_path)
     files = load_object_set("random_urdfs", split="train", cache_dir=tmp_path).files

@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet")
-
-import pybullet
-
 from envs.cell_layout import Scene
-from envs.pybullet_bodies import static_box
 from envs.robot_kinematics import JOINT_UPPER, forward_kinematics
 from envs.robot_safety import ArmStoppedError
 from envs.servo_arm import ServoArm
+from tests.helpers.simulators import needs_pybullet, pybullet
 from utils.config import load_config
 
 
@@ -56,7 +52,10 @@ def test_the_arm_does_not_run_into_a_joint_limit(cell):
     assert JOINT_UPPER[6] - 0.022 < cell.robot.q[6] < JOINT_UPPER[6] - 0.019
 
 
+@needs_pybullet
 def test_contact_stops_the_arm(cell):
+    from envs.pybullet_bodies import static_box
+
     empty(cell)
     wall = static_box(cell.client, [0.1, 0.01, 0.3], [0.35, 0.15, 0.3], (0.5, 0.5, 0.5, 1))
     reason, _ = drive(cell, np.array([0.6, 0, 0, 0, 0, 0, 0]))

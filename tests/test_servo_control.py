@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("pybullet")
-
-import pybullet
-import pybullet_data
 from hypothesis import given
-from pybullet_utils.bullet_client import BulletClient
 
+from envs.pybullet_files import data_folder
 from tests.helpers.servo_cases import derivative, twists
 from utils.servo_control import camera_jacobian, joint_velocities, pseudo_inverse
 from utils.servo_features import interaction_matrix
@@ -76,8 +71,11 @@ def test_pseudo_inverse_refuses_infinity_even_when_damped():
 @pytest.fixture(scope="module")
 def panda():
     """A fixed Panda; gives T_WE, Jacobian and E's velocity in W, from PyBullet."""
+    pybullet = pytest.importorskip("pybullet")
+    from pybullet_utils.bullet_client import BulletClient
+
     client = BulletClient(pybullet.DIRECT)
-    client.setAdditionalSearchPath(pybullet_data.getDataPath())
+    client.setAdditionalSearchPath(str(data_folder()))
     body = client.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
     yield Panda(client, body)
     client.disconnect()

@@ -1,0 +1,32 @@
+"""What a script says where it cannot run, and that it imports nothing else before."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from utils.installation import PACKAGES, problem
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl")
+
+
+def test_an_old_python_and_a_missing_package_are_named():
+    assert problem() is None
+    assert problem((3, 9, 18)).startswith("Python 3.9.18 is too old, 3.10 or newer is needed; ")
+    assert " lacks no_such_package; install with `make run`" in problem(
+        packages=("numpy", "no_such_package")
+    )
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_without_packages_a_script_ends_in_one_sentence(script):
+    """-S -I: an interpreter that sees the standard library and the script's folder alone."""
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {script}"
+    done = subprocess.run(
+        [sys.executable, "-S", "-I", "-c", code], capture_output=True, text=True, cwd=ROOT
+    )
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2 and done.stdout == ""
+    assert line.startswith("error: ") and f" lacks {', '.join(PACKAGES)}; " in line
