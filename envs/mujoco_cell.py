@@ -166,6 +166,14 @@ class MujocoCell(Cell):
             if self.robot.data.warning[kind].number:
                 raise PhysicsError(f"MuJoCo warns of {kind.name}")
 
+    def enable_sleeping(self) -> bool:
+        """MuJoCo itself wakes an object that something else touches."""
+        self.robot.model.opt.enableflags |= self._mujoco.mjtEnableBit.mjENBL_SLEEP
+        return True
+
+    def disable_sleeping(self) -> None:
+        self.robot.model.opt.enableflags &= ~self._mujoco.mjtEnableBit.mjENBL_SLEEP
+
     def object_pose(self, index: int) -> np.ndarray:
         start = self._places[index]
         w, x, y, z = self.robot.data.qpos[start + 3 : start + 7]

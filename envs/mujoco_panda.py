@@ -1,6 +1,6 @@
 """The Panda in MuJoCo: the links of `envs.panda_model`, servos, gripper and contacts.
 
-This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.3,<4".
+This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.4,<4".
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def load_mujoco():
         import mujoco
     except ImportError as error:
         raise UserError(
-            'MuJoCo is not installed: pip install "mujoco>=3.3,<4" (4.0.0 is another package)'
+            'MuJoCo is not installed: pip install "mujoco>=3.4,<4" (4.0.0 is another package)'
         ) from error
     return mujoco
 
@@ -228,6 +228,8 @@ class MujocoPanda(Robot):
         for _ in range(count):
             self.receive(1)
             control, reach = self.data.ctrl, 2 * FINGER_SPEED * self.dt
+            # Fingers that an object has stopped open from where they are.
+            control[7] = max(control[7], min(self._opening, self.opening))
             control[7] += min(max(self._opening - control[7], -reach), reach)
             control[:7] = self._arm_target()
             self._mujoco.mj_step(self.model, self.data, self.substeps)

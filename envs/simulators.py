@@ -57,7 +57,7 @@ SIMULATORS: dict[str, Simulator] = {
         "mujoco",
         "envs.mujoco_cell:MujocoCell",
         "envs.mujoco_bodies:MujocoTable",
-        'pip install "mujoco>=3.3,<4" (4.0.0 is another package)',
+        'pip install "mujoco>=3.4,<4" (4.0.0 is another package)',
     ),
 }
 

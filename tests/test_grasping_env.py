@@ -24,7 +24,7 @@ from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
 from envs.scripted_pick import scripted_pick
 from tests.helpers.shapes import cube_corners
-from tests.helpers.simulators import move, needs_pybullet, pybullet
+from tests.helpers.simulators import is_pybullet, move, needs_pybullet, pybullet
 from utils.config import with_settings
 from utils.errors import UserError
 
@@ -288,10 +288,11 @@ def make_awake(make, monkeypatch):
 
 
 def settle_only(cell) -> bool:
-    """What `PybulletCell.enable_sleeping` does before it decides."""
-    from envs.pybullet_bodies import settle
+    """What `PybulletCell.enable_sleeping` does before it decides; MuJoCo's does nothing before."""
+    if is_pybullet(cell):
+        from envs.pybullet_bodies import settle
 
-    settle(cell.client, cell.bodies, cell.config, checks=5)
+        settle(cell.client, cell.bodies, cell.config, checks=5)
     return False
 
 
