@@ -264,6 +264,21 @@ def mujoco(say: Say, part: Figures) -> str:
     return "\n\n".join([table(["planner", "PyBullet", "MuJoCo"], lines), origin(say, part)])
 
 
+def mujoco_only(say: Say, part: Figures) -> str:
+    ours, theirs = (
+        {(row["scenario"], row["policy"]): row for row in rows_of(part, name)}
+        for name in ("pybullet", "mujoco")
+    )
+    lines = [
+        [scenario, f"`{name}`", success(row), success(theirs[scenario, name]), cleared(row),
+         cleared(theirs[scenario, name])]
+        for (scenario, name), row in ours.items()
+    ]  # fmt: skip
+    header = ["scenario", "planner", "success in PyBullet", "success in MuJoCo",
+              "cleared in PyBullet", "cleared in MuJoCo"]  # fmt: skip
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
 def ppo(say: Say, part: Figures) -> str:
     lines = []
     for command in part["commands"].values():
@@ -329,6 +344,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "noise": (("noise", "scoreboard"), noise),
     "servo": (("servo",), servo),
     "mujoco": (("mujoco",), mujoco),
+    "mujoco_only": (("mujoco_only",), mujoco_only),
     "ppo": (("ppo",), ppo),
     "cornell": (("cornell",), cornell),
     "speed": (("speed",), speed),

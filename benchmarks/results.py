@@ -126,6 +126,12 @@ PARTS = (
                     "oracle evaluate.scenarios=pile evaluate.object_sets=random_urdfs", kept=3)
         for simulator in ("pybullet", "mujoco")
     )),
+    Part("mujoco_only", "the default objects without PyBullet, beside those with it", 90, tuple(
+        _evaluation(simulator, 100, f"simulator={simulator} scene.simulator={simulator} "
+                    f"evaluate.policies={ALL} evaluate.scenarios=isolated,packed,pile "
+                    "evaluate.object_sets=primitives", kept=2)
+        for simulator in ("mujoco", "pybullet")
+    )),
     Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
         _policy("box", "ppo_box.pt"),
         _policy("random_urdfs", "ppo_random_urdfs.pt"),
