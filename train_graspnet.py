@@ -62,14 +62,13 @@ from models.rectangle_folds import (
     save_fold,
 )
 from utils.config import COMPUTE_KEYS, Config
-from utils.distributed import Team, stop_on_interrupt, team
+from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
 from utils.runs import (
     check_resume,
     check_writable,
-    new_run_folder,
     parse_args,
     run_script,
     save_results,
@@ -96,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if photographs is not None:
             data = with_target(config, data, photographs)
         trainer = make_trainer(config, data, processes)
-        run = options.resume or open_run(config, processes)
+        run = run_folder("train_graspnet", config.train.name, config, options.resume, processes)
 
         history, finished = train(config, run, data, trainer)
 
@@ -135,12 +134,6 @@ def make_trainer(config: Config, data: TrainingData, processes: Team) -> Trainer
     if config.adaptation.target is not None:
         return AdaptingTrainer(model, config.train, total_steps, processes, config.adaptation)
     return Trainer(model, config.train, total_steps, processes)
-
-
-def open_run(config: Config, processes: Team) -> Path:
-    """Make the run folder, in the main process alone."""
-    run = new_run_folder("train_graspnet", config.train.name, config) if processes.is_main else None
-    return Path(processes.broadcast(str(run)))
 
 
 def train(
@@ -218,7 +211,7 @@ def cross_validate(config: Config, options: argparse.Namespace, processes: Team)
     if options.weights is not None and config.data.fold is None:
         raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
     folds = real_folds(config)
-    run = options.resume or open_run(config, processes)
+    run = run_folder("train_graspnet", config.train.name, config, options.resume, processes)
     judged: dict[int, list[Judged]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"

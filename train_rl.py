@@ -62,13 +62,12 @@ from models.ppo_rollouts import (
     evaluate_policy,
 )
 from utils.config import Config
-from utils.distributed import Team, stop_on_interrupt, team
+from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.runs import (
     Stopwatch,
     check_resume,
     check_writable,
-    new_run_folder,
     parse_args,
     run_script,
 )
@@ -95,9 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         training_envs(config, envs_of_each(config, processes)) as envs,
     ):
         ppo = make_ppo(envs.observation_space, envs.action_space, config, processes)
-        new = processes.is_main and options.resume is None
-        run = new_run_folder("train_rl", config.rl.name, config) if new else options.resume
-        run = Path(processes.broadcast(str(run)))
+        run = run_folder("train_rl", config.rl.name, config, options.resume, processes)
         history = load_progress(ppo, run / "last.pt")
         announce(config, run, ppo)
 

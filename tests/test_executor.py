@@ -10,6 +10,7 @@ from functools import partial
 from itertools import count, repeat
 from threading import Event
 
+import psutil
 import pytest
 
 from tests.helpers.cluster import local_cluster
@@ -17,9 +18,17 @@ from utils import executor
 from utils.config import load_config
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
+from utils.runs import REPOSITORY
 from utils.worker_process import kept
 
 # --- In threads, which have the same interface --------------------------------------------------
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 class Threads(ThreadPoolExecutor):
@@ -133,6 +142,33 @@ def test_a_call_that_ends_every_worker_is_an_error(compute):
         workers.submit(die).result()
 
 
+MAIN = """
+import os, sys, time
+from utils.config import load_config
+from utils.executor import open_executor
+
+def report(_):
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+
+if __name__ == "__main__":
+    with open_executor(load_config().compute, 1) as workers:
+        workers.submit(report, 0).result()
+"""
+
+
+def test_processes_end_when_the_main_process_is_killed(tmp_path):
+    (tmp_path / "script.py").write_text(MAIN)
+    main = subprocess.Popen(
+        [sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+    )  # fmt: skip
+    worker = psutil.Process(int(main.stdout.readline()))
+    main.kill()
+    wait_for(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
+    main.communicate()
+
+
 def test_an_error_for_the_user_says_where(compute):
     with (
         pytest.raises(UserError, match=r"^weights.pt does not exist") as raised,
@@ -150,12 +186,6 @@ def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
     """After all workers have vanished, together with the nannies that replace them."""
     monkeypatch.setattr(executor, "WAIT_SECONDS", 0.5)
     results, stop = [], Event()
-
-    def wait_for(condition):
-        deadline = time.monotonic() + 60
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
 
     def it_says_so():
         return "waiting for workers: tcp://127.0.0.1" in capfd.readouterr().err

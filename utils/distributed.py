@@ -1,7 +1,8 @@
-"""The processes of one training: which device each uses, what they exchange, and a clean Ctrl-C.
+"""The processes of one training: devices, what they exchange, their folder, and a clean Ctrl-C.
 
 `torchrun` starts the processes; without it a training is a team of one. Collective operations give
-the same result bit for bit in every process, so that all processes take the same steps. This module
+the same result bit for bit in every process, so that all processes take the same steps. Where it
+starts them again after a loss, they find their run's folder and so its last checkpoint. This module
 knows no network and no data.
 """
 
@@ -11,6 +12,7 @@ import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
 
@@ -18,7 +20,9 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
+from utils.config import Config
 from utils.errors import UserError
+from utils.runs import new_run_folder, run_of_job
 
 
 class Team(NamedTuple):
@@ -131,6 +135,20 @@ def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> 
             raise UserError(f"{key}={name}: this machine has {count} CUDA GPUs; use {key}=auto")
         device = torch.device("cuda", index)
     return device
+
+
+def run_folder(
+    script: str, name: str | None, config: Config, resume: Path | None, processes: Team
+) -> Path:
+    """The folder of a training's run, in every process of it.
+
+    resume: the folder to go on with; None for a new one, or the one that the processes have made
+    before `torchrun` started them again, because one was lost or others joined.
+    """
+    folder = resume
+    if folder is None and processes.is_main:
+        folder = run_of_job(script, config) or new_run_folder(script, name, config)
+    return Path(processes.broadcast(str(folder)))
 
 
 @contextmanager

@@ -34,7 +34,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
-from threading import Event
+from threading import Event, Thread
 from typing import Any, TypeVar
 
 from utils.config_schema import ComputeConfig
@@ -172,14 +172,24 @@ class _Processes(Workers):
 
 
 def _new_process() -> ProcessPoolExecutor:
-    """One process that ignores Ctrl-C, which the main process handles. It is spawned, because a
-    forked copy of a process that runs physics or threads of torch may hang."""
-    return ProcessPoolExecutor(
-        1,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
+    """One process, which is spawned, because a forked copy of a process that runs physics or
+    threads of torch may hang."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_begin_process)
+
+
+def _begin_process() -> None:
+    """In a new process: leave Ctrl-C to the main process, and end with it, even if it is killed;
+    it would be waited for without an end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 # --- A cluster ------------------------------------------------------------------------------------

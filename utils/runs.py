@@ -163,6 +163,27 @@ def new_run_folder(
     return folder
 
 
+def run_of_job(script: str, config: Config, root: Path = Path("runs")) -> Path | None:
+    """The folder that this job of `torchrun` (its --rdzv-id) has made for the same config, before
+    it was started again; None outside a job, or where there is none."""
+    job = torchrun_job()
+    for folder in sorted((root / script).glob("*/"), reverse=True) if job is not None else ():
+        try:
+            facts = json.loads((folder / "environment.json").read_text(encoding="utf-8"))
+            same = (folder / "config.yaml").read_text(encoding="utf-8") == dump_config(config)
+        except (OSError, ValueError):  # no run of this version, or one that is being made
+            continue
+        if same and facts.get("torchrun_job") == job:
+            return folder
+    return None
+
+
+def torchrun_job() -> str | None:
+    """The name of the job of `torchrun` that started this process, which its restarts share."""
+    job = os.environ.get("TORCHELASTIC_RUN_ID")
+    return None if job == "none" else job  # what torchrun calls every job without a name
+
+
 def check_resume(
     config: Config, run: Path | None, free_keys: Collection[str], checkpoints: Collection[str] = ()
 ) -> None:
@@ -227,6 +248,7 @@ def environment() -> dict[str, Any]:
         "commit": commit,
         "dirty": dirty,
         "command": sys.argv,
+        "torchrun_job": torchrun_job(),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
