@@ -11,21 +11,23 @@ scenes: evaluate.policies=oracle.
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
+import numpy as np
 import psutil
 from distributed import Client
 
-from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
+from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.evaluation_worker import work
 from utils.config import Config, load_config, with_settings
 from utils.evaluation import Task, tasks
@@ -36,6 +38,7 @@ from utils.worker_process import worker_environment
 
 SCENES = ("evaluate.policies=heuristic", "evaluate.scenarios=pile",
           "evaluate.object_sets=primitives", "evaluate.videos=0")  # fmt: skip
+SHORT = ("evaluate.scenarios=isolated",)  # of the evaluations in which workers are killed
 QUICK = ("evaluate.scenarios=isolated", "evaluate.object_sets=box")
 SIZES = (8, 64, 512)  # workers of the model
 FULL = 0.8  # share of a core from which a scheduler or a main process is late with its answers
@@ -43,8 +46,7 @@ EACH = 3  # scenes between two kills, so that a scene is not killed as often as 
 BRIDGE, NETWORK = "robotgrasp", "10.77.0"  # of the two namespaces
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """Per scene: seconds of wall time, bytes that are sent, and seconds of CPU of the main process
     and of the scheduler (0 without one)."""
 
@@ -63,23 +65,24 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "overrides", nargs="*", metavar="KEY=VALUE", help="evaluate.policies=oracle"
     )
-    parser.add_argument("--scenes", type=int, default=40, help="of each set-up")
+    parser.add_argument("--scenes", type=int, default=16, help="of each set-up")
     parser.add_argument(
         "--kills", type=int, default=20, help="worker processes to kill, each engine"
     )
     options = parser.parse_intermixed_args(argv)
-    scenes, kills, calls, repeats = options.scenes, options.kills, 500, 5
+    scenes, kills, calls, repeats = options.scenes, options.kills, 500, 3
     if options.quick:
-        scenes, kills, calls, repeats = 2, 1, 200, 1
+        scenes, kills, calls, repeats = 2, 1, 100, 1
     quick = QUICK if options.quick else ()
-    config = load_config(
-        None,
-        [*SCENES, *quick, f"evaluate.rounds={max(scenes, EACH * kills + 4)}", *options.overrides],
-    )
-    plan = list(tasks(config, []))
-    metrics = rates(config, plan[:scenes], calls, repeats)
-    metrics += killed(config, plan[: EACH * kills + 4], kills)
+    metrics = rates(*plan_of(scenes, [*quick, *options.overrides]), calls, repeats)
+    rounds = EACH * kills + 4
+    metrics += killed(*plan_of(rounds, [*SHORT, *quick, *options.overrides]), kills)
     report(metrics, options.json)
+
+
+def plan_of(rounds: int, overrides: Sequence[str]) -> tuple[Config, list[Task]]:
+    config = load_config(None, [*SCENES, f"evaluate.rounds={rounds}", *overrides])
+    return config, list(tasks(config, []))
 
 
 # --- What is measured -------------------------------------------------------------------------
@@ -96,18 +99,20 @@ def rates(config: Config, plan: Sequence[Task], calls: int, repeats: int) -> lis
             there = with_settings(config, "compute", {"scheduler": address})
             local = stack.enter_context(open_executor(config.compute, count))
             cluster = stack.enter_context(open_executor(there.compute))
-            for workers in (local, cluster):  # every process makes its cell
+            engines = {"local": (local, None), "dask": (cluster, scheduler)}
+            for workers, _ in engines.values():  # every process makes its cell
                 play(workers, config, plan[: 2 * count])
-            for name, workers, of in (("local", local, None), ("dask", cluster, scheduler)):
-                found[f"{name}_{count}"] = measure(partial(play, workers, config, plan), of)
-            size = round(found[f"dask_{count}"].sent)
-            for name, workers, of in (("local", local, None), ("dask", cluster, scheduler)):
+            runs: dict[str, list[Measured]] = {name: [] for name in engines}
+            for repeat in range(repeats if count == 2 else 1):
+                for name in list(engines)[:: 1 if repeat % 2 else -1]:  # who is first alternates
+                    workers, of = engines[name]
+                    runs[name].append(measure(partial(play, workers, config, plan), of))
+            size = round(runs["dask"][0].sent)
+            for name, (workers, of) in engines.items():
+                found[f"{name}_{count}"] = Measured(*np.mean(runs[name], axis=0).tolist())
                 idle[f"{name}_{count}"] = measure(partial(call, workers, config, size, calls), of)
-            ratio = median_ratio(
-                lambda: measure(partial(play, cluster, config, plan)).an_hour,  # noqa: B023
-                lambda: measure(partial(play, local, config, plan)).an_hour,  # noqa: B023
-                repeats,
-            )
+            pairs = zip(runs["dask"], runs["local"])
+            ratio = float(np.median([dask.an_hour / local.an_hour for dask, local in pairs]))
             aim = 0.95 if count == 2 else None
             metrics.append(Metric(f"dask_{count}_of_local_{count}", ratio, "of the rate", aim))
     with two_nodes() as (address, scheduler, received):
@@ -200,7 +205,7 @@ def killed(config: Config, plan: Sequence[Task], kills: int) -> list[Metric]:
     """The plan's rounds while `kills` busy workers die, against those that nothing disturbs."""
     with open_executor(config.compute, 2) as workers:
         expected = rounds(workers, config, plan)
-        metrics = _survived("local", workers, config, plan, kills, expected, psutil.Process())
+        metrics = _survived("local", workers, config, plan, kills, expected)
     with local_cluster(2) as (address, scheduler):
         there = with_settings(config, "compute", {"scheduler": address})
         with open_executor(there.compute) as workers:
@@ -287,7 +292,9 @@ def dask(
 
 
 def _start(stack: ExitStack, command: Sequence[str]) -> subprocess.Popen:
-    process = subprocess.Popen(command)
+    process = subprocess.Popen(
+        command, env=os.environ | {"DASK_LOGGING__DISTRIBUTED": "error"}, stdin=subprocess.DEVNULL
+    )
     stack.callback(process.wait)
     stack.callback(process.terminate)
     return process
@@ -347,4 +354,6 @@ def _make_network(stack: ExitStack, namespaces: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    run_script(main)
+    from benchmarks import bench_scaling  # under which name a worker finds its functions
+
+    run_script(bench_scaling.main)

@@ -146,7 +146,7 @@ PARTS = (
         Command("environment", "bench_env", ""),
         Command("planning", "bench_planning", ""),
     )),
-    Part("scaling", "workers of this machine, of a cluster and of two nodes, and killed ones", 30, (
+    Part("scaling", "workers of this machine, of a cluster and of two nodes, and killed ones", 15, (
         Command("scaling", "bench_scaling", f"seed={SEED}"),
     )),
 )  # fmt: skip
