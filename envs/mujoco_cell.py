@@ -172,7 +172,7 @@ class MujocoCell(Cell):
         return True
 
     def disable_sleeping(self) -> None:
-        self.robot.model.opt.enableflags &= ~self._mujoco.mjtEnableBit.mjENBL_SLEEP
+        self.robot.model.opt.enableflags &= ~int(self._mujoco.mjtEnableBit.mjENBL_SLEEP)
 
     def object_pose(self, index: int) -> np.ndarray:
         start = self._places[index]
