@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
-.PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results lock locked clean
+.PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results lock clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
 # tests/conftest.py orders the files.
@@ -69,8 +69,9 @@ results: $(VENV)/.installed-dev
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
+# LOCKED=1 takes the versions and hashes of requirements.lock, as CI does; they include what tests need.
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install -r requirements.txt
+	$(BIN)/python -m pip install -r $(if $(LOCKED),requirements.lock,requirements.txt)
 	touch $@
 
 $(VENV)/.installed-cluster: $(VENV)/.installed
@@ -81,14 +82,10 @@ $(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
 	$(BIN)/python -m pip install -r requirements-dev.txt
 	touch $@
 
-# The versions with which CI runs, with hashes for every system and Python, renewed; and installed.
+# The newest versions that requirements*.txt admit, with hashes for every system and Python: requirements.lock.
 lock: $(VENV)/.installed-dev
 	$(BIN)/uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-annotate \
 		--custom-compile-command "make lock" --output-file requirements.lock requirements.txt requirements-dev.txt
-
-locked: | $(VENV)/bin/python
-	$(BIN)/python -m pip install --require-hashes --only-binary :all: -r requirements.lock
-	touch $(VENV)/.installed $(VENV)/.installed-dev $(VENV)/.installed-cluster
 
 clean:
 	rm -rf .venv .venv-mujoco .venv-oldest

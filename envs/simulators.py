@@ -37,10 +37,11 @@ class Simulator:
     def load(self, path: str, name: str) -> type:
         """The class that `path` names. Raises UserError where the package is not installed."""
         if not self.installed:
-            offered = [other for other, one in SIMULATORS.items() if one.installed]
+            ways = [self.install]
+            ways += [f"use simulator={other}" for other, one in SIMULATORS.items() if one.installed]
             raise UserError(
-                f"simulator={name}: the package {self.package} is not installed; {self.install}, "
-                f"or use {' or '.join(f'simulator={other}' for other in offered)}"
+                f"simulator={name}: the package {self.package} is not installed; "
+                + ", or ".join(ways)
             )
         module, _, attribute = path.partition(":")
         return getattr(importlib.import_module(module), attribute)
@@ -51,7 +52,7 @@ SIMULATORS: dict[str, Simulator] = {
         "pybullet",
         "envs.pybullet_cell:PybulletCell",
         "envs.pybullet_bodies:PybulletTable",
-        "it has wheels for CPython 3.9 to 3.11 on Linux (pip install pybullet)",
+        "pip install pybullet, which has wheels for Python 3.10 and 3.11 on Linux x86-64",
     ),
     "mujoco": Simulator(
         "mujoco",

@@ -24,6 +24,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: -slow[item.path])
 
 
+@pytest.fixture(autouse=True)
+def without_other_tests_plug_ins(monkeypatch):
+    """A worker of a cluster must have the plug-ins that the main process has loaded."""
+    monkeypatch.setattr("utils.plugins._loaded", set())
+
+
 @pytest.fixture(scope="session")
 def config() -> Config:
     """The defaults, rendered by the CPU so that pictures are the same everywhere."""

@@ -11,7 +11,7 @@ def test_random_targets_are_legal():
     assert image.shape == (2, 4, 16, 24)
     torch.testing.assert_close(targets.angle.sum(1), torch.ones(2, 16, 24))
     assert set(targets.graspable.unique().tolist()) == {0.0, 1.0}
-    assert 0 <= targets.width.min() and targets.width.max() <= 0.08
+    assert targets.width.min() >= 0 and targets.width.max() <= 0.08
 
 
 def test_training_and_prediction_are_timed(monkeypatch):
@@ -25,6 +25,6 @@ def test_training_and_prediction_are_timed(monkeypatch):
 
 
 def test_the_time_of_a_call_is_the_median(monkeypatch):
-    clock = iter([0, 9, 10, 19, 20, 29, 30, 31, 40, 42, 50, 53])  # three warm-ups of 9 s
+    clock = iter([0, 10, 20, 30, 31, 40, 42, 50, 53])  # three warm-ups, of which no time is taken
     monkeypatch.setattr(bench_gpu, "perf_counter", lambda: next(clock))
     assert bench_gpu.median_seconds(lambda: None, bench_gpu.CPU, 3) == 2

@@ -20,9 +20,15 @@ from envs.rounds import run_round
 from envs.scenarios import teach, true_calibration, wrong_calibration
 from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, loop, round_with_a_box
+from tests.helpers.simulators import needs_pybullet
 from utils.config import load_config
 
-IN_PYBULLET = pytest.mark.parametrize("taught_cell", ["pybullet"], indirect=True, scope="module")
+IN_PYBULLET = pytest.mark.parametrize(
+    "taught_cell",
+    [pytest.param("pybullet", marks=needs_pybullet)],
+    indirect=True,
+    scope="module",
+)
 CLOSED = ("pbvs", "ibvs", "hybrid")
 
 

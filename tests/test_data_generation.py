@@ -48,7 +48,7 @@ def folder_of(*overrides: str) -> Path:
     "override",
     [
         "seed=1", "sim.frequency=120", "camera.width=128", "camera.fov_deg=30",
-        "workspace.size=0.25", "objects.density=500", "data.object_sets=primitives",
+        "workspace.size=0.25", "objects.density=500", "data.object_sets=box",
         "data.max_objects=3", "data.randomise=false", "data.executed_share=0.5",
     ],
 )  # fmt: skip

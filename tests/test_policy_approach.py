@@ -19,7 +19,7 @@ from envs.policy_approach import PolicyApproach, placeholder
 from envs.simulators import make_cell
 from envs.vector_env import make_env
 from models.grasp_policy import load_policy
-from tests.helpers.simulators import move
+from tests.helpers.simulators import move, needs_pybullet
 from utils.config import load_config
 
 CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
@@ -30,6 +30,7 @@ def box():
     return CHECKPOINTS / "ppo_box.pt"
 
 
+@needs_pybullet  # whose detailed pictures of the hand the policy has learned from
 def test_the_policy_of_the_box_lifts_it(box):
     """200 of 200 in docs/ppo.md: by far not each in ten would fail by chance."""
     config = config_of(box, ["sim.renderer=tiny"])
@@ -90,6 +91,7 @@ def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
     env.close()
 
 
+@needs_pybullet
 def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
     """In the cell of evaluate.py, whose own camera hangs overhead."""
     policy = load_policy(box)

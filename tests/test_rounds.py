@@ -122,7 +122,7 @@ def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -
 
 def test_physics_that_blows_up_ends_the_round(cell, box_set, monkeypatch):
     def plan(frame):
-        monkeypatch.setattr(cell.robot, "state", lambda: [np.nan] * 15)
+        monkeypatch.setattr(type(cell.robot), "q", property(lambda robot: np.full(7, np.nan)))
         return [cube_grasp()]
 
     record = run_round(cell, cube_scene(box_set), plan, policy="x", objects="b", max_failures=2)

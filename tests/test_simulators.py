@@ -117,7 +117,7 @@ def test_a_simulator_that_is_not_installed_is_refused(name, monkeypatch):
     missing = replace(SIMULATORS[name], package="no_such_package")
     monkeypatch.setitem(SIMULATORS, name, missing)
     config = load_config(None, [f"simulator={name}", f"scene.simulator={name}"])
-    message = f"simulator={name}: the package no_such_package is not installed; .* or use simulator"
+    message = f"simulator={name}: the package no_such_package is not installed; .*pip install"
     with pytest.raises(UserError, match=message):
         make_cell(config)
     with pytest.raises(UserError, match=message):
