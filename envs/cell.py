@@ -113,22 +113,23 @@ class PhysicsError(RuntimeError):
 class Cell(ABC):
     """A simulated robot cell. Close it, or use it in a `with` block.
 
-    dt: s, a physics step. home: (7,) rad. gripper: the robot's hand. robot, camera: see
-    `envs.robot.Robot` and `envs.cell.Camera`. bodies: the simulator's numbers of the objects.
-    remaining: numbers of the objects still in the round. steps, frames: taken since the scene was
-    built. Callbacks, each called with the cell: on_build when a scene has been built and nothing
-    has moved yet, before_step before every physics step (to disturb the objects), on_step after it
-    (to film). view: changes what cameras see; None changes nothing. sample: the randomisation drawn
-    for this scene alone (`utils.domain_randomization`), None for a nominal cell. on_action: changes
-    each action of a policy that moves the hand step by step; None leaves it as it is. taught: (4,
-    4) T_CE that `envs.scenarios.teach` has measured with this cell's wrist camera; None before.
+    gui: show the cell in a window. dt: s, a physics step. home: (7,) rad. gripper: the robot's
+    hand. robot, camera: see `envs.robot.Robot` and `envs.cell.Camera`. bodies: the simulator's
+    numbers of the objects. remaining: numbers of the objects still in the round. steps, frames:
+    taken since the scene was built. Callbacks, each called with the cell: on_build when a scene has
+    been built and nothing has moved yet, before_step before every physics step (to disturb the
+    objects), on_step after it (to film). view: changes what cameras see; None changes nothing.
+    sample: the randomisation drawn for this scene alone (`utils.domain_randomization`), None for a
+    nominal cell. on_action: changes each action of a policy that moves the hand step by step; None
+    leaves it as it is. taught: (4, 4) T_CE that `envs.scenarios.teach` has measured with this
+    cell's wrist camera; None before.
     """
 
     robot: Robot
     camera: Camera
     bodies: list[int]
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, gui: bool = False):
         self.config = config
         self.dt = 1.0 / config.sim.frequency
         self.home = np.array(config.robot.home)
