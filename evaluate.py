@@ -31,7 +31,7 @@ from envs.evaluation_worker import check_everything, privileged_policies, work
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
-from utils.config import Config, load_config
+from utils.config import Config, load_foreign, values_of
 from utils.errors import UserError
 from utils.evaluation import (
     FREE_TO_CHANGE,
@@ -178,7 +178,7 @@ def write_comparisons(comparisons: Sequence[Comparison], options: argparse.Names
 def report_replay(file: Path, overrides: Sequence[str]) -> int:
     """Play the rounds of a sample again; the status is 1 where one of them ends otherwise."""
     sample = read_sample(file)
-    config = load_config(None, [*sample.overrides, *overrides])
+    config = load_foreign(values_of(sample.overrides), str(file), overrides)
     check_names(config)
     print(f"{len(sample.rounds)} rounds of commit {sample.commit}, played again", flush=True)
     facts = environment()

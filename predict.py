@@ -74,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
 
     text = json.dumps(as_plain(found, frame, table, options), indent=2, allow_nan=False)
-    write(out / "grasps.png", picture(found, frame, saved))
-    write(out / "grasps.json", text + "\n")
+    write_atomic(out / "grasps.png", picture(found, frame, saved))
+    write_atomic(out / "grasps.json", text + "\n")
     print(text)
     print(f"wrote {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
     return 0
@@ -142,21 +142,14 @@ def check_output(folder: Path) -> None:
             raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
 
 
-def write(path: Path, content: str | bytes) -> None:
-    try:
-        write_atomic(path, content)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-
-
 def own_json(path: Path) -> dict[str, Any] | None:
     """The content of a grasps.json of this program; None if the file is something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        Path(content["rgb"]).resolve()
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return None
-    own = isinstance(content, dict) and content.get("format") == FORMAT
-    return content if own and isinstance(content.get("rgb"), str) else None
+    return content if content.get("format") == FORMAT else None
 
 
 def read_image(options: argparse.Namespace) -> RGBDFrame:

@@ -7,11 +7,9 @@ checkpoint was trained in, up to the overrides that are given.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo_rollouts import FRESH, derived_seeds
-from utils.config import Config, load_config
+from utils.config import Config, load_foreign
 from utils.runs import run_script
 from utils.statistics import wilson_interval
 
@@ -49,12 +47,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
-    """The config that a checkpoint was trained with, changed by overrides."""
-    plain = load_policy(checkpoint).config
-    with NamedTemporaryFile("w", suffix=".yaml") as file:
-        json.dump(plain, file)  # JSON is YAML
-        file.flush()
-        return load_config(Path(file.name), overrides)
+    """The config that a checkpoint was trained with, changed by overrides, which alone may name
+    plug-ins or an environment of another module."""
+    return load_foreign(load_policy(checkpoint).config, str(checkpoint), overrides)
 
 
 def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[str, int]]:

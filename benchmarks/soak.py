@@ -24,6 +24,7 @@ from threading import Event
 from typing import Any
 
 from benchmarks.soak_arm import soak_actions, soak_memory
+from benchmarks.soak_files import soak_files
 from benchmarks.soak_tally import Tally
 from envs.simulators import SIMULATORS
 from utils.distributed import stop_on_interrupt
@@ -51,6 +52,8 @@ PARTS = {
         ("memory", "a million steps and ten thousand resets", 40, soak_memory),
     )
     for simulator in INSTALLED
+} | {
+    "files": Part("damaged files of every kind that is read", 10, soak_files),
 }
 
 

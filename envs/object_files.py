@@ -6,18 +6,25 @@ object set.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from envs.object_meshes import ObjectError, checked_mesh, load_mesh, write_mesh_obj
+from envs.object_meshes import (
+    MESH_SUFFIXES,
+    ObjectError,
+    checked_mesh,
+    load_mesh,
+    parse_xml,
+    write_mesh_obj,
+)
 
-SUFFIXES = (".urdf", ".obj", ".stl", ".ply", ".glb", ".dae")
+SUFFIXES = (".urdf", *MESH_SUFFIXES)
 DEFAULT_FRICTION = 0.7  # for a file that states none
 
 
@@ -61,7 +68,7 @@ def object_files(folder: Path) -> list[Path]:
     referred: set[Path] = set()
     for path in files:
         if path.suffix.lower() == ".urdf":
-            for mesh in _parse_xml(path).iter("mesh"):
+            for mesh in parse_xml(path).iter("mesh"):
                 referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
     files = [path for path in files if path.resolve() not in referred]
     if not files:
@@ -105,13 +112,6 @@ def fine_visual(
     )
 
 
-def _parse_xml(path: Path) -> ElementTree.Element:
-    try:
-        return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
-
-
 def _resolve_mesh(filename: str, urdf: Path) -> str:
     """Return the file that a URDF's mesh element names, relative to the URDF or in a package that
     contains it."""
@@ -125,7 +125,7 @@ def _resolve_mesh(filename: str, urdf: Path) -> str:
 
 
 def _read_urdf(path: Path) -> ObjectSource:
-    xml = _parse_xml(path)
+    xml = parse_xml(path)
     for element in xml.iter("mesh"):
         # Reading the mesh first gives an error that names it, which yourdfpy's error may not.
         load_mesh(_resolve_mesh(element.get("filename", ""), path))
@@ -141,6 +141,8 @@ def _read_urdf(path: Path) -> ObjectSource:
         mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
         friction = xml.find(".//contact/lateral_friction")  # yourdfpy does not read <contact>
         friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
+        if not 0 <= friction < math.inf:
+            raise ValueError(f"its lateral_friction is {friction}")
     except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
         raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
     if len(mesh.faces) == 0:

@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 import coacd
 import manifold3d
@@ -26,6 +28,12 @@ from scipy.spatial import ConvexHull, QhullError
 from utils.errors import UserError
 from utils.runs import write_atomic
 
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".dae")
+MOST_FACES = 2_000_000
+SMALLEST_SIDE, LARGEST_SIDE = (
+    1e-9,
+    1e9,
+)  # in the file's units: beyond them numbers lose their digits
 MAX_PARTS = 8
 MAX_VERTICES = 32
 # The lengths below are fractions of the largest side of the mesh's bounding box.
@@ -73,12 +81,34 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     path = Path(path)
     if not path.is_file():
         raise ObjectError(f"mesh {path} does not exist")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise ObjectError(f"mesh {path} is none of {', '.join(MESH_SUFFIXES)}; convert it")
+    if path.suffix.lower() == ".dae":
+        parse_xml(path)
     try:
-        mesh = trimesh.load_scene(path, process=False).to_mesh()
+        # Materials name other files, which nothing here needs.
+        mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
     except Exception as error:  # each of trimesh's readers raises errors of its own kind
         reason = f"mesh {path} cannot be read ({error}); re-export or remove it"
         raise ObjectError(reason) from error
     return checked_mesh(mesh, str(path))
+
+
+def parse_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file. Raises ObjectError, also for a document type: its entities stand for
+    other files, or for any amount of text."""
+
+    def refuse(*_: object) -> None:
+        raise ValueError("it has a document type, <!DOCTYPE ...>")
+
+    try:
+        data = path.read_bytes()
+        parser = expat.ParserCreate()
+        parser.StartDoctypeDeclHandler = refuse
+        parser.Parse(data, True)
+        return ElementTree.fromstring(data)
+    except (OSError, ValueError, LookupError, SyntaxError, expat.ExpatError) as error:
+        raise ObjectError(f"{path} cannot be read ({error}); repair or remove it") from error
 
 
 def checked_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
@@ -92,11 +122,21 @@ def checked_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
             f"mesh {name} has {bad} of {len(mesh.vertices)} vertices that are not finite numbers; "
             "re-export or remove it"
         )
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise ObjectError(f"mesh {name} has triangles without corners; re-export or remove it")
+    if len(mesh.faces) > MOST_FACES:
+        raise ObjectError(f"mesh {name} has more than {MOST_FACES:,} triangles; simplify it")
+    side = float(np.ptp(mesh.vertices, axis=0).max())
+    if not (SMALLEST_SIDE < side < LARGEST_SIDE and abs(mesh.vertices).max() < LARGEST_SIDE):
+        raise ObjectError(
+            f"mesh {name} is {side:.3g} long, or as far from its origin, expected "
+            f"{SMALLEST_SIDE:g} to {LARGEST_SIDE:g}; re-export it in other units"
+        )
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
     # Triangles with two merged corners are removed; thin ones stay, because their removal would
     # leave holes.
     bare.update_faces((np.diff(np.sort(bare.faces, axis=1), axis=1) > 0).all(axis=1))
-    if not bare.nondegenerate_faces().any():
+    if len(bare.faces) == 0 or not bare.nondegenerate_faces().any():
         raise ObjectError(f"mesh {name} has only degenerate triangles; re-export or remove it")
     centred = bare.vertices - bare.vertices.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False)
@@ -323,7 +363,10 @@ def _read_parts(path: Path) -> list[np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as data:
             vertices, counts = data["vertices"], data["counts"]
-        if len(counts) == 0 or counts.sum() != len(vertices) or not np.isfinite(vertices).all():
+        fit = vertices.ndim == 2 and vertices.shape[1] == 3 and counts.ndim == 1
+        if not (fit and len(counts) and counts.min() > 0 and counts.sum() == len(vertices)):
+            raise ValueError("its shapes contradict each other")
+        if not np.isfinite(vertices).all():
             raise ValueError("its numbers contradict each other")
     except _UNREADABLE as error:
         raise _corrupt(path, str(error)) from error

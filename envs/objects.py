@@ -38,6 +38,7 @@ DEFAULT_DENSITY = 1000.0
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
 LARGEST_EXTENT = 0.5
+SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 1e3  # m
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
 ROLLING_FRICTION = 0.0005
@@ -342,6 +343,12 @@ def load_object(
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
     parts = tuple(scale * (part - solid.centre_of_mass) for part in parts)
+    side = float(np.ptp(np.concatenate(parts), axis=0).max())
+    if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
+        raise ObjectError(
+            f"object {path} is {side:.3g} m long, which no simulator bears; set objects.fit, for "
+            "example to 0.06, or objects.scale"
+        )
     true_mass = density * solid.volume * scale**3
     mass = max(true_mass, MIN_MASS)
     return ObjectModel(

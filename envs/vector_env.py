@@ -22,12 +22,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import yaml
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from utils.config import Config
-from utils.errors import UserError
+from utils.config import YAML_ERRORS, Config, load_yaml
+from utils.errors import UserError, one_line
 from utils.runs import REPOSITORY
 from utils.worker_process import worker_environment
 
@@ -200,7 +199,12 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
     arguments = {}
     for text in settings.env_kwargs or ():
         name, _, value = text.partition("=")
-        arguments[name] = yaml.safe_load(value)
+        try:
+            arguments[name] = load_yaml(value)
+        except YAML_ERRORS as error:
+            raise UserError(
+                f"rl.env_kwargs: {text!r} is not valid YAML ({one_line(error)})"
+            ) from error
     if render_mode is not None:  # panda-gym does not take None
         arguments["render_mode"] = render_mode
     if settings.env_id in OWN_ENVS:

@@ -25,7 +25,13 @@ from models.ppo_observations import (
     ObservationNormaliser,
     Observations,
 )
-from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.checkpoint import (
+    build_model,
+    load_checkpoint,
+    load_weights,
+    reading,
+    save_checkpoint,
+)
 from utils.config import with_current_keys
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
@@ -375,11 +381,11 @@ class SavedPolicy(NamedTuple):
 def load_policy(path: Path | str) -> SavedPolicy:
     """The policy of a checkpoint that `GraspPPO.save` wrote, on the CPU. Raises UserError."""
     checkpoint = load_checkpoint(path, KIND)
-    network = GraspPolicyNetwork(**checkpoint["model_args"])
-    load_weights(network, checkpoint, path)
+    network = build_model(GraspPolicyNetwork, checkpoint, path)
     extra = checkpoint["extra"]
-    layout = ObservationLayout.from_plain(extra["layout"])
-    return SavedPolicy(network.eval(), layout, extra, _current_config(checkpoint["config"]))
+    with reading(path):
+        layout = ObservationLayout.from_plain(extra["layout"])
+        return SavedPolicy(network, layout, extra, _current_config(checkpoint["config"]))
 
 
 def _current_config(stored: dict) -> dict:

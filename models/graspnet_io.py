@@ -19,7 +19,7 @@ from torch.export import Dim
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from models.graspnet import GraspNet
-from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.checkpoint import build_model, load_checkpoint, load_weights, save_checkpoint
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.runs import write_atomic
@@ -90,18 +90,12 @@ def load_graspnet(path: Path | str) -> SavedGraspNet:
     another version or architecture, or holds weights that are not finite.
     """
     checkpoint = load_checkpoint(path, KIND)
-    try:
-        model = GraspNet(**checkpoint["model_args"])
-    except (TypeError, ValueError, RuntimeError) as error:  # UserError is a ValueError
-        raise UserError(f"{path}: a checkpoint of another architecture: {error}") from None
-    load_weights(model, checkpoint, path)
-    if not all(bool(torch.isfinite(value).all()) for value in model.state_dict().values()):
-        raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
+    model = build_model(GraspNet, checkpoint, path)
     extra = dict(checkpoint["extra"])
     pixel_size = extra.pop(PIXEL_SIZE, None)
     if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
         raise UserError(f"{path}: does not hold the pixel size of its images ({PIXEL_SIZE})")
-    return SavedGraspNet(model.eval(), pixel_size, checkpoint["config"], extra)
+    return SavedGraspNet(model, pixel_size, checkpoint["config"], extra)
 
 
 def load_initial(model: GraspNet, path: Path | str) -> None:
@@ -171,10 +165,7 @@ def export_onnx(saved: SavedGraspNet, path: Path) -> None:
     }
     for key, value in described.items():
         onnx_model.metadata_props.add(key=key, value=json.dumps(value))
-    try:
-        write_atomic(path, onnx_model.SerializeToString())
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+    write_atomic(path, onnx_model.SerializeToString())
 
 
 def check_export_path(path: Path) -> None:

@@ -18,7 +18,14 @@ from torch.nn.parallel import DistributedDataParallel
 from models.graspnet import GraspLoss, GraspNet, create_model
 from models.graspnet_data import Example
 from models.graspnet_io import KIND, PIXEL_SIZE, load_initial
-from utils.checkpoint import load_checkpoint, load_weights, restore_rng, rng_states, save_checkpoint
+from utils.checkpoint import (
+    load_checkpoint,
+    load_weights,
+    reading,
+    restore_rng,
+    rng_states,
+    save_checkpoint,
+)
 from utils.config import Config, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
@@ -177,13 +184,14 @@ class Trainer:
         )
         if checkpoint["optimizer"] is None:
             raise UserError(f"{path}: holds weights only, no training to go on with")
-        self.take_weights(checkpoint, path)
-        self.optimizer.load_state_dict(checkpoint["optimizer"])
-        self.scheduler.load_state_dict(checkpoint["scheduler"])
-        if checkpoint["extra"]["scaler"]:  # empty from a device that needed none, such as a CPU
-            self.scaler.load_state_dict(checkpoint["extra"]["scaler"])
-        self.step = checkpoint["step"]
-        restore_rng(checkpoint["rng"], {})
+        with reading(path):
+            self.take_weights(checkpoint, path)
+            self.optimizer.load_state_dict(checkpoint["optimizer"])
+            self.scheduler.load_state_dict(checkpoint["scheduler"])
+            if checkpoint["extra"]["scaler"]:  # empty from a device that needed none, as a CPU
+                self.scaler.load_state_dict(checkpoint["extra"]["scaler"])
+            self.step = checkpoint["step"]
+            restore_rng(checkpoint["rng"], {})
         return checkpoint["extra"]
 
     def ordinary_model(self) -> GraspNet:

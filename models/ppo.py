@@ -26,7 +26,7 @@ from torch import nn
 
 from models.ppo_observations import ObservationLayout, Observations, RewardScaler
 from models.ppo_rollouts import NotFinite, Rollout, StepMemory, act, joined
-from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from utils.checkpoint import load_checkpoint, load_weights, reading, save_checkpoint
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
 from utils.errors import UserError
@@ -375,15 +375,16 @@ class GraspPPO:
             path, KIND, model_args=self.network.model_args, map_location=self.team.device
         )
         extra = checkpoint["extra"]
-        if ObservationLayout.from_plain(extra["layout"]) != self.layout:
-            raise UserError(f"{path}: a policy of other observations than this environment's")
-        if checkpoint["optimizer"] is None:
-            raise UserError(f"{path}: holds weights only, no training to go on with")
-        load_weights(self.network, checkpoint, path)
-        self.rewards.load_state_dict(extra["rewards"])
-        self.optimizer.load_state_dict(checkpoint["optimizer"])
-        if self.estimator_optimizer is not None:
-            self.estimator_optimizer.load_state_dict(extra["estimator"])
+        with reading(path):
+            if ObservationLayout.from_plain(extra["layout"]) != self.layout:
+                raise UserError(f"{path}: a policy of other observations than this environment's")
+            if checkpoint["optimizer"] is None:
+                raise UserError(f"{path}: holds weights only, no training to go on with")
+            load_weights(self.network, checkpoint, path)
+            self.rewards.load_state_dict(extra["rewards"])
+            self.optimizer.load_state_dict(checkpoint["optimizer"])
+            if self.estimator_optimizer is not None:
+                self.estimator_optimizer.load_state_dict(extra["estimator"])
         self.updates = checkpoint["step"]
         return extra
 

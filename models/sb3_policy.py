@@ -1,12 +1,17 @@
 """Policies of Stable-Baselines3, which are trained on `gymnasium.make("RobotGrasping-v0", ...)`.
 
-The package is optional. Loading a policy unpickles parts of its file, as Stable-Baselines3 always
-does, so that only files from a trusted source should be loaded. This module knows no simulator.
+The package is optional. Stable-Baselines3 itself unpickles most of a policy's file, which may run
+any code. Here only what a policy needs to act is unpickled, and of that only spaces, arrays and the
+classes of networks (`_NetworkUnpickler`). This module knows no simulator.
 """
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import pickle
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -74,7 +79,8 @@ def load_sb3(path: Path) -> Sb3Policy:
     algorithms = {"sac": "SAC", "td3": "TD3", "common": "PPO"}
     try:
         with zipfile.ZipFile(path) as archive:
-            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
+            data = json.loads(archive.read("data"))
+        module = data["policy_class"]["__module__"]
         kind = module.split(".")[1]
         if kind not in algorithms:
             raise UserError(
@@ -82,16 +88,63 @@ def load_sb3(path: Path) -> Sb3Policy:
                 "with PPO, A2C, SAC, TD3 or DDPG"
             )
         algorithm = getattr(stable_baselines3, algorithms[kind])
-        return Sb3Policy(path, algorithm.load(path, device="cpu"))
+        return Sb3Policy(path, algorithm.load(path, device="cpu", custom_objects=_replaced(data)))
     except OSError as error:
         raise UserError(f"sb3:{path}: cannot read this file: {error.strerror}") from error
     except UserError:
         raise
-    except Exception as error:  # unpickling raises whatever the file's objects raise
+    except Exception as error:  # Stable-Baselines3 raises errors of many kinds for other files
         raise UserError(
             f"sb3:{path}: not a policy of Stable-Baselines3 ({type(error).__name__}: {error}); "
             "give a file that model.save has written"
         ) from error
+
+
+# --- Without running the file's code --------------------------------------------------------------
+
+# Entries that a policy needs to act; all other objects belong to its training.
+_NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
+# Plain values for entries of the training that an algorithm sets itself up with, each the least.
+_LEAST = {
+    "learning_rate": 0.0, "clip_range": 0.2, "train_freq": 1, "n_envs": 1, "n_steps": 1,
+    "buffer_size": 1,
+}  # fmt: skip
+# Classes, and the functions by which numpy rebuilds arrays, types and generators.
+_CLASSES = re.compile(
+    r"(gymnasium\.spaces\.\w+|numpy\.(dtypes|random\.\w+)|torch\.(nn\.modules|optim)\.\w+"
+    r"|stable_baselines3\.(\w+\.policies|common\.torch_layers))\.\w+"
+    r"|collections\.OrderedDict|numpy\.(ndarray|dtype|bool|bool_|u?int\d+|float\d+)"
+)
+_FUNCTIONS = re.compile(
+    r"numpy\.(_core|core)\.(multiarray\.(_reconstruct|scalar)|numeric\._frombuffer)"
+    r"|numpy\.random\.(_pickle\.__\w+_ctor|bit_generator\.__pyx_unpickle_\w+)"
+)
+
+
+def _replaced(data: dict[str, Any]) -> dict[str, Any]:
+    """What stands for the objects that a file holds as pickles, so that Stable-Baselines3 unpickles
+    none of them."""
+    pickled = [k for k, v in data.items() if isinstance(v, dict) and ":serialized:" in v]
+    replaced = {key: _unpickled(data[key]) if key in _NEEDED else None for key in pickled}
+    return replaced | {key: value for key, value in _LEAST.items() if key in data}
+
+
+def _unpickled(entry: dict[str, Any]) -> Any:
+    return _NetworkUnpickler(io.BytesIO(base64.b64decode(entry[":serialized:"]))).load()
+
+
+class _NetworkUnpickler(pickle.Unpickler):
+    """Refuses every class and function that no space, array or network is made of."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        place = f"{module}.{name}"
+        is_function = _FUNCTIONS.fullmatch(place) is not None
+        if is_function or _CLASSES.fullmatch(place):
+            found = super().find_class(module, name)
+            if is_function or isinstance(found, type):
+                return found
+        raise pickle.UnpicklingError(f"it holds {place}, which no policy needs")
+        return found
 
 
 def _same_box(theirs: spaces.Box, ours: spaces.Box) -> bool:

@@ -1,5 +1,6 @@
 """The config: defaults, merging, and one clear sentence for every mistake."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,12 @@ from utils.config import (
     dump_config,
     known_keys,
     load_config,
+    load_foreign,
     schema_at,
     with_settings,
 )
 from utils.errors import unknown_choice
+from utils.plugins import code_named_in
 
 
 def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
@@ -248,3 +251,70 @@ def test_an_old_key_is_answered_by_what_to_write_instead(key, answer):
     with pytest.raises(ConfigError) as error:
         load_config(None, [key])
     assert str(error.value).startswith(answer)
+
+
+# --- Hostile files --------------------------------------------------------------------------------
+
+LAUGHS = "a: &a [x, x]\n" + "".join(
+    f"{two}: &{two} [*{one}, *{one}]\n" for one, two in zip("abcdefgh", "bcdefghi")
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        LAUGHS,
+        "seed: &a 1\nsim: {<<: *a}\n",
+        "seed: " + 5000 * "[",
+        "{[1, 2]: 3}\n",
+        "1: 2\n",
+        "seed: 2020-99-99\n",
+        "seed: " + 5000 * "9" + "\n",
+        "seed: .nan\n",
+        "robot: {grip_force: .inf}\n",
+        "camera: {width: 1000000000}\n",
+        "evaluate: {name: !!python/object/apply:os.system [id]}\n",
+        "seed: 1\n--- \nseed: 2\n",
+        "seed: 1\n" + 1_000_000 * "#",
+        "\x00",
+    ],
+)
+def test_a_hostile_file_is_one_sentence(tmp_path, text):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert len(str(caught.value)) < 1000 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"rl": {"env_id": "antigravity:Grasping-v0"}},
+        {"env": {"objects": "antigravity:objects"}},
+        {"env": {"reward": "antigravity:reward"}},
+        {"env": {"reward": {"success": 1.0, "antigravity:term": 0.1}}},
+        {"camera": {"depth_noise": "antigravity:Noise"}},
+        {"evaluate": {"policies": ["heuristic", "antigravity:plan"]}},
+        {"evaluate": {"object_sets": ["antigravity:objects"]}},
+        {"evaluate": {"policies": ["sb3:antigravity.zip"]}},
+        {"transfer": {"policies": [["x", "no", "antigravity:plan", None, None]]}},
+    ],
+)
+def test_a_file_of_data_names_no_code(stored):
+    """The command line may: then it is the user who names it."""
+    with pytest.raises(
+        ConfigError, match="FILE: names code to run, .*antigravity.*name it yourself"
+    ):
+        load_foreign(stored, "FILE")
+    key, name = next(code_named_in(stored))
+    if key in ("rl.env_id", "env.objects", "camera.depth_noise"):
+        assert load_foreign(stored, "FILE", [f"{key}={name}"])
+    assert "antigravity" not in sys.modules
+
+
+def test_a_file_of_data_does_not_say_where_to_compute_and_to_write():
+    stored = {"cache_dir": "/etc", "compute": {"scheduler": "tcp://10.0.0.1:8786"}, "seed": 7}
+    config = load_foreign(stored, "FILE", ["evaluate.rounds=3"])
+    assert (config.seed, config.evaluate.rounds) == (7, 3)
+    assert (config.cache_dir, config.compute.scheduler) == (None, None)

@@ -14,10 +14,12 @@ from utils.errors import UserError
 from utils.images import (
     PixelScaling,
     intrinsics_matrix,
+    open_image,
     overhead_view,
     read_depth,
     read_intrinsics,
     read_pose,
+    read_rgb,
 )
 from utils.transforms import deproject, look_at, project
 
@@ -155,3 +157,54 @@ def test_what_the_box_hides_is_bare_table():
     u, v = np.rint(hidden).astype(int)
     assert view.depth[v, u] == pytest.approx(0.8, abs=1e-3)
     assert tuple(view.rgb[v, u]) == GREY
+
+
+# --- Hostile files --------------------------------------------------------------------------------
+
+
+def test_a_small_file_that_stands_for_many_pixels_is_refused(tmp_path):
+    """100 million black pixels take 100 kB as PNG, and 300 MB in memory."""
+    path = tmp_path / "bomb.png"
+    Image.new("1", (10_000, 10_000)).save(path)
+    with pytest.raises(UserError, match="bomb.png: 10000 x 10000 pixels, expected 1 to 50,000,000"):
+        open_image(path)
+
+
+def test_a_format_whose_reader_runs_another_program_is_refused(tmp_path):
+    """Pillow hands PostScript to Ghostscript, whatever a file is called."""
+    path = tmp_path / "colour.png"
+    Image.new("RGB", (8, 8)).save(path, format="EPS")
+    with pytest.raises(UserError, match="colour.png: not a readable image"):
+        read_rgb(path)
+
+
+def test_arrays_of_objects_or_of_more_numbers_than_the_file_has_are_refused(tmp_path):
+    path = tmp_path / "depth.npy"
+    np.save(path, np.array([print], dtype=object), allow_pickle=True)
+    with pytest.raises(UserError, match="not a readable array"):
+        read_depth(path)
+    np.save(path, np.ones((12, 16), np.float32))
+    path.write_bytes(path.read_bytes().replace(b"(12, 16), }  ", b"(10**9, 99), }"[:13]))
+    with pytest.raises(UserError, match="not a readable array"):
+        read_depth(path)
+    np.save(path, np.ones((0, 16), np.float32))
+    with pytest.raises(UserError, match=r"depth.npy"):
+        read_depth(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "T_WC: &a [1, 2]\nb: *a\n",  # an alias: nested, ten lines stand for a billion numbers
+        "T_WC: " + 5000 * "[",
+        "T_WC: 2020-99-99\n",
+        "T_WC: !!python/object/apply:os.system [id]\n",
+        "T_WC: [" + 16 * "[9e999], " + "]\n",
+        20_000 * "1 ",
+    ],
+)
+def test_a_hostile_pose_is_one_sentence(tmp_path, text):
+    path = tmp_path / "pose.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match="pose.yaml"):
+        read_pose(path)

@@ -1,7 +1,11 @@
 """Policies of Stable-Baselines3: loaded, checked against the environment, and at work in a cell."""
 
+import base64
 import builtins
+import json
+import zipfile
 
+import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
@@ -95,6 +99,31 @@ def test_a_file_that_is_none_is_refused(tmp_path):
     (tmp_path / "other.zip").write_text("no zip")
     with pytest.raises(UserError, match="not a policy of Stable-Baselines3"):
         load_sb3(tmp_path / "other.zip")
+
+
+def test_code_in_a_file_is_not_run(files, tmp_path):
+    """A pickle that makes a file, in place of each object of a sound policy in turn."""
+    made = tmp_path / "made"
+
+    class Code:
+        def __reduce__(self):
+            return made.touch, ()
+
+    code = base64.b64encode(cloudpickle.dumps(Code())).decode()
+    with zipfile.ZipFile(files / "PPO.zip") as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    data = json.loads(parts["data"])
+    for key in [key for key, value in data.items() if ":serialized:" in str(value)]:
+        changed = data | {key: data[key] | {":serialized:": code}}
+        path = tmp_path / f"{key}.zip"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in (parts | {"data": json.dumps(changed)}).items():
+                archive.writestr(name, content)
+        try:
+            load_sb3(path)  # what a policy needs to act is refused, anything else is left out
+        except UserError as error:
+            assert "which no policy needs" in str(error)
+        assert not made.exists()
 
 
 def test_a_policy_with_discrete_actions_is_refused(tmp_path):

@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import nn
 
-from utils.errors import UserError
+from utils.errors import UserError, one_line
 from utils.runs import write_atomic
 
 MAGIC = "robot-grasping checkpoint"
 FORMAT_VERSION = 1  # raise when the meaning of an entry changes
+LARGEST_SIZE = 100_000  # of a layer, far beyond any network of this project
 PLAIN = (bool, int, float, str, bytes, type(None), torch.Tensor)  # what `weights_only` loads
 
+Model = TypeVar("Model", bound=nn.Module)
 Generators = Mapping[str, np.random.Generator | torch.Generator]
 
 
@@ -89,6 +92,7 @@ def load_checkpoint(
     content = _unpack(data, path, map_location)
     if not isinstance(content, dict) or content.get("magic") != MAGIC:
         raise UserError(f"{path}: not a checkpoint of this project")
+    _check_entries(content, path, len(data))
     if content["format_version"] != format_version:
         raise UserError(
             f"{path}: checkpoint format version {content['format_version']}, "
@@ -104,9 +108,54 @@ def load_checkpoint(
     return content
 
 
+def build_model(make: Callable[..., Model], checkpoint: dict[str, Any], path: Path | str) -> Model:
+    """Build the model of a checkpoint's arguments, with its weights, in evaluation mode.
+
+    Nothing is allocated before the shapes have been compared: a few numbers in a file may ask for
+    any amount of memory. Raises UserError, naming `path`, where they do not fit, and for weights
+    that are not finite.
+    """
+    arguments, stored = checkpoint["model_args"], checkpoint["model"]
+    try:
+        if any(isinstance(value, int) and value > LARGEST_SIZE for value in _parts(arguments)):
+            raise ValueError(f"a size is larger than {LARGEST_SIZE}")
+        with torch.device("meta"):
+            planned = make(**arguments)
+    except (TypeError, ValueError, RuntimeError, KeyError, IndexError) as error:
+        raise UserError(
+            f"{path}: a checkpoint of another architecture: {one_line(error)}"
+        ) from None
+    _check_fit(planned, stored, path)
+    model = make(**arguments)
+    load_weights(model, checkpoint, path)
+    if not all(bool(torch.isfinite(value).all()) for value in model.state_dict().values()):
+        raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
+    return model.eval()
+
+
 def load_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path | str) -> None:
     """Load a checkpoint's weights into a model; UserError names `path` if they do not fit."""
-    own, stored = model.state_dict(), checkpoint["model"]
+    _check_fit(model, checkpoint["model"], path)
+    model.load_state_dict(checkpoint["model"])
+
+
+@contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Within this context, entries of a checkpoint that are missing or unlike what was saved raise
+    UserError, which names `path`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError) as error:
+        raise UserError(
+            f"{path}: the checkpoint's entries do not fit ({type(error).__name__}: "
+            f"{one_line(error)}); start anew or from another checkpoint"
+        ) from error
+
+
+def _check_fit(model: nn.Module, stored: dict[str, torch.Tensor], path: Path | str) -> None:
+    own = model.state_dict()
     wrong = sorted(own.keys() ^ stored.keys())
     wrong += sorted(k for k in own.keys() & stored.keys() if own[k].shape != stored[k].shape)
     if wrong:
@@ -114,7 +163,6 @@ def load_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path | str)
             f"{path}: a checkpoint of another architecture: {len(wrong)} tensors do not fit, "
             f"the first is {wrong[0]}"
         )
-    model.load_state_dict(stored)
 
 
 def rng_states(generators: Generators) -> dict[str, Any]:
@@ -150,9 +198,11 @@ def _unpack(data: bytes, path: Path, map_location: str | torch.device) -> Any:
         raise UserError(f"{path}: not a checkpoint of this project")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            damaged = archive.testzip()
-    except (zipfile.BadZipFile, EOFError, ValueError) as error:
-        damaged = str(error)
+            # torch.save compresses nothing; what is compressed may have any size in memory.
+            packed = any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist())
+            damaged = "it is compressed" if packed else archive.testzip()
+    except Exception as error:  # zipfile raises errors of many kinds for damaged archives
+        damaged = one_line(error) or type(error).__name__
     if damaged is not None:
         raise UserError(f"{path}: the checkpoint is truncated or damaged ({damaged})")
     try:
@@ -161,6 +211,50 @@ def _unpack(data: bytes, path: Path, map_location: str | torch.device) -> Any:
         raise UserError(
             f"{path}: not a checkpoint of this project ({type(error).__name__})"
         ) from None
+
+
+_ENTRIES: dict[str, type | tuple[type, ...]] = {
+    "format_version": int,
+    "kind": str,
+    "model_args": dict,
+    "model": dict,
+    "optimizer": (dict, type(None)),
+    "scheduler": (dict, type(None)),
+    "step": int,
+    "rng": dict,
+    "config": dict,
+    "extra": dict,
+}
+
+
+def _check_entries(content: dict[str, Any], path: Path, size: int) -> None:
+    """Raise UserError for entries that `save_checkpoint` would not have written, and for a tensor
+    that is larger than the whole file of `size` bytes: it repeats the same numbers."""
+    for name, kind in _ENTRIES.items():
+        if not isinstance(content.get(name), kind):
+            raise UserError(f"{path}: not a checkpoint of this project, its {name} is missing")
+    weights = content["model"].items()
+    sound = all(isinstance(k, str) and isinstance(v, torch.Tensor) for k, v in weights)
+    try:
+        for count, part in enumerate(_parts(content)):
+            if isinstance(part, torch.Tensor) and part.numel() * part.element_size() > size:
+                sound = False
+            if not sound or count > size:  # no part takes less than a byte, unless it is repeated
+                raise UserError(f"{path}: not a checkpoint of this project, its parts do not fit")
+    except RecursionError:
+        raise UserError(f"{path}: not a checkpoint of this project, it has no end") from None
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    """A value and all that is nested in it, the keys of mappings included."""
+    yield value
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            yield from _parts(key)
+            yield from _parts(entry)
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for entry in value:
+            yield from _parts(entry)
 
 
 def _differences(found: dict[str, Any], expected: dict[str, Any]) -> str:

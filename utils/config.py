@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +40,7 @@ from utils.config_schema import (
 )
 from utils.config_types import RandomizationConfig, Section
 from utils.errors import UserError, did_you_mean, one_line
+from utils.plugins import code_named_in
 
 __all__ = [
     "DEFAULTS",
@@ -65,9 +66,17 @@ __all__ = [
     "changed_keys",
     "dump_config",
     "load_config",
+    "load_foreign",
+    "load_yaml",
+    "read_config",
+    "values_of",
     "with_settings",
 ]
 
+LARGEST_FILE = 1_000_000  # bytes of a config
+# What PyYAML raises, besides its own errors: for dates and numbers that do not exist or have
+# thousands of digits, and for lists in lists without end.
+YAML_ERRORS = (yaml.YAMLError, ValueError, OverflowError, RecursionError)
 DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"
 
 # Old dotted keys and sections, and their new names.
@@ -82,6 +91,9 @@ RENAMED_KEYS = {
 
 # Keys of where a run computes, which change no result.
 COMPUTE_KEYS = ("compute.scheduler", "compute.timeout")
+
+# Keys that a file of data, such as a checkpoint, does not set: where to compute and to write.
+FOREIGN_KEYS = (*COMPUTE_KEYS, "cache_dir")
 
 # Removed dotted keys and sections, and what to do instead.
 REMOVED_KEYS = {
@@ -116,13 +128,33 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     """
     layers = [Layer(str(DEFAULTS), _defaults())]
     if path is not None:
-        layers.append(Layer(str(path), _read_yaml(Path(path))))
+        layers.append(Layer(str(path), read_config(Path(path))))
     layers += [Layer("command line", _parse_override(text)) for text in overrides]
-    merged: dict[str, Any] = {}
-    for layer in layers:
-        merged = _merge(merged, layer.values)
     try:
-        return Config.model_validate(merged)
+        return Config.model_validate(_merged(layer.values for layer in layers))
+    except ValidationError as error:
+        raise ConfigError(explain(error, layers)) from error
+
+
+def load_foreign(stored: Mapping[str, Any], source: str, overrides: Sequence[str] = ()) -> Config:
+    """The config that a file of data brings, such as a checkpoint, with overrides laid over it.
+
+    stored: plain data under the keys of this version. source: the file. Such a file may come from
+    anywhere, so that it says neither where to compute and write (FOREIGN_KEYS) nor what code to
+    run: the overrides have to name that. Raises ConfigError.
+    """
+    given = values_of(overrides)
+    kept = _without(stored, FOREIGN_KEYS)
+    named = {name for _, name in code_named_in(given)}
+    for key, name in code_named_in(_merge(kept, given)):
+        if name not in named:
+            raise ConfigError(
+                f"{source}: names code to run, {key}: {name!r}, which no file of data may do; if "
+                f"you trust it, name it yourself: {key}={name}"
+            )
+    layers = [Layer(str(DEFAULTS), _defaults()), Layer(source, kept), Layer("command line", given)]
+    try:
+        return Config.model_validate(_merged(layer.values for layer in layers))
     except ValidationError as error:
         raise ConfigError(explain(error, layers)) from error
 
@@ -165,6 +197,17 @@ def with_current_keys(stored: Mapping[str, Any]) -> dict[str, Any]:
     return current
 
 
+def values_of(overrides: Sequence[str]) -> dict[str, Any]:
+    """The nested values of dotted assignments. Raises ConfigError."""
+    return _merged(_parse_override(text) for text in overrides)
+
+
+def load_yaml(text: str) -> Any:
+    """The plain data of a YAML text. Raises one of YAML_ERRORS, also for aliases: with these, a few
+    lines stand for any amount of data."""
+    return yaml.load(text, _Loader)  # a SafeLoader
+
+
 def dump_config(config: Config) -> str:
     """The config as YAML that `load_config` reads back to an equal object."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
@@ -184,11 +227,24 @@ def changed_keys(config: Config) -> list[str]:
 
 
 class _Loader(yaml.SafeLoader):
-    """yaml.safe_load's loader, which also reads 3e-4 as a number and refuses repeated keys."""
+    """yaml.safe_load's loader, which also reads 3e-4 as a number, and refuses repeated keys and
+    aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(
+                None, None, f"an alias (*{event.anchor}) is not allowed", event.start_mark
+            )
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen: set[str] = set()
         for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    None, None, "a key is no text", key.start_mark
+                )
             if key.value in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key.value!r} stands twice", key.start_mark
@@ -205,15 +261,20 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> dict[str, Any]:
+    """The plain data of a config file, whose keys are not checked. Raises ConfigError."""
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
+        if path.stat().st_size > LARGEST_FILE:
+            raise ConfigError(f"{path}: has more than {LARGEST_FILE} bytes, this is no config file")
+        values = load_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.y*ml")])
         raise ConfigError(f"{path}: no such config file{near or '; check the path'}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot read this config file: {error}") from error
-    except yaml.YAMLError as error:
+    except ConfigError:
+        raise
+    except YAML_ERRORS as error:
         raise ConfigError(f"{path}: not valid YAML: {one_line(error)}") from error
     if values is None:  # an empty file changes nothing
         return {}
@@ -228,7 +289,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 @cache
 def _defaults() -> dict[str, Any]:
     """The values of `DEFAULTS`, read once, because that takes 50 ms; nobody changes them."""
-    return _read_yaml(DEFAULTS)
+    return read_config(DEFAULTS)
 
 
 def _parse_override(text: str) -> dict[str, Any]:
@@ -244,10 +305,10 @@ def _parse_override(text: str) -> dict[str, Any]:
         raise ConfigError(unknown_key(key, "command line"))
     types = {part.get("type") for part in alternatives(schema)}
     try:
-        value = yaml.load(raw, _Loader)
+        value = load_yaml(raw)
         if "array" in types and not isinstance(value, list | dict | None):
-            value = yaml.load(f"[{raw}]", _Loader)
-    except yaml.YAMLError as error:
+            value = load_yaml(f"[{raw}]")
+    except YAML_ERRORS as error:
         raise ConfigError(
             f"{key}: cannot read {raw!r} as YAML: {one_line(error)}; expected {allowed(schema)}"
         ) from error
@@ -268,6 +329,25 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
             value = _merge(below, value)
         merged[key] = value
     return merged
+
+
+def _merged(values: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    merged: dict[str, Any] = {}
+    for top in values:
+        merged = _merge(merged, top)
+    return merged
+
+
+def _without(values: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """`values` without some dotted keys of at most two parts."""
+    kept = {name: dict(v) if isinstance(v, dict) else v for name, v in values.items()}
+    for key in keys:
+        section, _, leaf = key.partition(".")
+        if not leaf:
+            kept.pop(section, None)
+        elif isinstance(kept.get(section), dict):
+            kept[section].pop(leaf, None)
+    return kept
 
 
 # --- What is wrong with a config -------------------------------------------------------------

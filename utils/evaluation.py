@@ -137,6 +137,17 @@ def planned_rounds(config: Config) -> int:
     return plan.rounds * len(policies_of(config)) * len(plan.scenarios) * len(plan.object_sets)
 
 
+def check_recorded(rounds: Sequence[RoundRecord], config: Config, source: str) -> None:
+    """Raise UserError for a round on a scene that this config does not play."""
+    plan = config.evaluate
+    for record in rounds:
+        if record.objects not in plan.object_sets or record.scenario not in plan.scenarios:
+            raise UserError(
+                f"{source}: holds a round of {record.objects} in the scenario {record.scenario}, "
+                "which its config does not play; it was changed by hand, start a new run"
+            )
+
+
 def interruption(rounds_done: int, config: Config) -> str | None:
     """'interrupted: N of M rounds', or None for a complete evaluation."""
     planned = planned_rounds(config)
@@ -186,6 +197,7 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
     """
     journal = run / "rounds.jsonl"
     outcome = Outcome(rounds=read_rounds(journal))
+    check_recorded(outcome.rounds, config, str(journal))
     todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:
@@ -220,7 +232,17 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
 def replay(
     sample: Sample, config: Config, work: Callable[[Config, Task], TaskResult]
 ) -> list[RoundRecord]:
-    """Play the rounds of a sample again; `config` is made of the sample's overrides."""
+    """Play the rounds of a sample again; `config` is made of the sample's overrides.
+
+    Raises UserError for a round that is not of this config: its policy would be loaded unchecked.
+    """
+    check_recorded(sample.rounds, config, "--replay")
+    for record in sample.rounds:
+        if (record.planner, record.controller) not in policies_of(config):
+            raise UserError(
+                f"--replay: the sample holds a round of {record.policy}, which its own config does "
+                "not score; it was changed by hand, choose another"
+            )
     todo = [
         Task(record.objects, record.scenario, record.seed, ((record.planner, record.controller),))
         for record in sample.rounds

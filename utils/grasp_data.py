@@ -20,7 +20,7 @@ import torch
 from torch.utils.data import Dataset
 
 from utils.augmentation import LabelledImage
-from utils.errors import UserError
+from utils.errors import UserError, one_line
 from utils.grasp_labels import GraspLabels, Trial
 from utils.runs import write_atomic
 from utils.transforms import RGBDFrame, project
@@ -72,20 +72,28 @@ def write_shard(
         for number, thing in enumerate(f.frame.truth.objects):
             row[number] = thing.centre_of_mass
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
+    tables = {
+        "K": np.stack([f.frame.K for f in frames]),
+        "T_WC": np.stack([f.frame.T_WC for f in frames]),
+        "centres": centres,
+        "trials": np.array([(t.quality, t.weight, t.success) for t in trials], float).reshape(
+            -1, 3
+        ),
+    }
+    # Checksums of all numbers, and by this version of the format of all that describes them.
+    with h5py.File(buffer, "w", libver=("v110", "v110")) as file:
         file.attrs["format_version"] = FORMAT_VERSION
         for name, values in stacked.items():
             # One chunk a frame: frames are read singly and at random.
             data = file.create_dataset(
-                name, data=values, chunks=(1, *values.shape[1:]), compression="lzf", shuffle=True
-            )
+                name, data=values, chunks=(1, *values.shape[1:]), compression="lzf", shuffle=True,
+                fletcher32=True,
+            )  # fmt: skip
             if name in units:
                 data.attrs["unit"] = units[name]
-        file["K"] = np.stack([f.frame.K for f in frames])
-        file["T_WC"] = np.stack([f.frame.T_WC for f in frames])
-        file["centres"] = centres
+        for name, values in tables.items():
+            file.create_dataset(name, data=values, chunks=True, fletcher32=True)
         file["scene"] = [f.scene for f in frames]
-        file["trials"] = np.array([(t.quality, t.weight, t.success) for t in trials]).reshape(-1, 3)
     write_atomic(path, buffer.getvalue())
 
 
@@ -133,6 +141,12 @@ class SimulatedDataset(Dataset):
     def __getitem__(self, index: int) -> LabelledImage:
         if not 0 <= index < len(self):
             raise IndexError(index)
+        try:
+            return self._read(index)
+        except (OSError, KeyError, RuntimeError) as error:  # HDF5's, for what was damaged since
+            raise _unreadable(self.paths[self._place[index][0]], error) from error
+
+    def _read(self, index: int) -> LabelledImage:
         file, i = self._at(index)
         return LabelledImage(
             rgb=torch.from_numpy(np.moveaxis(file["rgb"][i], -1, 0).copy()),
@@ -165,20 +179,64 @@ class SimulatedDataset(Dataset):
         return self.__dict__ | {"_files": {}}
 
 
+# Numbers of dimensions and kinds of numbers of what a shard holds.
+_CONTENT = {
+    "rgb": (4, "u1"), "depth": (3, "u2"), "quality": (4, "u1"), "width": (4, "u1"),
+    "valid": (3, "b1"), "instance": (3, "i1"), "K": (3, "f8"), "T_WC": (3, "f8"),
+    "centres": (3, "f8"), "scene": (1, "O"), "trials": (2, "f8"),
+}  # fmt: skip
+_IMAGES = ("rgb", "depth", "quality", "width", "valid", "instance")
+_LARGEST_SIDE = 4096  # pixels, as of the config's cameras
+
+
 def _open(path: Path) -> h5py.File:
     try:
         file = h5py.File(path, "r")
         version = file.attrs["format_version"]
-    except (OSError, KeyError) as error:
-        # Only the operating system sets a number: the file's content is not to blame.
-        if getattr(error, "errno", None) is not None:
-            raise UserError(f"{path}: cannot be read ({os.strerror(error.errno)})") from error
-        raise UserError(
-            f"{path}: not a readable data shard ({error}); delete it, and it is made again"
-        ) from error
+        if version == FORMAT_VERSION:
+            _check_content(file, path.stat().st_size)
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise _unreadable(path, error) from error
     if version != FORMAT_VERSION:
         raise UserError(
             f"{path}: data format version {version}, this program reads {FORMAT_VERSION}; "
             "delete the data set's folder, and it is made again"
         )
     return file
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    # Only the operating system sets a number: the file's content is not to blame.
+    if getattr(error, "errno", None) is not None:
+        return UserError(f"{path}: cannot be read ({os.strerror(error.errno)})")
+    return UserError(
+        f"{path}: not a readable data shard ({one_line(error)}); delete it, and it is made again"
+    )
+
+
+def _check_content(file: h5py.File, size: int) -> None:
+    """Raise ValueError for entries that `write_shard` would not have written: of other shapes or
+    types, larger than a file of `size` bytes can hold, or in other files."""
+    frames, *sides = file["depth"].shape
+    bins = file["quality"].shape[1]
+    if not (0 < frames <= size and len(sides) == 2 and 0 < max(*sides, bins) <= _LARGEST_SIDE):
+        raise ValueError(f"depth has the shape {file['depth'].shape}")
+    shapes = dict.fromkeys(_IMAGES, (frames, *sides)) | {
+        "rgb": (frames, *sides, 3), "quality": (frames, bins, *sides),
+        "width": (frames, bins, *sides), "K": (frames, 3, 3), "T_WC": (frames, 4, 4),
+        "scene": (frames,),
+    }  # fmt: skip
+    for name, (dimensions, kind) in _CONTENT.items():
+        here = isinstance(file.get(name, getlink=True), h5py.HardLink)
+        data = file[name]
+        if not here or not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
+            raise ValueError(f"{name} is in another file")
+        wrong = data.ndim != dimensions or data.dtype != kind
+        if wrong or data.shape != shapes.get(name, data.shape):
+            raise ValueError(f"{name} is {data.dtype} of the shape {data.shape}")
+        if name not in _IMAGES and data.nbytes > size:
+            raise ValueError(f"{name} is larger than the file")
+    if file["centres"].shape[::2] != (frames, 3) or file["trials"].shape[1] != 3:
+        raise ValueError("centres or trials have other shapes")
+    if not 0 < file["width"].attrs["unit"] < 1:
+        raise ValueError("width has no unit")

@@ -161,9 +161,9 @@ def prediction_panel(
 def is_prediction_panel(path) -> bool:
     """Whether the file is a picture that `prediction_panel` made."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=["PNG"]) as image:
             return image.info.get(MARK[0]) == MARK[1]
-    except (OSError, SyntaxError, ValueError):
+    except Exception:  # Pillow raises errors of many kinds for files of others
         return False
 
 

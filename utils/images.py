@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +19,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from utils.config import YAML_ERRORS, load_yaml
 from utils.depth import nearest_values
 from utils.errors import UserError
 from utils.geometry import Workspace
@@ -104,17 +106,34 @@ MAX_PIXEL_ASPECT = 1.5  # fx / fy: real sensors stay well below; swapped numbers
 RIGID_TOLERANCE = 1e-3  # of a rotation's orthonormality: poses are often printed with 4 digits
 
 
+LARGEST_IMAGE = 50_000_000  # pixels: a small file may stand for any number of them
+# Of what Pillow reads, formats that hold pixels alone: some run other programs, or refer to files.
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
+
+
 def open_image(path: Path) -> Image.Image:
-    """The decoded image; UserError if it is missing, unreadable or cut short."""
+    """The decoded image; UserError if it is missing, unreadable, cut short, empty or too large."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
+            _check_size(path, image.size)
             image.load()
             return image.copy()
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    # Pillow raises any of these for damaged files.
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        raise UserError(f"{path}: not a readable image, or cut short ({error})") from error
+    except UserError:
+        raise
+    except Exception as error:  # Pillow's readers raise errors of many kinds for damaged files
+        raise UserError(
+            f"{path}: not a readable image ({', '.join(IMAGE_FORMATS)}), or cut short ({error})"
+        ) from error
+
+
+def _check_size(path: Path, sides: Sequence[int]) -> None:
+    count = math.prod(sides)
+    if not 0 < count <= LARGEST_IMAGE:
+        raise UserError(
+            f"{path}: {' x '.join(map(str, sides))} pixels, expected 1 to {LARGEST_IMAGE:,}"
+        )
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -186,14 +205,15 @@ def _intrinsics_in(path: Path) -> dict[str, float]:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     missing = [key for key in INTRINSICS if not isinstance(values, dict) or key not in values]
     if missing:
         raise UserError(f"{path}: has no {', '.join(missing)}; expected {', '.join(INTRINSICS)}")
     for key in (*INTRINSICS, "width", "height"):
-        if not isinstance(values.get(key, 0), int | float):
-            raise UserError(f"{path}: {key} is {values[key]!r}, expected a number")
+        value = values.get(key, 0)
+        if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
+            raise UserError(f"{path}: {key} is {value!r:.40}, expected a number")
     return values
 
 
@@ -254,14 +274,17 @@ def read_pose(path: Path) -> np.ndarray:
 
 def _load_array(path: Path) -> np.ndarray:
     try:
-        values = np.load(path, allow_pickle=False)  # a pickled object could run code
+        # Mapped, because a header may promise more numbers than the file has and memory holds; and
+        # without pickles, because a pickled object could run code.
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # numpy's reader raises errors of many kinds for damaged files
         raise UserError(f"{path}: not a readable array, or cut short ({error})") from error
     if not isinstance(values, np.ndarray):  # an .npz under a wrong name
         raise UserError(f"{path}: holds several arrays, expected one as np.save writes it")
-    return values
+    _check_size(path, values.shape)
+    return np.array(values)
 
 
 def _pose_numbers(path: Path) -> np.ndarray:
@@ -269,9 +292,11 @@ def _pose_numbers(path: Path) -> np.ndarray:
         suffix = path.suffix.lower()
         if suffix == ".npy":
             return np.asarray(_load_array(path), dtype=float)
+        if path.stat().st_size > LARGEST_POSE:
+            raise UserError(f"{path}: has more than {LARGEST_POSE} bytes, this is no camera pose")
         text = path.read_text(encoding="utf-8")
         if suffix in (".json", ".yaml", ".yml"):
-            content: Any = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
+            content: Any = json.loads(text) if suffix == ".json" else load_yaml(text)
             if isinstance(content, dict):
                 if "T_WC" not in content:
                     raise UserError(f"{path}: has no entry T_WC")
@@ -284,8 +309,11 @@ def _pose_numbers(path: Path) -> np.ndarray:
     except UserError:
         raise
     # A ValueError is also what JSON and UTF-8 raise.
-    except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
+    except (OSError, TypeError, *YAML_ERRORS) as error:
         raise UserError(f"{path}: cannot be read as a 4x4 camera pose ({error})") from error
+
+
+LARGEST_POSE = 10_000  # bytes of a text
 
 
 def _listed(numbers: Sequence[float]) -> str:

@@ -3,7 +3,9 @@
 Gymnasium names its environments in the same way. A planner, an object set, a depth noise, a reward
 or a term of one that is given as `module:name` needs no entry in a registry. The module must be
 importable: from the folder that a script is started in (`utils.runs.run_script`), from
-`PYTHONPATH` or as an installed package. This module knows nothing about what is loaded.
+`PYTHONPATH` or as an installed package. Only a config or a command line may name one: what a
+checkpoint or another file of data names is not imported (`utils.config.load_foreign`). This module
+knows nothing about what is loaded.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import importlib
 import re
 import traceback
+from collections.abc import Iterator
 from typing import Any
 
 from utils.errors import UserError, did_you_mean, one_line
@@ -29,6 +32,29 @@ def loaded_modules() -> list[str]:
 def is_import_path(name: str) -> bool:
     """Whether `name` has the form `module:name`; it need not exist. `ppo:model.pt` has it too."""
     return re.fullmatch(IMPORT_PATH, name) is not None
+
+
+def names_code(key: str, name: str) -> bool:
+    """Whether a text at a dotted key of a config would run code that is named by it: an import path
+    (a Gymnasium id `MODULE:ID` is one), or a policy that is unpickled."""
+    if key == "rl.env_id":
+        return ":" in name
+    return name.startswith("sb3:") or is_import_path(name) and not name.startswith("ppo:")
+
+
+def code_named_in(values: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted key and text of all that would run code in the plain data of a config; the terms of a
+    reward are keys of a mapping."""
+    if isinstance(values, dict):
+        for name, value in values.items():
+            if isinstance(name, str) and names_code(key, name):
+                yield key, name
+            yield from code_named_in(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(values, list | tuple):
+        for value in values:
+            yield from code_named_in(value, key)
+    elif isinstance(values, str) and names_code(key, values):
+        yield key, values
 
 
 def load_plugin(path: str, what: str, must_be_callable: bool = True) -> Any:

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from utils.config_types import Change, changed
 from utils.depth import KinectNoise
 from utils.errors import UserError
+from utils.images import open_image
 from utils.transforms import deproject, known_depth
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
@@ -187,16 +188,10 @@ def random_colour(rng: np.random.Generator) -> np.ndarray:
 @lru_cache(maxsize=256)
 def _read_picture(file: str) -> np.ndarray:
     """(H, W, 3) RGB factors of mean 1. Raises UserError."""
-    try:
-        data = np.fromfile(file, np.uint8)
-    except OSError as error:
-        raise UserError(f"texture {file}: cannot be read ({error.strerror})") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if picture is None:
-        raise UserError(f"texture {file} is not a picture that OpenCV can read")
+    picture = np.array(open_image(Path(file)).convert("RGB"))
     shrink = min(1.0, _LARGEST_PICTURE / max(picture.shape[:2]))
     size = [max(1, round(side * shrink)) for side in picture.shape[1::-1]]
-    picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+    picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     factors = picture / max(float(picture.mean()), 1.0)
     factors.flags.writeable = False
     return factors

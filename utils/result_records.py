@@ -7,7 +7,10 @@ packages, so that anyone can play the same rounds again (`python evaluate.py --r
 
 from __future__ import annotations
 
+import errno
 import json
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +18,7 @@ from typing import Any
 
 from utils.config import changed_keys, load_config
 from utils.errors import UserError
-from utils.runs import write_atomic
+from utils.runs import cannot_write, write_atomic
 from utils.transforms import ImageGrasp
 
 SUCCESS = "success"
@@ -135,9 +138,18 @@ class RoundRecord:
 
 
 def append_round(path: Path, record: RoundRecord) -> None:
-    """Add a finished round to the journal."""
-    with path.open("a", encoding="utf-8") as journal:
-        journal.write(_line(record))
+    """Add a finished round to the journal, or nothing. Raises UserError where it cannot be written,
+    as on a full disk."""
+    line = _line(record).encode()
+    try:
+        with path.open("ab", buffering=0) as journal:
+            end = journal.tell()
+            written = journal.write(line)
+            if written < len(line):  # the disk is full: the next write would say so
+                journal.truncate(end)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def _line(record: RoundRecord) -> str:
@@ -167,18 +179,51 @@ def _parse(path: Path, lines: Sequence[str], first_line: int = 1) -> list[RoundR
     rounds = []
     for number, line in enumerate(lines, start=first_line):
         try:
-            content = json.loads(line)
-            attempts = tuple(
-                AttemptRecord(**(a | {"grasp": a["grasp"] and ImageGrasp(**a["grasp"])}))
-                for a in content.pop("attempts")
-            )
-            rounds.append(RoundRecord(**content, attempts=attempts))
-        except (ValueError, TypeError, KeyError) as error:
+            rounds.append(_round(json.loads(line, parse_constant=_no_number)))
+        # Missing entries and entries of other types are any of these; nesting without end is one.
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise UserError(
                 f"{path}, line {number}: not a recorded round ({error}); delete the line or start "
                 "a new run without --resume"
             ) from error
     return rounds
+
+
+def _round(content: dict[str, Any]) -> RoundRecord:
+    attempts = content.pop("attempts")
+    _check_types(content, _ROUND_TYPES)
+    for attempt in attempts:
+        _check_types(attempt, _ATTEMPT_TYPES)
+        grasp = attempt["grasp"]
+        if grasp is not None:
+            numbers = [*grasp["pixel"], *(grasp[name] for name in _GRASP_NUMBERS)]
+            if len(numbers) != 2 + len(_GRASP_NUMBERS) or not all(map(_is_number, numbers)):
+                raise ValueError("a grasp does not consist of numbers")
+            attempt["grasp"] = ImageGrasp(**grasp)
+    return RoundRecord(**content, attempts=tuple(AttemptRecord(**one) for one in attempts))
+
+
+_ROUND_TYPES = {
+    "policy": str, "scenario": str, "objects": str, "seed": int, "objects_total": int,
+    "objects_cleared": int, "ended": str, "controller": str,
+}  # fmt: skip
+_ATTEMPT_TYPES = {"success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float}
+_GRASP_NUMBERS = ("angle", "depth", "width", "quality")
+
+
+def _check_types(content: dict[str, Any], types: dict[str, type]) -> None:
+    for name, kind in types.items():
+        value = content[name] if name != "controller" else content.get(name, OPEN_LOOP)
+        if not (_is_number(value) if kind is float else type(value) is kind):
+            raise ValueError(f"{name} is {value!r:.40}")
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and abs(value) < math.inf
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no number")
 
 
 # --- Samples: the first rounds of a run, to be checked by others --------------------------------
@@ -219,9 +264,11 @@ def read_sample(path: Path) -> Sample:
     try:
         first, *lines = path.read_text(encoding="utf-8").splitlines()
         origin = Sample(**json.loads(first), rounds=[])
+        if not all(isinstance(one, str) for one in [*origin.overrides, *origin.versions]):
+            raise ValueError("its overrides and versions are no texts")
     except OSError as error:
         raise UserError(f"{path}: cannot read this sample: {error.strerror}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise UserError(
             f"{path}: not a sample of rounds ({error}); choose a file of docs/results"
         ) from error

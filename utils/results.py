@@ -15,8 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import yaml
-
+from utils.config import read_config
 from utils.errors import UserError
 from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, read_rounds
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
@@ -273,7 +272,10 @@ def _read_run(folder: Path) -> tuple[dict[str, Any], list[RoundRecord]]:
             f"--compare {folder}: not the folder of an evaluation; choose one with config.yaml and "
             "rounds.jsonl, such as runs/evaluate/20250131-120000"
         )
-    return yaml.safe_load(config.read_text(encoding="utf-8")), read_rounds(journal)
+    plain = read_config(config)
+    if type(plain.get("seed")) is not int:
+        raise UserError(f"{config}: holds no seed, so that it is not the config of a run")
+    return plain, read_rounds(journal)
 
 
 def _scenes(rounds: Iterable[RoundRecord]) -> set[tuple[str, str, int]]:

@@ -9,11 +9,13 @@ nothing of what a run computes.
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import json
 import os
 import platform
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -37,6 +39,11 @@ PACKAGES = (
     "numpy", "scipy", "torch", "torchvision", "pybullet", "mujoco", "gymnasium", "pydantic",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
+# What a full disk, a folder that may not be written and a damaged disk give.
+DISK_ERRORS = (
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO
+)  # fmt: skip
 
 
 class GitState(NamedTuple):
@@ -89,39 +96,72 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
 
     The current folder becomes importable for plug-ins (`utils.plugins`), here and in the processes
     that the script starts: by itself Python adds the script's own folder only.
-    A user error becomes one line on stderr and status 2; Ctrl-C ends with status 130.
+    A user error becomes one line on stderr and status 2, and so do a disk that is full, a folder
+    that cannot be written and memory that does not suffice. Ctrl-C ends with status 130; SIGTERM,
+    by which schedulers end a job, does the same as Ctrl-C and ends with status 143.
     Any other exception is a bug and keeps its traceback.
     """
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
+    terminated = []
+
+    def terminate(*_: object) -> None:
+        terminated.append(True)
+        signal.raise_signal(signal.SIGINT)  # whoever handles Ctrl-C now
+
+    before = signal.signal(signal.SIGTERM, terminate)
     try:
         status = main(sys.argv[1:])
     except UserError as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        status = 2
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        print(f"error: {one_line(error)}; make room or choose another folder", file=sys.stderr)
+        status = 2
+    except MemoryError as error:
+        print(f"error: out of memory ({one_line(error)}); use fewer workers", file=sys.stderr)
+        status = 2
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
-    sys.exit(status or 0)
+        print("terminated" if terminated else "interrupted", file=sys.stderr)
+        status = INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    sys.exit(TERMINATED if terminated and status == INTERRUPTED else status or 0)
 
 
 # --- Files ------------------------------------------------------------------------------------
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing: into a temporary neighbour, then renamed into place."""
+    """Write a whole file or nothing: into a temporary neighbour, then renamed into place.
+
+    Raises UserError where that cannot be done, as on a full disk or in a read-only folder.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     data = content.encode() if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """The error for a file that the operating system does not let us write."""
+    return UserError(
+        f"{path}: cannot be written ({error.strerror or error}); make room or choose a folder that "
+        "can be written, what was there before is unchanged"
+    )
 
 
 def write_json_atomic(path: Path, content: Mapping) -> None:

@@ -1,0 +1,52 @@
+"""Damaged files of every kind: each gives something or one sentence, and changes no other file."""
+
+from __future__ import annotations
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from benchmarks.soak_files import KINDS, damaged, problem
+from utils.errors import UserError
+
+BY_NAME = {kind.name: kind for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A sound file of each kind, in a folder of its own."""
+    paths = {}
+    for kind in KINDS:
+        paths[kind.name] = tmp_path_factory.mktemp(kind.name.replace(".", "_")) / kind.name
+        kind.write(paths[kind.name])
+    return paths
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_sound_file_is_read(sound, name):
+    BY_NAME[name].read(sound[name])
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+@hypothesis.settings(
+    max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
+@hypothesis.given(seed=st.integers(0, 2**32 - 1))
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_file_is_one_sentence_or_works(sound, name, seed):
+    content = sound[name].read_bytes()
+    path = sound[name].with_name(f"damaged-{name}")
+    path.write_bytes(damaged(content, np.random.default_rng(seed)))
+    assert problem(BY_NAME[name], path) is None
+    assert sound[name].read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["colour.png", "depth.npy", "shard.h5", "network.pt", "parts.npz"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
+def test_a_file_that_is_cut_short_is_refused(sound, name, share):
+    content = sound[name].read_bytes()
+    path = sound[name].with_name(f"cut-{name}")
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(UserError):
+        BY_NAME[name].read(path)
