@@ -25,6 +25,7 @@ from typing import Any
 
 from benchmarks.soak_arm import soak_actions, soak_memory
 from benchmarks.soak_files import soak_files
+from benchmarks.soak_processes import soak_disk, soak_stopped, soak_workers
 from benchmarks.soak_tally import Tally
 from envs.simulators import SIMULATORS
 from utils.distributed import stop_on_interrupt
@@ -54,6 +55,11 @@ PARTS = {
     for simulator in INSTALLED
 } | {
     "files": Part("damaged files of every kind that is read", 10, soak_files),
+    "disk": Part("full disks and read-only folders; has to run as root", 2, soak_disk),
+    "workers": Part(
+        "workers that hang, freeze or are slow, here and on a cluster", 5, soak_workers
+    ),
+    "stopped": Part("scripts that are stopped by SIGTERM and SIGKILL", 30, soak_stopped),
 }
 
 

@@ -77,6 +77,7 @@ class LimitWatch:
 
     position, speed, box: the farthest that an arm was beyond a limit in rad, rad/s and m, negative
     within. acceleration: the largest, as a multiple of the joint's limit. steps: physics steps.
+    forces: newtons with which the arm pressed on something whenever it was beyond a limit.
     """
 
     def __init__(self, config: Config):
@@ -87,6 +88,7 @@ class LimitWatch:
         self._states: list[list[float]] = []
         self.position = self.speed = self.box = -np.inf
         self.acceleration, self.steps = 0.0, 0
+        self.forces: list[float] = []
 
     def follow(self, cell: Cell) -> None:
         """Watch a cell's arm from now on."""
@@ -120,6 +122,12 @@ class LimitWatch:
             f"a joint's limit, {1e3 * max(self.box, 0):.1f} mm beyond the box, "
             f"{max(self.speed, 0):.2g} rad/s beyond a joint's speed limit; joint accelerations up "
             f"to {self.acceleration:.0f} times the limit of planned motions"
+            + (
+                f"; beyond a limit in {len(self.forces)} actions, in which it pressed on table, "
+                f"bin or object with {min(self.forces):.0f} N or more"
+                if self.forces
+                else ""
+            )
         )
 
 
@@ -156,7 +164,10 @@ def hostile_episodes(
             watch.follow(env.cell)
         _, _, terminated, truncated, info = env.step(action)
         ended = terminated or truncated
-        tally.add(watch.held() and info["reason"] != "physics")
+        held = watch.held()
+        if not held:
+            watch.forces.append(env.cell.robot.contact_force())
+        tally.add(held and info["reason"] != "physics")
     env.close()
 
 

@@ -134,6 +134,32 @@ def test_a_call_that_hangs_is_repeated(compute, tmp_path):
         assert sorted(completed(workers, function, range(2))) == [0, 1]
 
 
+def test_slow_calls_within_their_time_are_left_alone(compute):
+    hurried = compute.model_copy(update={"timeout": 4.0})
+    with open_executor(hurried, 2) as workers:
+        assert sorted(completed(workers, nap, [1.0, 1.5, 0.0])) == [0.0, 1.0, 1.5]
+
+
+def nap(seconds):
+    time.sleep(seconds)
+    return seconds
+
+
+def freeze():
+    """Stop the whole process, its timers included, as a machine that swaps does."""
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGSTOP")
+def test_a_process_that_freezes_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(executor, "FREEZE_SECONDS", 3.0)
+    compute = load_config(None, ["compute.timeout=3"]).compute
+    with open_executor(compute, 2) as workers:
+        function = partial(first_time, tmp_path, freeze)
+        assert sorted(completed(workers, function, range(3))) == [0, 1, 4]
+
+
 def test_a_call_that_ends_every_worker_is_an_error(compute):
     with (
         pytest.raises(LostWorkerError, match=r"4 worker processes in a row died.*compute\.timeout"),

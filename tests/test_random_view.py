@@ -63,7 +63,7 @@ def test_wrong_textures_are_refused(tmp_path):
     with pytest.raises(UserError, match="no picture"):
         TextureRandomizer(tmp_path)
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    with pytest.raises(UserError, match="bad.png is not a picture"):
+    with pytest.raises(UserError, match="bad.png: not a readable image"):
         TextureRandomizer(tmp_path)
     with pytest.raises(UserError, match="'marble' is unknown"):
         TextureRandomizer.make({"kind": "marble"})

@@ -44,6 +44,8 @@ from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_env
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
+FREEZE_SECONDS = 60.0  # after compute.timeout, by when a process that runs has ended itself
+KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has the latter, which ends as surely
 COUNT_SECONDS = 1.0  # between two looks at how many workers a cluster has
 WAIT_SECONDS = 60.0  # between two messages that it has none
 
@@ -136,12 +138,13 @@ def _lost(job: Job) -> LostWorkerError:
 
 class _Processes(Workers):
     """Local processes. Each stands in a pool of its own, so that one that dies is replaced alone
-    and only its call is repeated. A thread waits for each of them."""
+    and only its call is repeated. A thread waits for each of them, and ends one that is frozen as a
+    whole, which could not end itself."""
 
     def __init__(self, count: int, job: Job) -> None:
         self._count, self._job = count, job
         self._threads = ThreadPoolExecutor(count)
-        self._idle: deque[ProcessPoolExecutor] = deque()
+        self._idle: deque[_Process] = deque()
 
     def size(self) -> int:
         return self._count
@@ -154,9 +157,9 @@ class _Processes(Workers):
             try:
                 process = self._idle.pop()
             except IndexError:
-                process = _new_process()
+                process = _Process()
             try:
-                return process.submit(work, self._job, call).result()
+                return process.run(self._job, call)
             except BrokenProcessPool:
                 process.shutdown()
                 process = None
@@ -171,11 +174,24 @@ class _Processes(Workers):
             self._idle.pop().shutdown(wait)
 
 
-def _new_process() -> ProcessPoolExecutor:
+class _Process:
     """One process, which is spawned, because a forked copy of a process that runs physics or
     threads of torch may hang."""
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, mp_context=context, initializer=_begin_process)
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_process)
+        self._number = self._pool.submit(os.getpid)
+
+    def run(self, job: Job, call: Call) -> Any:
+        """The result of a call. Raises BrokenProcessPool where the process has died."""
+        future = self._pool.submit(work, job, call)
+        if not wait([future], job.seconds + FREEZE_SECONDS).done and self._number.done():
+            os.kill(self._number.result(), KILL)
+        return future.result()
+
+    def shutdown(self, wait: bool = True) -> None:
+        self._pool.shutdown(wait)
 
 
 def _begin_process() -> None:

@@ -40,6 +40,7 @@ PACKAGES = (
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
+NO_MEMORY = re.compile("can't allocate memory|CUDA out of memory")  # torch's RuntimeErrors
 # What a full disk, a folder that may not be written and a damaged disk give.
 DISK_ERRORS = (
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO
@@ -120,8 +121,10 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
             raise
         print(f"error: {one_line(error)}; make room or choose another folder", file=sys.stderr)
         status = 2
-    except MemoryError as error:
-        print(f"error: out of memory ({one_line(error)}); use fewer workers", file=sys.stderr)
+    except (MemoryError, RuntimeError) as error:
+        if not (isinstance(error, MemoryError) or NO_MEMORY.search(str(error))):
+            raise
+        print(f"error: out of memory ({one_line(error)}); ask for less at a time", file=sys.stderr)
         status = 2
     except KeyboardInterrupt:
         print("terminated" if terminated else "interrupted", file=sys.stderr)
