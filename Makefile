@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
-.PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results lock clean
+.PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results soak lock clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
 # tests/conftest.py orders the files.
@@ -65,6 +65,11 @@ bench: $(VENV)/.installed-dev
 # docs are written with WRITE=1 only: make results PARTS=clutter15 SCALE=0.5 WRITE=1
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell $(CORNELL)) $(ARGS)
+
+# Faults by the thousand: make soak PARTS=files,disk SCALE=0.1; writes docs/reliability.md.
+soak: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.soak --json docs/results/reliability.json $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
+	$(BIN)/python -m benchmarks.results --write
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }

@@ -18,7 +18,9 @@ from typing import Any
 from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
-PAGES = ("README.md", "README.zh-CN.md", "docs/results.md", "docs/scaling.md")
+PAGES = (
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/scaling.md", "docs/reliability.md",
+)  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
@@ -97,7 +99,8 @@ def with_tables(text: str, folder: Path, chinese: bool = False) -> str:
         if all(file.exists() for file in files):
             body = draw(say, *(json.loads(file.read_text()) for file in files))
         else:
-            body = f"*{say('not measured yet')}: `make results PARTS={','.join(parts)}`*"
+            make = "soak" if parts == ("reliability",) else f"results PARTS={','.join(parts)}"
+            body = f"*{say('not measured yet')}: `make {make}`*"
         return f"{match[1]}{body}\n{match[3]}"
 
     return _BLOCK.sub(block, text)
@@ -333,6 +336,22 @@ def scaling_model(say: Say, part: Figures) -> str:
     return "\n\n".join([by_workers, metrics_table(model), origin(say, part)])
 
 
+def reliability(say: Say, parts: Figures) -> str:
+    """What `benchmarks.soak` has tried; each of its parts may have been run at another commit."""
+    lines = [
+        [row["fault"], *(f"{row[key]:,}" for key in ("tried", "survived", "lost")), row["note"]]
+        for part in parts.values()
+        for row in part["rows"]
+    ]
+    origins = [
+        f"<sub>`{part['command']}`: measured at commit `{part['commit'][:10]}` ({part['date']}), "
+        f"seed {part['seed']}, {part['device']}, {part['minutes']:g} minutes</sub>"
+        for part in parts.values()
+    ]
+    header = ["fault", "tried", "survived", "lost", "note"]
+    return "\n\n".join([table(header, lines), "\\\n".join(origins)])
+
+
 # Name of a table: the parts that it needs, and what writes it.
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "planners": (("scoreboard", "clutter15"), planners),
@@ -350,6 +369,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "speed": (("speed",), speed),
     "scaling": (("scaling",), scaling),
     "scaling_model": (("scaling",), scaling_model),
+    "reliability": (("reliability",), reliability),
 }
 
 

@@ -1,6 +1,8 @@
 """Checkpoints: what is saved comes back, and every bad file is one clear error."""
 
+import io
 import pickle
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,8 +11,11 @@ from torch import nn
 
 from utils.checkpoint import (
     FORMAT_VERSION,
+    MAGIC,
+    build_model,
     load_checkpoint,
     load_weights,
+    reading,
     restore_rng,
     rng_states,
     save_checkpoint,
@@ -158,3 +163,91 @@ def test_what_could_not_be_loaded_is_not_saved_and_the_old_file_stays(tmp_path, 
     with pytest.raises(TypeError, match=r"checkpoint.extra.a\[1\]"):
         save(path, extra={"a": [0, value]})
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["c.pt"]
+
+
+# --- Hostile files --------------------------------------------------------------------------------
+
+
+def test_code_in_a_checkpoint_is_not_run(tmp_path):
+    made, path = tmp_path / "made", tmp_path / "bad.pt"
+
+    class Code:
+        def __reduce__(self):
+            return made.touch, ()
+
+    save(path)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, pickle.dumps(Code()) if name.endswith("data.pkl") else content)
+    with pytest.raises(UserError, match=r"bad.pt: not a checkpoint of this project \(Unpickling"):
+        load_checkpoint(path, "test")
+    assert not made.exists()
+
+
+def test_a_small_file_that_stands_for_much_is_refused(tmp_path):
+    path = tmp_path / "bad.pt"
+    save(path, extra={"zeros": torch.zeros(1).expand(10**6, 10**6)})
+    with pytest.raises(UserError, match="its parts do not fit"):
+        load_checkpoint(path, "test")
+    laughs = []
+    for _ in range(40):
+        laughs = [laughs, laughs]
+    content = {"magic": MAGIC, "format_version": FORMAT_VERSION, "kind": "test", "model_args": ARGS}
+    content |= {"model": {}, "optimizer": None, "scheduler": None, "step": 0, "rng": {}}
+    torch.save(content | {"config": {}, "extra": {"laughs": laughs}}, path)
+    with pytest.raises(UserError, match="its parts do not fit"):
+        load_checkpoint(path, "test")
+    endless = {}
+    endless["again"] = endless
+    torch.save(content | {"config": endless, "extra": {}}, path)
+    with pytest.raises(UserError, match="not a checkpoint of this project"):
+        load_checkpoint(path, "test")
+    torch.save(content | {"config": {}, "extra": {}}, path)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive, zipfile.ZipFile(path, "w", 8) as packed:
+        for name in archive.namelist():
+            packed.writestr(name, archive.read(name))
+    with pytest.raises(UserError, match="truncated or damaged .it is compressed"):
+        load_checkpoint(path, "test")
+
+
+def test_nothing_is_built_of_a_size_that_the_weights_do_not_have(tmp_path):
+    def make(width):
+        return nn.Sequential(nn.Linear(4, width), nn.BatchNorm1d(width), nn.Linear(width, 1))
+
+    path = tmp_path / "bad.pt"
+    for width, message in (
+        (99_999, "do not fit"),
+        (10**12, "larger than"),
+        ("3", "must be tuple of ints"),
+    ):
+        save(path, model_args={"width": width})
+        with pytest.raises(UserError, match=f"bad.pt: a checkpoint of another.*{message}"):
+            build_model(make, load_checkpoint(path, "test"), path)
+    model = make(3)
+    with torch.no_grad():
+        model[0].weight[0, 0] = torch.nan
+    save(path, model)
+    with pytest.raises(UserError, match="bad.pt: holds weights that are not finite"):
+        build_model(make, load_checkpoint(path, "test"), path)
+
+
+def test_entries_that_do_not_fit_are_one_sentence(tmp_path):
+    model, optimizer, _ = training()
+    with (
+        pytest.raises(UserError, match="last.pt: the checkpoint's entries do not fit .KeyError"),
+        reading("last.pt"),
+    ):
+        {}["rewards"]
+    with (
+        pytest.raises(UserError, match="last.pt: the checkpoint's entries do not fit .*; start"),
+        reading("last.pt"),
+    ):
+        optimizer.load_state_dict({"state": {}, "param_groups": []})
+    with (
+        pytest.raises(UserError, match="last.pt: the checkpoint's entries do not fit"),
+        reading("last.pt"),
+    ):
+        restore_rng({"torch": torch.zeros(3)}, {})

@@ -24,6 +24,7 @@ from models.planners import make_planner
 from tests.helpers.cluster import local_cluster
 from tests.helpers.simulators import needs_pybullet
 from utils.config import DEFAULTS
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
 from utils.runs import run_script as end_like_a_script
@@ -434,3 +435,28 @@ def test_a_filmed_round_without_an_attempt_has_a_picture(tmp_path, monkeypatch, 
                  "evaluate.workers=1"]  # fmt: skip
     assert evaluate.main(arguments) == 0
     assert list((only_run(tmp_path) / "films").glob("*.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("policies", "planner", "message"),
+    [
+        ('["antigravity:plan"]', "antigravity:plan", "names code to run, evaluate.policies"),
+        ('["heuristic"]', "antigravity:plan", "a round of antigravity:plan, which its own config"),
+        ('["heuristic"]', "heuristic", "a round of elsewhere:objects in the scenario pile"),
+    ],
+)
+def test_a_sample_names_no_code(tmp_path, policies, planner, message):
+    """Anyone may send one."""
+    sample = tmp_path / "sample.jsonl"
+    objects = "elsewhere:objects" if "elsewhere" in message else "box"
+    overrides = [f"evaluate.policies={policies}", "evaluate.object_sets=box",
+                 "evaluate.scenarios=pile", "cache_dir=/proc/elsewhere"]  # fmt: skip
+    origin = {"commit": None, "versions": {}, "overrides": overrides}
+    record = {
+        "policy": planner, "scenario": "pile", "objects": objects, "seed": 0, "objects_total": 1,
+        "objects_cleared": 0, "attempts": [], "ended": "lost",
+    }  # fmt: skip
+    sample.write_text(f"{json.dumps(origin)}\n{json.dumps(record)}\n")
+    with pytest.raises(UserError, match=message):
+        evaluate.main(["--replay", str(sample)])
+    assert "antigravity" not in sys.modules

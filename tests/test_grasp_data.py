@@ -187,3 +187,80 @@ def test_table_distance_of_a_tilted_camera(tmp_path):
     write_shard(shard_path(tmp_path, "train", 0), [tilted], [], 0.08)
     distance = SimulatedDataset(tmp_path, "train").table_distance(0)
     assert distance == pytest.approx(0.6 / (np.sqrt(3) / 2))
+
+
+# --- Hostile files --------------------------------------------------------------------------------
+
+
+def link_elsewhere(file, folder):
+    del file["K"]
+    file["K"] = h5py.ExternalLink(folder / "other.h5", "K")
+
+
+def store_elsewhere(file, folder):
+    del file["K"]
+    file.create_dataset("K", (2, 3, 3), "f8", external=[(str(folder / "secret"), 0, 144)])
+
+
+def ask_for_terabytes(file, folder):
+    del file["centres"]
+    file.create_dataset("centres", (2, 10**10, 3), "f8", chunks=(1, 1000, 3))
+
+
+def ask_for_frames_without_end(file, folder):
+    shape = (10**9, *file["depth"].shape[1:])
+    del file["depth"]
+    file.create_dataset("depth", shape, "u2", chunks=(1, *shape[1:]))
+
+
+def change_the_type(file, folder):
+    del file["valid"]
+    file["valid"] = np.ones((2, *SHAPE), np.float64)
+
+
+def change_the_shape(file, folder):
+    del file["T_WC"]
+    file["T_WC"] = np.zeros((2, 3, 3))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        link_elsewhere, store_elsewhere, ask_for_terabytes, ask_for_frames_without_end,
+        change_the_type, change_the_shape,
+    ],
+)  # fmt: skip
+def test_what_no_shard_has_is_refused(stored, spoil):
+    folder, *_ = stored
+    path = shard_path(folder, "train", 0)
+    (folder / "other.h5").write_bytes(path.read_bytes())
+    (folder / "secret").write_bytes(bytes(144))
+    with h5py.File(path, "a") as file:
+        spoil(file, folder)
+    with pytest.raises(UserError, match="00000.h5: not a readable data shard"):
+        SimulatedDataset(folder, "train")
+
+
+def test_a_flipped_bit_is_noticed(stored):
+    """In the middle of the numbers of an image, which HDF5 alone would decompress to others."""
+    folder, *_ = stored
+    path = shard_path(folder, "train", 0)
+    with h5py.File(path) as file:
+        place = file["rgb"].id.get_chunk_info(1).byte_offset + 20
+    content = bytearray(path.read_bytes())
+    content[place] ^= 4
+    path.write_bytes(content)
+    images = SimulatedDataset(folder, "train")
+    images[0]
+    with pytest.raises(UserError, match="00000.h5: not a readable data shard.*delete it"):
+        images[1]
+
+
+def test_a_shard_that_is_cut_short_while_it_is_read_is_named(stored):
+    folder, *_ = stored
+    images = SimulatedDataset(folder, "train")
+    images[0]
+    path = shard_path(folder, "train", 1)
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(UserError, match="00001.h5: not a readable data shard"):
+        images[2]

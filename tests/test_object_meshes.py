@@ -7,7 +7,15 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from envs import object_meshes
-from envs.object_meshes import ObjectError, decompose, load_mesh, mass_properties, simplify_hull
+from envs.object_meshes import (
+    ObjectError,
+    checked_mesh,
+    decompose,
+    load_mesh,
+    mass_properties,
+    parse_xml,
+    simplify_hull,
+)
 
 
 @pytest.fixture
@@ -168,3 +176,45 @@ def test_a_damaged_byte_anywhere_in_the_cache_is_refused_or_harmless(tmp_path):
             assert path.name in str(error)
             compared += 1
     assert compared > len(whole) / 7 / 2
+
+
+# --- Hostile files --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "corner", ["nan 0 0", "inf 0 0", "1e300 0 0", "1e8 0 0", "0 0 1e-30"], ids=str
+)
+def test_corners_that_make_no_body_are_one_sentence(tmp_path, corner):
+    path = tmp_path / "bad.obj"
+    others = "v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+    path.write_text(f"v {corner}\n{others}")
+    with pytest.raises(ObjectError, match="bad.obj"):
+        load_mesh(path)
+
+
+def test_triangles_without_corners_are_one_sentence():
+    mesh = trimesh.Trimesh(np.eye(3), [[0, 1, 9]], process=False)
+    with pytest.raises(ObjectError, match="bad has triangles without corners"):
+        checked_mesh(mesh, "bad")
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [
+        '<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;">',  # doubled often, it fills the memory
+        '<!ENTITY a SYSTEM "file:///etc/passwd">',
+        "",
+    ],
+)
+def test_xml_with_a_document_type_is_refused(tmp_path, declared):
+    path = tmp_path / "bad.urdf"
+    path.write_text(f'<?xml version="1.0"?><!DOCTYPE robot [{declared}]><robot name="x"></robot>')
+    with pytest.raises(ObjectError, match="bad.urdf cannot be read .it has a document type"):
+        parse_xml(path)
+
+
+def test_only_mesh_files_are_read(tmp_path):
+    path = tmp_path / "passwd"
+    path.write_text("root:x:0:0")
+    with pytest.raises(ObjectError, match="passwd is none of .obj"):
+        load_mesh(path)

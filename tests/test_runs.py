@@ -3,6 +3,8 @@
 import json
 import math
 import re
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from tests.helpers.records import CONFIG
 from utils.config import ConfigError, load_config
 from utils.errors import UserError
 from utils.runs import (
+    REPOSITORY,
     check_resume,
     environment,
     git_state,
@@ -21,6 +24,7 @@ from utils.runs import (
     parse_args,
     run_script,
     save_results,
+    write_atomic,
     write_json_atomic,
 )
 
@@ -129,3 +133,83 @@ def test_run_script(monkeypatch, capsys):
     assert status(interrupted) == 130
     with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
         run_script(lambda argv: 1 / 0)
+
+
+# --- Faults of the machine ------------------------------------------------------------------------
+
+SCRIPT = """
+import sys, time
+from utils.distributed import stop_on_interrupt
+from utils.runs import run_script
+
+def loop(argv):  # as a training that saves what it has
+    with stop_on_interrupt() as stop:
+        print("ready", flush=True)
+        while not stop.is_set():
+            time.sleep(0.01)
+    print("saved", flush=True)
+    return 130
+
+def wait(argv):  # as a script that is between two such loops
+    print("ready", flush=True)
+    time.sleep(60)
+
+run_script({"loop": loop, "wait": wait}[sys.argv[1]])
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["Ctrl-C", "SIGTERM"]
+)
+@pytest.mark.parametrize("what", ["loop", "wait"])
+def test_a_script_that_is_stopped_saves_and_says_so(what, number, status):
+    with subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, what], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, cwd=REPOSITORY,
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        output, error = process.communicate(timeout=30)
+    assert process.returncode == status
+    assert (output == "saved\n") is (what == "loop")
+    assert error in ("", "interrupted\n", "terminated\n")
+
+
+def limited(limit: str, size: int, code: str) -> subprocess.CompletedProcess:
+    """Run Python code as a script, under a limit of the operating system in bytes."""
+    pytest.importorskip("resource", reason="Windows has no such limits")
+    text = (
+        f"import resource; resource.setrlimit(resource.{limit}, ({size}, {size}))\n"
+        "from pathlib import Path\nimport numpy as np\nfrom utils.runs import *\n"
+        f"def main(argv):\n    {code}\nrun_script(main)"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", text], capture_output=True, text=True, cwd=REPOSITORY, timeout=60
+    )
+
+
+def test_a_disk_without_room_is_one_sentence_and_keeps_what_was_there(tmp_path):
+    """A limit of the size of files is a full disk that needs no rights to make."""
+    path = tmp_path / "last.pt"
+    path.write_bytes(b"before")
+    done = limited("RLIMIT_FSIZE", 10_000, f"write_atomic(Path({str(path)!r}), bytes(20_000))")
+    assert done.returncode == 2
+    said = r"error: .*last.pt: cannot be written \(File too large\); .*\n"
+    assert re.fullmatch(said, done.stderr)
+    assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
+    done = limited("RLIMIT_FSIZE", 10_000, f"Path({str(path)!r}).write_bytes(bytes(20_000))")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+def test_too_little_memory_is_one_sentence():
+    done = limited("RLIMIT_AS", 2 * 1024**3, "np.ones(10**10)")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: out of memory (") and done.stderr.count("\n") == 1
+
+
+def test_a_folder_that_may_not_be_written_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="x.json: cannot be written .File exists"):
+        write_atomic(tmp_path / "file" / "x.json", "{}")
+    with pytest.raises(UserError, match="/proc/x.json: cannot be written"):
+        write_atomic(Path("/proc/x.json"), "{}")

@@ -219,7 +219,7 @@ def _check_types(content: dict[str, Any], types: dict[str, type]) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and abs(value) < math.inf
+    return isinstance(value, int | float) and type(value) is not bool and abs(value) < math.inf
 
 
 def _no_number(name: str) -> None:

@@ -114,7 +114,9 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     try:
         status = main(sys.argv[1:])
     except UserError as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)
+        # A process that loads images sends an error as a traceback, with the sentence at its end.
+        sentence = one_line(error).rpartition(f".{UserError.__name__}: ")[2]
+        print(f"error: {sentence}", file=sys.stderr)
         status = 2
     except OSError as error:
         if error.errno not in DISK_ERRORS:
