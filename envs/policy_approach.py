@@ -20,6 +20,7 @@ from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
 from models.grasp_policy import SavedPolicy, load_policy
 from models.sb3_policy import Sb3Policy, load_sb3
+from utils.checkpoint import reading
 from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.result_records import OPEN_LOOP
@@ -158,4 +159,5 @@ def learned_approach(name: str, cell: Cell) -> PolicyApproach:
     if isinstance(policy, Sb3Policy):
         sections = {"env": cell.config.env, "camera": cell.config.camera}
         return PolicyApproach(cell, policy, {key: sections[key].model_dump() for key in sections})
-    return PolicyApproach(cell, policy, policy.config)
+    with reading(name):
+        return PolicyApproach(cell, policy, policy.config)

@@ -385,6 +385,9 @@ def load_policy(path: Path | str) -> SavedPolicy:
     extra = checkpoint["extra"]
     with reading(path):
         layout = ObservationLayout.from_plain(extra["layout"])
+        for name in ("image_channels", "state_dim", "privileged_dim"):
+            if getattr(layout, name) != network.model_args[name]:
+                raise ValueError(f"{name} of its observations is not the network's")
         return SavedPolicy(network, layout, extra, _current_config(checkpoint["config"]))
 
 

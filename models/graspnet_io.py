@@ -19,7 +19,13 @@ from torch.export import Dim
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from models.graspnet import GraspNet
-from utils.checkpoint import build_model, load_checkpoint, load_weights, save_checkpoint
+from utils.checkpoint import (
+    build_model,
+    load_checkpoint,
+    load_weights,
+    reading,
+    save_checkpoint,
+)
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.runs import write_atomic
@@ -95,7 +101,10 @@ def load_graspnet(path: Path | str) -> SavedGraspNet:
     pixel_size = extra.pop(PIXEL_SIZE, None)
     if not isinstance(pixel_size, float) or not 0 < pixel_size < np.inf:
         raise UserError(f"{path}: does not hold the pixel size of its images ({PIXEL_SIZE})")
-    return SavedGraspNet(model, pixel_size, checkpoint["config"], extra)
+    saved = SavedGraspNet(model, pixel_size, checkpoint["config"], extra)
+    with reading(path):
+        saved.gripper  # noqa: B018 - raises for a hand that cannot be
+    return saved
 
 
 def load_initial(model: GraspNet, path: Path | str) -> None:

@@ -16,6 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from models.grasp_policy import GraspPPO, load_policy, save_policy
 from models.ppo_rollouts import SIMULATION, Episode
+from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
 from utils.runs import Stopwatch, save_results
 
@@ -103,7 +104,11 @@ def save_evaluation(
 
 def load_progress(ppo: GraspPPO, last: Path) -> list[ProgressRow]:
     """Continue from a checkpoint, if there is one; returns the history so far."""
-    return ppo.load(last)["history"] if last.is_file() else []
+    if not last.is_file():
+        return []
+    extra = ppo.load(last)
+    with reading(last):
+        return extra["history"]
 
 
 def save_training(run: Path, history: list[ProgressRow], weights: Path | None) -> ProgressRow:

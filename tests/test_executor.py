@@ -140,11 +140,6 @@ def test_slow_calls_within_their_time_are_left_alone(compute):
         assert sorted(completed(workers, nap, [1.0, 1.5, 0.0])) == [0.0, 1.0, 1.5]
 
 
-def nap(seconds):
-    time.sleep(seconds)
-    return seconds
-
-
 def freeze():
     """Stop the whole process, its timers included, as a machine that swaps does."""
     os.kill(os.getpid(), signal.SIGSTOP)
