@@ -34,6 +34,7 @@ EPISODE, SUBSTEPS = 100, 4  # actions, and physics steps of each, in part `memor
 # A joint is stopped in the physics step after the one that took it over its limit, and the motors
 # follow a command that is at the edge of the box with an error.
 POSITION_TOLERANCE, BOX_TOLERANCE = 5e-3, 0.02  # rad, m
+PRESSED = 10.0  # N
 ROUNDING = 1e-6  # of a speed or an acceleration
 SAMPLED = 50  # episodes from one look at the memory to the next
 GROWTH = 20.0  # MB by which the second half of a run may grow: 4 kB an episode
@@ -122,13 +123,12 @@ class LimitWatch:
             f"a joint's limit, {1e3 * max(self.box, 0):.1f} mm beyond the box, "
             f"{max(self.speed, 0):.2g} rad/s beyond a joint's speed limit; joint accelerations up "
             f"to {self.acceleration:.0f} times the limit of planned motions"
-            + (
-                f"; beyond a limit in {len(self.forces)} actions, in which it pressed on table, "
-                f"bin or object with {min(self.forces):.0f} N or more"
-                if self.forces
-                else ""
-            )
+            f"; beyond one of these in {len(self.forces)} actions, in {self._pressed()} of which "
+            f"it pressed on something with more than {PRESSED:g} N"
         )
+
+    def _pressed(self) -> int:
+        return sum(force > PRESSED for force in self.forces)
 
 
 def soak_actions(simulator: str, scale: float, seed: int, stop: Event) -> Iterator[Tally]:
