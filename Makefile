@@ -89,7 +89,7 @@ $(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
 
 # The newest versions that requirements*.txt admit, with hashes for every system and Python: requirements.lock.
 lock: $(VENV)/.installed-dev
-	$(BIN)/uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-annotate \
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.10 --upgrade --generate-hashes --no-annotate \
 		--custom-compile-command "make lock" --output-file requirements.lock requirements.txt requirements-dev.txt
 
 clean:
