@@ -15,9 +15,6 @@ from time import perf_counter
 
 import gymnasium
 import numpy as np
-import panda_gym  # noqa: F401 - registers its environments
-import pybullet
-import pybullet_data
 from scipy.spatial.transform import Rotation
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
@@ -26,11 +23,22 @@ from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
-from envs.pybullet_bodies import add_table, set_up_physics, spawn
-from envs.pybullet_camera import PybulletCamera, projection_matrix
-from envs.pybullet_cell import PybulletCell
 from utils.config import Config, load_config, with_settings
 from utils.runs import run_script
+
+try:
+    import panda_gym  # noqa: F401 - registers its environments
+    import pybullet
+    import pybullet_data
+
+    from envs.pybullet_bodies import add_table, set_up_physics, spawn
+    from envs.pybullet_camera import PybulletCamera, projection_matrix
+    from envs.pybullet_cell import PybulletCell
+except ModuleNotFoundError as error:
+    raise SystemExit(
+        f"error: {error.name} is not installed; the peers, panda-gym and PyBullet's own objects, "
+        "have wheels for Python 3.10 and 3.11 on Linux x86-64"
+    ) from None
 
 STEPS = 40  # of an environment, between two readings of the clock
 PHYSICS_STEPS = 120

@@ -18,7 +18,7 @@ from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
-from envs.pybullet_cell import PybulletCell
+from envs.simulators import cell_class
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
 from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
     scene = make_scene(chosen.layout, objects, config.seed, config)
-    with PybulletCell(config) as bullet, MujocoCell(config) as mujoco:
+    with cell_class("pybullet")(config) as bullet, MujocoCell(config) as mujoco:
         for cell in (bullet, mujoco):
             cell.build(scene)
         frames = bullet.frame(), mujoco.frame()
