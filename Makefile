@@ -26,6 +26,7 @@ quick: $(VENV)/.installed
 WORKERS ?= $(shell getconf _NPROCESSORS_ONLN)
 cluster: export PYTHONPATH := $(CURDIR)
 cluster: export OMP_NUM_THREADS := 1
+cluster: export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED := False
 cluster: $(VENV)/.installed-cluster
 	$(BIN)/dask scheduler --host 127.0.0.1 --port 8786 & trap "kill $$! 2>/dev/null" EXIT INT TERM; \
 	$(BIN)/dask worker tcp://127.0.0.1:8786 --nworkers $(WORKERS) --nthreads 1

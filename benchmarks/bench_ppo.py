@@ -15,17 +15,21 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import psutil
+from gymnasium.wrappers import FilterObservation, FlattenObservation
 from scipy.stats import t as student
 
 from benchmarks.metrics import Metric, benchmark_parser, report
 from utils.config import Config, load_config
-from utils.runs import run_script
+from utils.runs import REPOSITORY, run_script
 
+CONFIGS = REPOSITORY / "configs"
 EPISODES = 100  # deterministic ones at the end
 FIRST_SEED = 900_000  # of these
 ENVS = 4
@@ -33,12 +37,16 @@ ENVS = 4
 
 @dataclass(frozen=True)
 class Task:
-    """An environment, the module that registers it, and settings of `rl` that suit it (Pendulum's
-    are those of RL Baselines3 Zoo without its state-dependent exploration)."""
+    """An environment, the module that registers it (None for this project's), and settings that
+    suit it (Pendulum's are those of RL Baselines3 Zoo without its state-dependent exploration).
 
-    module: str
+    config: under the settings; None for the defaults.
+    """
+
+    module: str | None
     steps: int
     settings: tuple[str, ...]
+    config: Path | None = None
 
 
 COMMON = (
@@ -57,6 +65,13 @@ TASKS = {
         "panda_gym", 100_000,
         ("rl.lr=1e-3", "rl.gamma=0.95", "rl.epochs=10", "rl.rollout_steps=512",
          "rl.batch_size=64", "rl.parallel=true"),
+    ),
+    # The cell as the policy without images sees it; a process for each core of a small machine.
+    "RobotGrasping-v0": Task(
+        None, 16_384,
+        ("rl.envs=2", "rl.lr=1e-3", "rl.gamma=0.9", "rl.epochs=8", "rl.rollout_steps=256",
+         "rl.batch_size=128", "rl.parallel=true"),
+        CONFIGS / "ppo_state.yaml",
     ),
 }  # fmt: skip
 
@@ -162,9 +177,8 @@ def family() -> list[psutil.Process]:
 
 def config_of(env: str, seed: int) -> Config:
     task = TASKS[env]
-    return load_config(
-        None, [*COMMON, *task.settings, f"seed={seed}", f"rl.env_id={task.module}:{env}"]
-    )
+    name = env if task.module is None else f"{task.module}:{env}"
+    return load_config(task.config, [*COMMON, *task.settings, f"seed={seed}", f"rl.env_id={name}"])
 
 
 def whole_updates(config: Config, steps: int) -> int:
@@ -204,7 +218,7 @@ def train_sb3(env: str, seed: int, steps: int) -> Result:
     config = config_of(env, seed)
     rl = config.rl
     kind = SubprocVecEnv if rl.parallel else DummyVecEnv
-    envs = make_vec_env(rl.env_id, rl.envs, seed, vec_env_cls=kind)
+    envs = make_vec_env(partial(as_sb3_sees_it, config), rl.envs, seed, vec_env_cls=kind)
     widths = [rl.hidden_dim] * rl.hidden_layers
     dict_observation = hasattr(envs.observation_space, "spaces")
     model = PPO(
@@ -219,9 +233,19 @@ def train_sb3(env: str, seed: int, steps: int) -> Result:
     model.learn(steps)
     spent = time.perf_counter() - start, cpu_seconds() - cpu, memory()
     envs.close()
-    judge, seeds = gymnasium.make(rl.env_id), range(FIRST_SEED, FIRST_SEED + EPISODES)
+    judge, seeds = as_sb3_sees_it(config), range(FIRST_SEED, FIRST_SEED + EPISODES)
     final = float(np.mean([deterministic_return(model, judge, number) for number in seeds]))
     return Result(final, steps, *spent)
+
+
+def as_sb3_sees_it(config: Config, **arguments: Any) -> gymnasium.Env:
+    """The environment; of its observation as one vector the entries that the policy sees."""
+    from envs.vector_env import make_env
+
+    seen = config.rl.policy_observations
+    if seen is None:
+        return gymnasium.make(config.rl.env_id, **arguments)
+    return FlattenObservation(FilterObservation(make_env(config, **arguments), seen))
 
 
 def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:

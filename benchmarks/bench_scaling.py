@@ -43,6 +43,7 @@ QUICK = ("evaluate.scenarios=isolated", "evaluate.object_sets=box")
 SIZES = (8, 64, 512)  # workers of the model
 FULL = 0.8  # share of a core from which a scheduler or a main process is late with its answers
 EACH = 3  # scenes between two kills, so that a scene is not killed as often as an executor allows
+DASK = {"DASK_LOGGING__DISTRIBUTED": "error", "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 BRIDGE, NETWORK = "robotgrasp", "10.77.0"  # of the two namespaces
 
 
@@ -292,9 +293,7 @@ def dask(
 
 
 def _start(stack: ExitStack, command: Sequence[str]) -> subprocess.Popen:
-    process = subprocess.Popen(
-        command, env=os.environ | {"DASK_LOGGING__DISTRIBUTED": "error"}, stdin=subprocess.DEVNULL
-    )
+    process = subprocess.Popen(command, env=os.environ | DASK, stdin=subprocess.DEVNULL)
     stack.callback(process.wait)
     stack.callback(process.terminate)
     return process

@@ -22,11 +22,29 @@ from utils.runs import (
     git_state,
     new_run_folder,
     parse_args,
+    run_of_job,
     run_script,
     save_results,
     write_atomic,
     write_json_atomic,
 )
+
+
+def test_a_job_of_torchrun_finds_the_run_that_it_has_begun(tmp_path, monkeypatch):
+    other = load_config(None, ["seed=1"])
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    new_run_folder("train_rl", None, CONFIG, tmp_path)
+    assert run_of_job("train_rl", CONFIG, tmp_path) is None, "jobs without a name are not the same"
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "first")
+    assert run_of_job("train_rl", CONFIG, tmp_path) is None
+    run = new_run_folder("train_rl", None, CONFIG, tmp_path)
+    new_run_folder("train_rl", None, other, tmp_path)
+    assert run_of_job("train_rl", CONFIG, tmp_path) == run
+    assert run_of_job("train_graspnet", CONFIG, tmp_path) is None
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "second")
+    assert run_of_job("train_rl", CONFIG, tmp_path) is None
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID")
+    assert run_of_job("train_rl", CONFIG, tmp_path) is None
 
 
 def test_run_folder(tmp_path):

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import functools
 import hashlib
 import importlib.util
 import os
 import platform
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +25,7 @@ from utils.errors import UserError
 from utils.runs import PACKAGES, REPOSITORY, package_version
 
 SOURCES = ("envs", "models", "utils")  # this project's packages
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 Result = TypeVar("Result")
 
@@ -114,7 +117,17 @@ def _begin(job: Job) -> None:
     cv2.setNumThreads(1)  # the workers fill the cores
     if job.facts is not None:
         check(job.facts)
+        _keep_memory()
     _begun = job
+
+
+def _keep_memory() -> None:
+    """Let malloc keep what is freed, as it does by itself. Dask's nanny has it give back every 64
+    KiB, so that each image that a scene computes would be paged in anew."""
+    library = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if hasattr(library, "mallopt"):  # glibc
+        library.mallopt(M_MMAP_THRESHOLD, 2**25)
+        library.mallopt(M_TRIM_THRESHOLD, 2**28)
 
 
 # --- The same bits on another machine -------------------------------------------------------------

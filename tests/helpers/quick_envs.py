@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -21,7 +23,8 @@ class PointEnv(gymnasium.Env):
     """Move a point in the plane to a goal: an episode is ten steps long, or ends within 0.1 of it.
 
     images: show the goal as a bright pixel in 16 x 16 `rgb` and `depth` instead, and be content
-    with 0.2. `goal` is in info. trouble: what happens at step 3 of the third episode.
+    with 0.2. `goal` is in info. trouble: what happens at step 3 of the third episode; "lost" kills
+    one process, once, as soon as there is a checkpoint.
     """
 
     def __init__(self, images: bool = False, trouble: str | None = None):
@@ -65,8 +68,17 @@ class PointEnv(gymnasium.Env):
                 observation["velocity"] = observation.pop("state")
             if self._trouble == "shape":
                 observation["state"] = observation["state"][:1]
+        if self._trouble == "lost" and any(Path().glob("runs/*/*/last.pt")):
+            self._lose_one_process()
         terminated = self._distance() < self._near
         return observation, reward, terminated, self._steps >= 10, self._info()
+
+    def _lose_one_process(self) -> None:
+        try:
+            Path("lost").touch(exist_ok=False)
+        except FileExistsError:
+            return
+        os.kill(os.getpid(), signal.SIGKILL)
 
     def _distance(self) -> float:
         return float(np.linalg.norm(self._goal - self._position))
