@@ -132,7 +132,10 @@ def checked_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
             f"mesh {name} is {side:.3g} long, or as far from its origin, expected "
             f"{SMALLEST_SIDE:g} to {LARGEST_SIDE:g}; re-export it in other units"
         )
-    bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    try:
+        bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    except OverflowError as error:  # of trimesh's grid, on which vertices are merged
+        raise ObjectError(f"mesh {name} is too large for its details; re-export it") from error
     # Triangles with two merged corners are removed; thin ones stay, because their removal would
     # leave holes.
     bare.update_faces((np.diff(np.sort(bare.faces, axis=1), axis=1) > 0).all(axis=1))

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def read_trials(folder: Path) -> list[Trial]:
     """Read all label trials on a data set's training images."""
     trials = []
     for path in sorted((Path(folder) / "train").glob("*.h5")):
-        with _open(path) as file:
+        with _open(path) as file, _reading(path):
             trials += [Trial(float(q), float(w), bool(s)) for q, w, s in file["trials"][:]]
     return trials
 
@@ -128,7 +129,7 @@ class SimulatedDataset(Dataset):
         self.cameras: list[tuple[np.ndarray, np.ndarray]] = []
         self.scenes: list[str] = []
         for shard, path in enumerate(self.paths):
-            with _open(path) as file:
+            with _open(path) as file, _reading(path):
                 self._place += [(shard, i) for i in range(len(file["depth"]))]
                 self.cameras += zip(file["K"][:], file["T_WC"][:])
                 self.scenes += list(file["scene"].asstr()[:])
@@ -141,10 +142,8 @@ class SimulatedDataset(Dataset):
     def __getitem__(self, index: int) -> LabelledImage:
         if not 0 <= index < len(self):
             raise IndexError(index)
-        try:
+        with _reading(self.paths[self._place[index][0]]):  # it may have been damaged since
             return self._read(index)
-        except (OSError, KeyError, RuntimeError) as error:  # HDF5's, for what was damaged since
-            raise _unreadable(self.paths[self._place[index][0]], error) from error
 
     def _read(self, index: int) -> LabelledImage:
         file, i = self._at(index)
@@ -190,13 +189,11 @@ _LARGEST_SIDE = 4096  # pixels, as of the config's cameras
 
 
 def _open(path: Path) -> h5py.File:
-    try:
+    with _reading(path):
         file = h5py.File(path, "r")
         version = file.attrs["format_version"]
         if version == FORMAT_VERSION:
             _check_content(file, path.stat().st_size)
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise _unreadable(path, error) from error
     if version != FORMAT_VERSION:
         raise UserError(
             f"{path}: data format version {version}, this program reads {FORMAT_VERSION}; "
@@ -205,13 +202,21 @@ def _open(path: Path) -> h5py.File:
     return file
 
 
-def _unreadable(path: Path, error: Exception) -> UserError:
-    # Only the operating system sets a number: the file's content is not to blame.
-    if getattr(error, "errno", None) is not None:
-        return UserError(f"{path}: cannot be read ({os.strerror(error.errno)})")
-    return UserError(
-        f"{path}: not a readable data shard ({one_line(error)}); delete it, and it is made again"
-    )
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Within this context the errors of HDF5 and of contents that make no sense are UserErrors."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        # Only the operating system sets a number: the file's content is not to blame.
+        if getattr(error, "errno", None) is not None:
+            raise UserError(f"{path}: cannot be read ({os.strerror(error.errno)})") from error
+        raise UserError(
+            f"{path}: not a readable data shard ({one_line(error)}); delete it, and it is made "
+            "again"
+        ) from error
 
 
 def _check_content(file: h5py.File, size: int) -> None:
