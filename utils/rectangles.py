@@ -298,7 +298,8 @@ def _inverse_table(depth: np.ndarray, side: int) -> np.ndarray:
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     seen = _central(terms * depth[..., None], side)[::_TABLE_STEP, ::_TABLE_STEP].reshape(-1, 6)
     start = np.linalg.lstsq(seen, np.ones(len(seen)), rcond=None)[0]
-    found, _ = robust_fit(lambda x: seen @ x - 1, start, _FLAT, jac=lambda x: seen)
+    # SciPy before 1.16 scales the derivative in place.
+    found, _ = robust_fit(lambda x: seen @ x - 1, start, _FLAT, jac=lambda x: seen.copy())
     return terms @ found
 
 
