@@ -342,6 +342,7 @@ def reliability(say: Say, parts: Figures) -> str:
         [row["fault"], *(f"{row[key]:,}" for key in ("tried", "survived", "lost")), row["note"]]
         for part in parts.values()
         for row in part["rows"]
+        if row["tried"]  # a part that was stopped did not come to all of them
     ]
     origins = [
         f"<sub>`{part['command']}`: measured at commit `{part['commit'][:10]}` ({part['date']}), "
