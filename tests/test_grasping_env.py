@@ -336,8 +336,14 @@ def test_a_sleeping_object_is_pushed_like_one_awake(make, make_awake):
         _, info = env.reset(seed=0)
         start = info["object_position"]
         # Down beside the cube with closed fingers, then through it.
-        for goal in (start + [0.0, 0.09, 0.1], start + [0.0, 0.09, 0.0], start - [0.0, 0.04, 0.0]):
-            for _ in range(12):
+        # Only the first hit counts: the cube slides ahead, and each further hit amplifies differences.
+        beside = start + [0.0, 0.09, 0.0]
+        for goal, steps in (
+            (beside + [0.0, 0.0, 0.1], 12),
+            (beside, 12),
+            (start - [0.0, 0.04, 0.0], 4),
+        ):
+            for _ in range(steps):
                 offset = np.clip((goal - info["end_effector_position"]) / 0.05, -0.4, 0.4)
                 *_, info = env.step(np.array([*offset, 0.0, -1.0]))
         ends.append(info["object_position"] - start)
