@@ -336,7 +336,7 @@ def test_a_sleeping_object_is_pushed_like_one_awake(make, make_awake):
         _, info = env.reset(seed=0)
         start = info["object_position"]
         # Down beside the cube with closed fingers, then through it.
-        # Only the first hit counts: the cube slides ahead, and each further hit amplifies differences.
+        # Only the first hit counts: each further one amplifies differences.
         beside = start + [0.0, 0.09, 0.0]
         for goal, steps in (
             (beside + [0.0, 0.0, 0.1], 12),
