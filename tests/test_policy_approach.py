@@ -30,7 +30,7 @@ def box():
     return CHECKPOINTS / "ppo_box.pt"
 
 
-@needs_pybullet  # whose detailed pictures of the hand the policy has learned from
+@needs_pybullet  # where the policy has learned; on scenes laid out in MuJoCo it is less certain
 def test_the_policy_of_the_box_lifts_it(box):
     """200 of 200 in docs/ppo.md: by far not each in ten would fail by chance."""
     config = config_of(box, ["sim.renderer=tiny"])
