@@ -156,7 +156,7 @@ def test_run_script(monkeypatch, capsys):
 # --- Faults of the machine ------------------------------------------------------------------------
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
 from utils.distributed import stop_on_interrupt
 from utils.runs import run_script
 
@@ -172,14 +172,21 @@ def wait(argv):  # as a script that is between two such loops
     print("ready", flush=True)
     time.sleep(60)
 
-run_script({"loop": loop, "wait": wait}[sys.argv[1]])
+# Whatever the tests themselves have inherited: a shell's background jobs ignore Ctrl-C.
+ignored = sys.argv[1] == "background"
+signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+run_script(loop if sys.argv[1] == "loop" else wait)
 """
 
 
 @pytest.mark.parametrize(
-    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["Ctrl-C", "SIGTERM"]
-)
-@pytest.mark.parametrize("what", ["loop", "wait"])
+    ("what", "number", "status"),
+    [
+        ("loop", signal.SIGINT, 130), ("loop", signal.SIGTERM, 143),
+        ("wait", signal.SIGINT, 130), ("wait", signal.SIGTERM, 143),
+        ("background", signal.SIGTERM, 143),
+    ],
+)  # fmt: skip
 def test_a_script_that_is_stopped_saves_and_says_so(what, number, status):
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, what], stdout=subprocess.PIPE, stderr=subprocess.PIPE,

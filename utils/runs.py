@@ -108,6 +108,8 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
 
     def terminate(*_: object) -> None:
         terminated.append(True)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as of a shell's background jobs
+            raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)  # whoever handles Ctrl-C now
 
     before = signal.signal(signal.SIGTERM, terminate)
