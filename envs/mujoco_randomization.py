@@ -33,13 +33,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from envs.mujoco_panda import ARM_JOINTS, FINGERS, MujocoPanda, load_mujoco
-from utils.config_types import Change, changed
+from utils.config_types import Change, changed_in
 from utils.transforms import pose_matrix
 
 _OF_OBJECTS = ("object_mass", "object_friction", "rolling_friction", "restitution")
@@ -97,7 +96,7 @@ class MujocoRandomizable:
         self._change_friction(changes)
         self._change_contacts(changes)
         self._change_motors(changes)
-        model.opt.gravity[2] = _changed(changes, "gravity", self._gravity)
+        model.opt.gravity[2] = changed_in(changes, "gravity", self._gravity)
         # Inertias seen by contacts and joints; the nominal ones come back bit for bit.
         self._mujoco.mj_setConst(model, self._scratch)
 
@@ -119,9 +118,9 @@ class MujocoRandomizable:
     def _change_masses(self, changes: Mapping[str, Change]) -> None:
         model, nominal = self._model, self._nominal["body_mass"]
         for i, body in enumerate(self._bodies):
-            self._scale_mass([body], _changed(changes, "object_mass", nominal[body], i))
+            self._scale_mass([body], changed_in(changes, "object_mass", nominal[body], i))
         for i, links in enumerate(self._links):
-            self._scale_mass(links, _changed(changes, "robot_mass", nominal[links].sum(), i))
+            self._scale_mass(links, changed_in(changes, "robot_mass", nominal[links].sum(), i))
             # The controller knows the nominal masses alone. A link without mass has no weight.
             known = np.divide(
                 nominal[links], model.body_mass[links], where=nominal[links] > 0,
@@ -143,19 +142,19 @@ class MujocoRandomizable:
                 (model.pair_friction, model.pair_dim, pairs, _SLIDING, _ROLLING),
             ):
                 nominal = friction[rows, sliding]
-                friction[rows, sliding] = _changed(changes, "object_friction", nominal, i)
+                friction[rows, sliding] = changed_in(changes, "object_friction", nominal, i)
                 first = np.flatnonzero(rows)[0]  # all of an object's have the same
                 rolls = dimensions[first] == _WHOLE
                 length = float(friction[first, rolling.start]) if rolls else 0.0
-                new = _changed(changes, "rolling_friction", length, i)
+                new = changed_in(changes, "rolling_friction", length, i)
                 if new != length:
                     friction[rows, rolling] = new
                     dimensions[rows] = _WHOLE if new > 0 else _WITHOUT_ROLLING
         table, fingers, friction = self._with_table, self._with_fingers, model.pair_friction
-        friction[table, _SLIDING] *= _changed(changes, "table_friction", 1.0)
-        friction[fingers, _SLIDING] *= _changed(changes, "finger_friction", 1.0)
+        friction[table, _SLIDING] *= changed_in(changes, "table_friction", 1.0)
+        friction[fingers, _SLIDING] *= changed_in(changes, "finger_friction", 1.0)
         torsion = friction[fingers, _TORSION]
-        friction[fingers, _TORSION] = _changed(changes, "spinning_friction", torsion)
+        friction[fingers, _TORSION] = changed_in(changes, "spinning_friction", torsion)
 
     def _change_contacts(self, changes: Mapping[str, Change]) -> None:
         """Write stiffness and damping where they change: MuJoCo takes them negated, in place of a
@@ -168,12 +167,12 @@ class MujocoRandomizable:
         critical = 2 * math.sqrt(nominal[0])
         own = restitution_of(nominal[1] / critical)
         for i, pairs in enumerate(self._pairs_of):
-            bounce = _changed(changes, "restitution", own, i)
+            bounce = changed_in(changes, "restitution", own, i)
             if bounce != own:
                 ratio = _damping_ratio(bounce, most / critical)
                 solref[pairs & self._with_table] = -nominal[0], -ratio * critical
-        stiffness = _changed(changes, "contact_stiffness", nominal[0])
-        damping = _changed(changes, "contact_damping", nominal[1])
+        stiffness = changed_in(changes, "contact_stiffness", nominal[0])
+        damping = changed_in(changes, "contact_damping", nominal[1])
         if (stiffness, damping) != nominal:
             stiffness = min(stiffness, _MOST_STIFFNESS / step**2)
             solref[self._with_fingers] = -stiffness, -min(damping, most)
@@ -181,7 +180,7 @@ class MujocoRandomizable:
     def _change_motors(self, changes: Mapping[str, Change]) -> None:
         model, robot = self._model, self._robot
         position, velocity, gripper = (
-            _changed(changes, name, 1.0)
+            changed_in(changes, name, 1.0)
             for name in ("arm_position_gain", "arm_velocity_gain", "gripper_gain")
         )
         model.actuator_gainprm[:_GRIPPER, 0] *= position
@@ -192,8 +191,8 @@ class MujocoRandomizable:
         model.actuator_biasprm[_GRIPPER, 1] *= gripper
         for i, joint in enumerate(self._joints):
             damping = model.dof_damping[joint]
-            model.dof_damping[joint] = _changed(changes, "joint_damping", damping, i)
-        seconds = _changed(changes, "latency", self._latency * robot.dt)
+            model.dof_damping[joint] = changed_in(changes, "joint_damping", damping, i)
+        seconds = changed_in(changes, "latency", self._latency * robot.dt)
         robot.latency = max(0, round(seconds / robot.dt))
 
 
@@ -224,13 +223,3 @@ def _stiffness_damping(solref: np.ndarray) -> tuple[float, float]:
     """1/s^2 and 1/s of a contact that MuJoCo has as time constant, s, and damping ratio."""
     seconds, ratio = solref.tolist()
     return 1 / (seconds * ratio) ** 2, 2 / seconds
-
-
-def _changed(
-    changes: Mapping[str, Change], name: str, nominal: Any, index: int | None = None
-) -> Any:
-    """A nominal value, or an array of them, after the change of that name."""
-    if name not in changes:
-        return nominal
-    operation, value = changes[name]
-    return changed(operation, nominal, value if index is None else value[index])

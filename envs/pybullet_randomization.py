@@ -12,7 +12,7 @@ import numpy as np
 import pybullet
 
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
-from utils.config_types import Change, changed
+from utils.config_types import Change, changed_in
 from utils.transforms import pose_matrix
 
 # The keyword of `changeDynamics` and the place in `getDynamicsInfo`'s answer of each quantity.
@@ -83,14 +83,14 @@ class PybulletRandomizable:
         for link, quantities in self._quantities(changes).items():
             pybullet.changeDynamics(*link, **quantities, physicsClientId=client)
         for i, joint in enumerate(ARM):
-            damping = _changed(changes, "joint_damping", self._damping[joint], i)
+            damping = changed_in(changes, "joint_damping", self._damping[joint], i)
             pybullet.changeDynamics(robot.body, joint, jointDamping=damping, physicsClientId=client)
         x, y, z = self._gravity
-        pybullet.setGravity(x, y, _changed(changes, "gravity", z), physicsClientId=client)
+        pybullet.setGravity(x, y, changed_in(changes, "gravity", z), physicsClientId=client)
         for name, attribute in _OF_MOTORS.items():
-            value = _changed(changes, name, self._motors[attribute])
+            value = changed_in(changes, name, self._motors[attribute])
             setattr(robot, attribute, value)
-        seconds = _changed(changes, "latency", self._latency * self._dt)
+        seconds = changed_in(changes, "latency", self._latency * self._dt)
         robot.latency = max(0, round(seconds / self._dt))
 
     def paint(self, colours: Sequence[Sequence[float]] | None) -> None:
@@ -109,7 +109,7 @@ class PybulletRandomizable:
         found = {}
         for i, body in enumerate(self._bodies):
             values = {
-                quantity: _changed(changes, name, self._nominal((body, -1), quantity), i)
+                quantity: changed_in(changes, name, self._nominal((body, -1), quantity), i)
                 for name, quantity in _OF_OBJECTS.items()
             }
             found[body, -1] = self._with_inertia((body, -1), values)
@@ -119,16 +119,16 @@ class PybulletRandomizable:
         # Bullet multiplies the restitutions of two bodies in contact: with 1 for the table, the
         # object's own counts.
         bounces = 1.0 if "restitution" in changes else self._nominal(table, "restitution")
-        friction = _changed(changes, "table_friction", self._nominal(table, "lateralFriction"))
+        friction = changed_in(changes, "table_friction", self._nominal(table, "lateralFriction"))
         found[table] = {"lateralFriction": friction, "restitution": bounces}
         for i, link in enumerate(ARM):
             key = (self._robot.body, link)
-            mass = _changed(changes, "robot_mass", self._nominal(key, "mass"), i)
+            mass = changed_in(changes, "robot_mass", self._nominal(key, "mass"), i)
             found[key] = self._with_inertia(key, {"mass": mass})
         for link in FINGERS:
             key = (self._robot.body, link)
             found[key] = {
-                quantity: _changed(changes, name, self._nominal(key, quantity))
+                quantity: changed_in(changes, name, self._nominal(key, quantity))
                 for name, quantity in _OF_FINGERS.items()
             }
         return found
@@ -144,12 +144,3 @@ class PybulletRandomizable:
         nominal = self._nominal(link, "localInertiaDiagonal")
         values["localInertiaDiagonal"] = [factor * i for i in nominal]
         return values
-
-
-def _changed(
-    changes: Mapping[str, Change], name: str, nominal: float, index: int | None = None
-) -> float:
-    if name not in changes:
-        return nominal
-    operation, value = changes[name]
-    return changed(operation, nominal, value if index is None else value[index])

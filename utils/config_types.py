@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -204,6 +205,18 @@ def changed(operation: str, nominal: float, value: float) -> float:
     if operation == "scale":
         return nominal * value
     return nominal + value if operation == "add" else value
+
+
+def changed_in(
+    changes: Mapping[str, Change], name: str, nominal: Any, index: int | None = None
+) -> Any:
+    """A nominal value, or an array of them, after the change of that name, if there is one.
+
+    index: of the entry to take, where the change has a value for each object."""
+    if name not in changes:
+        return nominal
+    operation, value = changes[name]
+    return changed(operation, nominal, value if index is None else value[index])
 
 
 def _draw_one(spec: Range, rng: np.random.Generator) -> float:
