@@ -50,16 +50,32 @@ CONTACT_TIME = 0.005
 
 # MuJoCo's steps in one of the cell's steps: a grip lasts through about one millisecond.
 SUBSTEPS = 4
+_PUSH = 1e-12  # m/s
 
 
 def set_up_physics(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Set gravity and the friction solver of a model; returns it."""
+    """Set gravity and the friction solver of a model, and let what lies still sleep; returns it.
+
+    What sleeps costs nothing and has no contacts. MuJoCo wakes what is touched by something awake,
+    and the robot never sleeps; `wake` does it where a support disappears.
+    """
     mujoco = load_mujoco()
     spec.option.gravity = [0, 0, -GRAVITY]
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 100  # of friction's stiffness: grasped objects creep less
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     return spec
+
+
+def wake(model: mujoco.MjModel, data: mujoco.MjData, bodies: Iterable[int]) -> None:
+    """Wake free bodies, by MuJoCo's numbers, that sleep.
+
+    MuJoCo takes any speed of a sleeping body for a push, however small it is.
+    """
+    for body in bodies:
+        if not data.body_awake[body]:
+            data.qvel[model.body_dofadr[body]] = _PUSH
 
 
 def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
@@ -187,6 +203,7 @@ class MujocoTable(LayoutTable):
 
     def remove(self, body: int) -> None:
         self._collide(body, False)
+        wake(self._model, self._data, [self._model.body(_name(used)).id for used in self._used()])
         if body < len(self._models):
             self._place(body, _PARKED, (0.0, 0.0, 0.0, 1.0))
             self._free.append(body)
@@ -220,6 +237,10 @@ class MujocoTable(LayoutTable):
             for one in self._shapes(body)
             for two in self._shapes(other)
         )
+
+    def _used(self) -> list[int]:
+        """Numbers of the objects on the table."""
+        return [number for number in range(len(self._models)) if number not in self._free]
 
     def _place(self, number: int, position, quaternion) -> None:
         """Put an object down, at rest."""

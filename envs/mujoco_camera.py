@@ -63,12 +63,11 @@ class MujocoCamera(Camera):
         near, far = intrinsics.near, intrinsics.far
         extent = model.stat.extent
         model.vis.map.znear, model.vis.map.zfar = near / extent, far / extent
-        _shine(model, DEFAULT_LIGHT | (light or {}))
         place = camera_of(intrinsics, T_WC)
         number = self._camera.fixedcamid
         model.cam_fovy[number] = place["fovy"]
         mujoco.mj_kinematics(model, data)  # a step leaves poses one step behind
-        mujoco.mj_camlight(model, data)
+        _shine(model, data, DEFAULT_LIGHT | (light or {}))
         data.cam_xpos[number] = place["pos"]
         data.cam_xmat[number] = place["mat"].ravel()
         mujoco.mjv_updateScene(
@@ -182,12 +181,16 @@ def camera_of(intrinsics: Intrinsics, T_WC: np.ndarray) -> dict:
     }
 
 
-def _shine(model: mujoco.MjModel, light: dict) -> None:
-    """Set the model's light; `light` has the keys of DEFAULT_LIGHT."""
+def _shine(model: mujoco.MjModel, data: mujoco.MjData, light: dict) -> None:
+    """Set the light; `light` has the keys of DEFAULT_LIGHT.
+
+    Its place goes into the data at once: MuJoCo derives it from the model's no more, once bodies
+    may sleep.
+    """
     direction, colour = (np.array(light[k], float) for k in ("lightDirection", "lightColor"))
     number = model.light(LIGHT).id
-    model.light_dir[number] = -direction / np.linalg.norm(direction)
-    model.light_pos[number] = light["lightDistance"] * -model.light_dir[number]
+    data.light_xdir[number] = -direction / np.linalg.norm(direction)
+    data.light_xpos[number] = light["lightDistance"] * -data.light_xdir[number]
     model.light_diffuse[number] = light["lightDiffuseCoeff"] * colour
     model.light_specular[number] = light["lightSpecularCoeff"] * colour
     model.light_castshadow[number] = bool(light["shadow"])

@@ -34,6 +34,7 @@ from envs.mujoco_bodies import (
     add_box,
     add_object,
     set_up_physics,
+    wake,
 )
 from envs.mujoco_camera import MujocoCamera, Window, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
@@ -166,14 +167,6 @@ class MujocoCell(Cell):
             if self.robot.data.warning[kind].number:
                 raise PhysicsError(f"MuJoCo warns of {kind.name}")
 
-    def enable_sleeping(self) -> bool:
-        """MuJoCo itself wakes an object that something else touches."""
-        self.robot.model.opt.enableflags |= self._mujoco.mjtEnableBit.mjENBL_SLEEP
-        return True
-
-    def disable_sleeping(self) -> None:
-        self.robot.model.opt.enableflags &= ~int(self._mujoco.mjtEnableBit.mjENBL_SLEEP)
-
     def object_pose(self, index: int) -> np.ndarray:
         start = self._places[index]
         w, x, y, z = self.robot.data.qpos[start + 3 : start + 7]
@@ -211,6 +204,8 @@ class MujocoCell(Cell):
         model.pair_margin[pairs] = -spheres[pairs]
         model.body_gravcomp[body] = 1.0  # with nothing that pulls or touches, it stays
         self.robot.data.qvel[self._speeds[index] : self._speeds[index] + 6] = 0.0
+        # What leaned on it must not go on sleeping.
+        wake(model, self.robot.data, [self.bodies[other] for other in self.remaining])
 
     def _free_camera(self) -> None:
         if self._camera is not None:

@@ -37,6 +37,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import brentq
 
+from envs.mujoco_bodies import wake
 from envs.mujoco_panda import ARM_JOINTS, FINGERS, MujocoPanda, load_mujoco
 from utils.config_types import Change, changed_in
 from utils.transforms import pose_matrix
@@ -99,6 +100,7 @@ class MujocoRandomizable:
         model.opt.gravity[2] = changed_in(changes, "gravity", self._gravity)
         # Inertias seen by contacts and joints; the nominal ones come back bit for bit.
         self._mujoco.mj_setConst(model, self._scratch)
+        wake(model, self._robot.data, self._bodies)
 
     def paint(self, colours: Sequence[Sequence[float]] | None) -> None:
         self._model.geom_rgba[:] = self._colours

@@ -1,13 +1,16 @@
 """The cell in MuJoCo beside PyBullet's: its bodies, what is gripped, what is a success."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from envs.cell import PhysicsError
+from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
+from envs.mujoco_bodies import wake
 from envs.mujoco_cell import MujocoCell
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
@@ -23,6 +26,20 @@ def test_settled_objects_stay_where_pybullet_has_them(cells, pile):
     for index in cells[1].remaining:
         off = cells[0].object_position(index) - cells[1].object_position(index)
         assert np.linalg.norm(off) < 0.003
+
+
+def test_what_leans_on_a_retired_object_wakes_and_falls(config, box_set):
+    """Two cubes of 6 cm, one on the other; both sleep, and the upper one comes down by a cube."""
+    one = make_scene("isolated", box_set, 0, config).placements[0]
+    stack = [replace(one, position=np.array([0.5, 0.0, z]), quaternion=np.array([0, 0, 0, 1.0]))
+             for z in (0.03, 0.09)]  # fmt: skip
+    with MujocoCell(config) as cell:
+        cell.build(Scene("pile", 0, tuple(stack)))
+        cell.step(60)
+        assert not cell.robot.data.body_awake[cell.bodies].any()
+        cell.retire(0)
+        cell.step(24)  # 0.1 s: by 4.9 cm of its 6
+        assert cell.object_position(1)[2] == pytest.approx(0.09 - 9.81 * 0.1**2 / 2, abs=3e-3)
 
 
 @pytest.mark.slow
@@ -194,6 +211,7 @@ def test_a_box_slides_on_a_tilt_steeper_than_its_friction(config, box_set):
         cell.robot.model.opt.gravity[:] = (
             9.81 * np.sin(np.radians(degrees)), 0, -9.81 * np.cos(np.radians(degrees)),
         )  # fmt: skip
+        wake(cell.robot.model, cell.robot.data, cell.bodies)
         cell.step(round(0.3 / cell.dt))
         moved[degrees] = np.linalg.norm(cell.object_pose(0)[:3, 3] - start)
     assert moved[20] < 0.005 < 0.03 < moved[35]
