@@ -75,9 +75,10 @@ soak: $(VENV)/.installed-dev
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
+# Without compiling all of torch to bytecode, pip needs half the time.
 # LOCKED=1 takes the versions and hashes of requirements.lock, as CI does; they include what tests need.
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install -r $(if $(LOCKED),requirements.lock,requirements.txt)
+	$(BIN)/python -m pip install --no-compile -r $(if $(LOCKED),requirements.lock,requirements.txt)
 	touch $@
 
 $(VENV)/.installed-cluster: $(VENV)/.installed
@@ -85,7 +86,7 @@ $(VENV)/.installed-cluster: $(VENV)/.installed
 	touch $@
 
 $(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
-	$(BIN)/python -m pip install -r requirements-dev.txt
+	$(BIN)/python -m pip install --no-compile -r requirements-dev.txt
 	touch $@
 
 # The newest versions that requirements*.txt admit, with hashes for every system and Python: requirements.lock.

@@ -36,6 +36,7 @@ def add_view(spec: mujoco.MjSpec) -> None:
     light = spec.worldbody.add_light(name=LIGHT)
     light.type = load_mujoco().mjtLightType.mjLIGHT_DIRECTIONAL
     spec.visual.quality.offsamples = 0  # mixed pixels would have mixed depths and numbers
+    spec.visual.quality.shadowsize = 2048  # without a graphics card, a film takes half the time
 
 
 class MujocoCamera(Camera):
@@ -59,6 +60,26 @@ class MujocoCamera(Camera):
 
     def render(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:
         """The image of a camera at T_WC (4, 4); its `bodies` are MuJoCo's numbers."""
+        self._look(intrinsics, T_WC, light)
+        near, far = intrinsics.near, intrinsics.far
+        rgb, _ = self._draw(intrinsics, as_numbers=False)
+        colours, inverse = self._draw(intrinsics, as_numbers=True)
+        # With the far plane at 0, what is stored is linear in one over the depth.
+        depth = near * far / (near + (far - near) * inverse)
+        nothing = inverse <= 0
+        rgb[nothing], depth[nothing] = 255, 0.0  # empty space is white in PyBullet, black here
+        return Image(rgb, depth.astype(np.float32), self._bodies(colours))
+
+    def render_rgb(
+        self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None
+    ) -> np.ndarray:
+        self._look(intrinsics, T_WC, light)
+        rgb, inverse = self._draw(intrinsics, as_numbers=False)
+        rgb[inverse <= 0] = 255
+        return rgb
+
+    def _look(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None) -> None:
+        """Put camera and light in place."""
         mujoco, model, data = self._mujoco, self._model, self._data
         near, far = intrinsics.near, intrinsics.far
         extent = model.stat.extent
@@ -73,13 +94,6 @@ class MujocoCamera(Camera):
         mujoco.mjv_updateScene(
             model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        rgb, _ = self._draw(intrinsics, as_numbers=False)
-        colours, inverse = self._draw(intrinsics, as_numbers=True)
-        # With the far plane at 0, what is stored is linear in one over the depth.
-        depth = near * far / (near + (far - near) * inverse)
-        nothing = inverse <= 0
-        rgb[nothing], depth[nothing] = 255, 0.0  # empty space is white in PyBullet, black here
-        return Image(rgb, depth.astype(np.float32), self._bodies(colours))
 
     def _draw(self, intrinsics: Intrinsics, as_numbers: bool) -> tuple[np.ndarray, np.ndarray]:
         """Colours (H, W, 3) uint8 and the depth buffer (H, W), or numbers of shapes as colours."""

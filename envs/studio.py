@@ -54,7 +54,7 @@ class Studio:
             self._twin.mirror(self._cell)
             shown = self._twin
         # Not `Cell.image`: a randomised view belongs to the cell's camera and counts its pictures.
-        return shown.camera.render(self._intrinsics, self._T_WC, _LIGHT).rgb
+        return shown.camera.render_rgb(self._intrinsics, self._T_WC, _LIGHT)
 
     def close(self) -> None:
         if self._twin is not None:
