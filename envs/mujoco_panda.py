@@ -22,7 +22,13 @@ from envs.panda_model import (
     panda_links,
 )
 from envs.robot import FINGER_SPEED, Contact, Robot
-from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, forward_kinematics
+from envs.robot_kinematics import (
+    JOINT_LOWER,
+    JOINT_TORQUE,
+    JOINT_UPPER,
+    JOINT_VELOCITY,
+    forward_kinematics,
+)
 from envs.robot_safety import ArmGate
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
@@ -70,7 +76,7 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
         stiffness, torque = _STIFFNESS[i], JOINT_TORQUE[i]
         _servo(mujoco, spec, name, mujoco.mjtTrn.mjTRN_JOINT, (
             stiffness, -stiffness, -_DAMPING_RATIO_OF_STIFFNESS * stiffness,
-        ), torque, joint.range)  # fmt: skip
+        ), torque)  # fmt: skip
     for name in FINGER_JOINTS:
         spec.joint(name).armature = _FINGER_ARMATURE
     equal = spec.add_equality()
@@ -83,7 +89,9 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     # The tendon's force acts on both fingers alike, so this one is a finger's.
     _servo(mujoco, spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, (
         _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
-    ), FINGER_FORCE, [0.0, gripper.max_opening])  # fmt: skip
+    ), FINGER_FORCE)  # fmt: skip
+    fingers = spec.actuator("opening")
+    fingers.ctrlrange, fingers.ctrllimited = [0.0, gripper.max_opening], True
     # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
     for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
         exclude = spec.add_exclude()
@@ -110,14 +118,17 @@ def _add_link(mujoco, spec: mujoco.MjSpec, link: Link) -> None:
         joint.range, joint.limited = [link.joint.lower, link.joint.upper], True
 
 
-def _servo(mujoco, spec, target: str, kind, gains, force: float, span) -> None:
-    """force = gain x control + position gain x position + velocity gain x velocity, limited."""
+def _servo(mujoco, spec, target: str, kind, gains, force: float) -> None:
+    """force = gain x control + position gain x position + velocity gain x velocity, limited.
+
+    The control has no limits of its own: what makes up for the damping takes it beyond the range of
+    a joint that is within.
+    """
     actuator = spec.add_actuator(name=target, target=target, trntype=kind)
     actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
     actuator.gainprm[0] = gains[0]
     actuator.biasprm[:3] = [0.0, *gains[1:]]
-    actuator.forcerange, actuator.ctrlrange = [-force, force], list(span)
-    actuator.forcelimited = actuator.ctrllimited = True
+    actuator.forcerange, actuator.forcelimited = [-force, force], True
 
 
 class MujocoPanda(Robot):
@@ -252,9 +263,11 @@ class MujocoPanda(Robot):
         self._reference = self._reference + step
         target = self._reference + self.damping_time * step / self.dt
         # The servo asks for the velocity (target - q) / damping_time. An arm that is behind, while
-        # it accelerates or after a collision, must not catch up faster than the limit.
+        # it accelerates or after a collision, must not catch up faster than the limit; nor may it
+        # overshoot the end of a joint's range, before which the reference does not brake.
         q, reach = self.q, self.damping_time * self._speed
-        return np.minimum(np.maximum(target, q - reach), q + reach)
+        lower, upper = np.maximum(q - reach, JOINT_LOWER), np.minimum(q + reach, JOINT_UPPER)
+        return np.minimum(np.maximum(target, lower), upper)
 
     # --- Contacts -----------------------------------------------------------------------------
 

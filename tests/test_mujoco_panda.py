@@ -123,6 +123,17 @@ def test_a_trajectory_is_followed(panda):
     np.testing.assert_allclose(panda.q, READY, atol=1e-3)
 
 
+def test_a_joint_near_its_limit_is_as_quick_as_elsewhere(panda):
+    q, velocity = READY.copy(), np.zeros(7)
+    q[6], velocity[6] = JOINT_UPPER[6] - 0.3, 1.0
+    panda.place(q)
+    for _ in range(round(0.28 / panda.dt)):
+        q[6] += velocity[6] * panda.dt
+        panda.command_arm(q, velocity)
+        panda.step()
+        assert panda.q[6] == pytest.approx(q[6], abs=0.005)  # it moves 4.2 mrad in a period
+
+
 def test_fingers_close_no_faster_than_the_hand(panda):
     """0.05 m/s a finger: 4 cm less in 0.4 s."""
     panda.place(READY, opening=0.08)
