@@ -41,8 +41,7 @@ _PARKED = (0.0, 0.0, -10.0)  # m in W, where an object is that is not on the tab
 # MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
 # fingers: with nothing on these here, the object's own coefficient counts in both.
 NO_FRICTION = 1e-5
-# m and dimensionless lengths of torsional and rolling friction, MuJoCo's defaults.
-TORSION, ROLLING = 0.005, 1e-4
+ROLLING = 1e-4  # m, MuJoCo's default
 # s, in which a contact gets rid of a penetration. MuJoCo's default, 20 ms, is so soft that objects
 # of 30 g creep and turn in a grip of 10 N (by 1.6 mm in half a second, with this by 0.5 mm).
 CONTACT_TIME = 0.005
@@ -85,7 +84,7 @@ def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
     geom = body.add_geom(
         name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=list(box.half_size), rgba=list(colour)
     )
-    geom.friction = [NO_FRICTION, TORSION, ROLLING]
+    geom.friction = [NO_FRICTION, 0.0, ROLLING]
     geom.solref[0] = CONTACT_TIME
 
 
@@ -102,8 +101,8 @@ def add_object(
     body.explicitinertial = True
     for geom in _add_shapes(spec, body, name, model):
         geom.rgba = list(model.color)
-        geom.friction = [model.friction, TORSION, max(model.rolling_friction, ROLLING)]
-        geom.condim = 6 if model.rolling_friction else 4
+        geom.friction = [model.friction, 0.0, max(model.rolling_friction, ROLLING)]
+        geom.condim = 6 if model.rolling_friction else 3
         geom.solref[0] = CONTACT_TIME
     return body
 

@@ -29,7 +29,6 @@ from envs.mujoco_bodies import (
     NO_FRICTION,
     ROLLING,
     SUBSTEPS,
-    TORSION,
     add_board,
     add_box,
     add_object,
@@ -39,6 +38,7 @@ from envs.mujoco_bodies import (
 from envs.mujoco_camera import MujocoCamera, Window, add_view
 from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
 from envs.mujoco_randomization import MujocoRandomizable
+from envs.panda_model import FINGER_SURFACE
 from utils.config import Config
 from utils.geometry import GripperGeometry
 from utils.transforms import pose_matrix, position_quaternion
@@ -55,7 +55,7 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
     spec = set_up_physics(panda_spec(gripper))
     for name in FINGERS:
         for geom in spec.body(name).geoms:
-            geom.friction = [NO_FRICTION, TORSION, ROLLING]
+            geom.friction = [NO_FRICTION, 0.0, ROLLING]
     add_box(spec, "table", table_box(), TABLE_COLOUR)
     for i, wall in enumerate(bin_walls()):
         add_box(spec, f"bin{i}", wall, BIN_COLOUR)
@@ -74,22 +74,26 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
 def _add_pairs(spec: mujoco.MjSpec, count: int) -> None:
     """Give the contacts of the objects with table and fingers parameters of their own.
 
-    They are those that MuJoCo would take from the two shapes, and the physics is the same to the
-    last bit; `envs.mujoco_randomization` changes them.
+    Sliding and rolling friction are those that MuJoCo would take from the two shapes. Torsional
+    friction, a fourth dimension of a contact, is the fingertips' alone, as in PyBullet.
+    `envs.mujoco_randomization` changes all of them.
     """
     touched = [
-        geom for name in ("table", *FINGERS) for geom in spec.body(name).geoms if geom.contype
+        (geom, FINGER_SURFACE.spinning if name in FINGERS else 0.0)
+        for name in ("table", *FINGERS)
+        for geom in spec.body(name).geoms
+        if geom.contype
     ]
-    for number, geom in enumerate(touched):
+    for number, (geom, _) in enumerate(touched):
         geom.name = geom.name or f"touched{number}"
     for i in range(count):
         for number, shape in enumerate(spec.body(f"object{i}").geoms):
             shape.name = f"object{i}_{number}"
-            for other in touched:
-                sliding, torsion, rolling = np.maximum(shape.friction, other.friction)
+            for other, patch in touched:
+                sliding, _, rolling = np.maximum(shape.friction, other.friction)
                 pair = spec.add_pair(geomname1=shape.name, geomname2=other.name)
-                pair.friction = [sliding, sliding, torsion, rolling, rolling]
-                pair.condim = max(shape.condim, other.condim)
+                pair.friction = [sliding, sliding, patch * sliding, rolling, rolling]
+                pair.condim = max(shape.condim, 4 if patch else 3)
                 pair.solref, pair.solimp = shape.solref, shape.solimp
 
 

@@ -14,6 +14,7 @@ from envs.panda_model import (
     ARM_JOINTS,
     ARM_LINKS,
     BASE,
+    FINGER_DRIVE_INERTIA,
     FINGER_FORCE,
     FINGER_JOINTS,
     FINGERS,
@@ -45,7 +46,6 @@ _STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 _DAMPING_RATIO_OF_STIFFNESS = 0.1  # s
 _ARMATURE = 0.1
 _FINGER_STIFFNESS, _FINGER_DAMPING = 4000.0, 100.0  # N/m, N s/m
-_FINGER_ARMATURE = 0.1  # kg
 
 
 def load_mujoco():
@@ -78,7 +78,7 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
             stiffness, -stiffness, -_DAMPING_RATIO_OF_STIFFNESS * stiffness,
         ), torque)  # fmt: skip
     for name in FINGER_JOINTS:
-        spec.joint(name).armature = _FINGER_ARMATURE
+        spec.joint(name).armature = FINGER_DRIVE_INERTIA
     equal = spec.add_equality()
     equal.type, equal.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
     equal.name, (equal.name1, equal.name2) = "fingers", FINGER_JOINTS
@@ -91,7 +91,8 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
         _FINGER_STIFFNESS, -_FINGER_STIFFNESS, -_FINGER_DAMPING,
     ), FINGER_FORCE)  # fmt: skip
     fingers = spec.actuator("opening")
-    fingers.ctrlrange, fingers.ctrllimited = [0.0, gripper.max_opening], True
+    fingers.ctrlrange = [-_beyond(FINGER_FORCE), gripper.max_opening]
+    fingers.ctrllimited = True
     # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
     for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
         exclude = spec.add_exclude()
@@ -116,6 +117,11 @@ def _add_link(mujoco, spec: mujoco.MjSpec, link: Link) -> None:
             name=link.joint.name, type=kinds[link.joint.kind], axis=list(link.joint.axis)
         )
         joint.range, joint.limited = [link.joint.lower, link.joint.upper], True
+
+
+def _beyond(force: float) -> float:
+    """m by which the fingers' goal lies beyond where they are when they press with `force` N."""
+    return force / _FINGER_STIFFNESS
 
 
 def _servo(mujoco, spec, target: str, kind, gains, force: float) -> None:
@@ -232,7 +238,8 @@ class MujocoPanda(Robot):
 
     def _drive_fingers(self, opening: float, force: float) -> None:
         self.model.actuator_forcerange[7] = [-force, force]
-        self._opening = opening
+        # A closing hand aims beyond closed, so that it also grips a thin object with all its force.
+        self._opening = opening or -_beyond(force)
 
     def step(self, count: int = 1) -> None:
         """Advance by so many control periods."""

@@ -8,7 +8,7 @@ parameter changes, beside PyBullet's cell (`envs.pybullet_randomization`):
 | object_mass | mass and inertia of the object, and the constants that follow from them |
 | object_friction | sliding friction of the object in every contact |
 | rolling_friction | rolling friction, m, of the object in every contact; none if it is 0 |
-| spinning_friction | torsional friction, m, in contacts of objects with the fingertips |
+| spinning_friction | torque over friction force, m, in contacts of objects with the fingertips |
 | table_friction, finger_friction | 1 nominally; multiplies the object's sliding friction there |
 | restitution | damping of the object's contact with the table, see `restitution_of` |
 | contact_stiffness, contact_damping | of contacts of objects with the fingertips, 1/s^2 and 1/s |
@@ -39,11 +39,12 @@ from scipy.optimize import brentq
 
 from envs.mujoco_bodies import wake
 from envs.mujoco_panda import ARM_JOINTS, FINGERS, MujocoPanda, load_mujoco
+from envs.panda_model import FINGER_SURFACE
 from utils.config_types import Change, changed_in
 from utils.transforms import pose_matrix
 
 _OF_OBJECTS = ("object_mass", "object_friction", "rolling_friction", "restitution")
-_WITHOUT_ROLLING, _WHOLE = 4, 6  # dimensions of a contact without and with rolling friction
+_SLIDES, _TURNS, _ROLLS = 3, 4, 6  # dimensions of a contact: with torsional, with rolling friction
 # The fields of MuJoCo's model that `apply` changes. MuJoCo derives others from them.
 _PHYSICS = (
     "body_mass", "body_inertia", "geom_friction", "geom_condim", "pair_friction", "pair_dim",
@@ -82,6 +83,7 @@ class MujocoRandomizable:
         ends = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
         self._with_table = (ends == table).any(axis=1)
         self._with_fingers = np.isin(ends, fingers).any(axis=1)
+        self._pair_dim = np.where(self._with_fingers, _TURNS, _SLIDES)  # without rolling friction
         self._pairs_of = [(ends == body).any(axis=1) for body in self._bodies]
         self._shapes_of = [model.geom_bodyid == body for body in self._bodies]
 
@@ -139,24 +141,26 @@ class MujocoRandomizable:
     def _change_friction(self, changes: Mapping[str, Change]) -> None:
         model = self._model
         for i, (shapes, pairs) in enumerate(zip(self._shapes_of, self._pairs_of)):
-            for friction, dimensions, rows, sliding, rolling in (
-                (model.geom_friction, model.geom_condim, shapes, slice(0, 1), slice(2, 3)),
-                (model.pair_friction, model.pair_dim, pairs, _SLIDING, _ROLLING),
-            ):
+            for friction, dimensions, plain, rows, sliding, rolling in (
+                (model.geom_friction, model.geom_condim, _SLIDES, shapes, slice(0, 1), slice(2, 3)),
+                (model.pair_friction, model.pair_dim, self._pair_dim[pairs], pairs, _SLIDING,
+                 _ROLLING),
+            ):  # fmt: skip
                 nominal = friction[rows, sliding]
                 friction[rows, sliding] = changed_in(changes, "object_friction", nominal, i)
                 first = np.flatnonzero(rows)[0]  # all of an object's have the same
-                rolls = dimensions[first] == _WHOLE
+                rolls = dimensions[first] == _ROLLS
                 length = float(friction[first, rolling.start]) if rolls else 0.0
                 new = changed_in(changes, "rolling_friction", length, i)
                 if new != length:
                     friction[rows, rolling] = new
-                    dimensions[rows] = _WHOLE if new > 0 else _WITHOUT_ROLLING
+                    dimensions[rows] = _ROLLS if new > 0 else plain
         table, fingers, friction = self._with_table, self._with_fingers, model.pair_friction
+        # As in Bullet: of the object's friction, whatever the fingers' sliding friction is.
+        patch = changed_in(changes, "spinning_friction", FINGER_SURFACE.spinning)
+        friction[fingers, _TORSION] = patch * friction[fingers, _SLIDING.start]
         friction[table, _SLIDING] *= changed_in(changes, "table_friction", 1.0)
         friction[fingers, _SLIDING] *= changed_in(changes, "finger_friction", 1.0)
-        torsion = friction[fingers, _TORSION]
-        friction[fingers, _TORSION] = changed_in(changes, "spinning_friction", torsion)
 
     def _change_contacts(self, changes: Mapping[str, Change]) -> None:
         """Write stiffness and damping where they change: MuJoCo takes them negated, in place of a

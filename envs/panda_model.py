@@ -105,8 +105,9 @@ INERTIALS = {
 
 
 class Surface(NamedTuple):
-    """friction: coefficient of sliding. spinning: of torsion, m. stiffness: N/m, and damping:
-    N s/m, of a contact."""
+    """friction: coefficient of sliding; that of the object counts besides. spinning: the largest
+    torque about a contact's normal, over the largest friction force, m. stiffness: N/m, and
+    damping: N s/m, of a contact."""
 
     friction: float
     spinning: float
@@ -114,9 +115,20 @@ class Surface(NamedTuple):
     damping: float
 
 
-# Of the fingers, as pybullet_data's `franka_panda/panda.urdf` states it. MuJoCo takes of it the
-# sliding friction, which counts as 1 there, too: see `envs.mujoco_cell`.
-FINGER_SURFACE = Surface(friction=1.0, spinning=0.1, stiffness=30000.0, damping=1000.0)
+# A rubber fingertip touches an object not in a point but in a patch, here a disc of this radius
+# under even pressure: a bit less than half the 17.6 mm width of the tips. About its normal friction
+# then holds a torque of 2/3 radius x friction force (Howe and Cutkosky, "Practical force-motion
+# models for sliding manipulation", IJRR 1996).
+PATCH_RADIUS = 0.0075  # m
+# Stiffness and damping, for PyBullet alone, as pybullet_data's `franka_panda/panda.urdf` has them.
+FINGER_SURFACE = Surface(
+    friction=1.0, spinning=2 / 3 * PATCH_RADIUS, stiffness=30000.0, damping=1000.0
+)
+
+# kg that motor and gear add to what a finger's motion has to accelerate. Nobody has published it.
+# With the 15 g of a finger alone PyBullet's solver, which takes from joint to contact a limited
+# impulse in each iteration, grips with 5 N whatever the motor's force; with this, with up to 70 N.
+FINGER_DRIVE_INERTIA = 0.2
 
 
 # --- Shapes ---------------------------------------------------------------------------------------

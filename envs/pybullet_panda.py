@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
+from envs.panda_model import FINGER_DRIVE_INERTIA
 from envs.robot import FINGER_SPEED, LEFT, Contact, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
@@ -52,11 +53,8 @@ class PybulletPanda(Robot):
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
         )
         self.links = [self.body]
-        # One motor drives both fingers, as in the real hand: the left finger's, and a gear takes it
-        # to the right one. Without the gear the fingers drift off centre (bullet3 #2101).
-        pybullet.setJointMotorControl2(
-            self.body, RIGHT_FINGER, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client
-        )
+        # In the real hand one motor drives both fingers. Here each has its share, and a gear keeps
+        # them together: without it they drift off centre (bullet3 #2101).
         gear = pybullet.createConstraint(
             self.body, LEFT_FINGER, self.body, RIGHT_FINGER, pybullet.JOINT_GEAR,
             [1, 0, 0], [0, 0, 0], [0, 0, 0], physicsClientId=client,
@@ -65,6 +63,11 @@ class PybulletPanda(Robot):
         for link in [*ARM, *FINGERS]:
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
+            )
+        for link in FINGERS:  # Bullet has no inertia of a joint's own, so that the finger has it
+            mass = pybullet.getDynamicsInfo(self.body, link, physicsClientId=client)[0]
+            pybullet.changeDynamics(
+                self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=client
             )
         self.limit_speed(JOINT_VELOCITY.max())
 
@@ -131,13 +134,14 @@ class PybulletPanda(Robot):
             )  # fmt: skip
 
     def _send_gripper(self, opening: float, force: float) -> None:
-        self._send(
-            pybullet.setJointMotorControl2, self.body, LEFT_FINGER, pybullet.POSITION_CONTROL,
-            targetPosition=opening / 2, force=2 * force,
-            positionGain=self.gripper_gain * _GRIPPER_GAIN, velocityGain=1.0,
-            maxVelocity=FINGER_SPEED,
-            physicsClientId=self.client,
-        )  # fmt: skip
+        for finger in FINGERS:
+            self._send(
+                pybullet.setJointMotorControl2, self.body, finger, pybullet.POSITION_CONTROL,
+                targetPosition=opening / 2, force=force,
+                positionGain=self.gripper_gain * _GRIPPER_GAIN, velocityGain=1.0,
+                maxVelocity=FINGER_SPEED,
+                physicsClientId=self.client,
+            )  # fmt: skip
 
     # --- Contacts -----------------------------------------------------------------------------
 

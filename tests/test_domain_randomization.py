@@ -301,10 +301,10 @@ def test_fingers_table_and_gravity_as_pybullet_reports_them(scene):
     with cell_class("pybullet")(config) as cell:
         cell.build(scene)
         randomizer_of(cell).randomize(0)
-        for finger in FINGERS:  # panda.urdf: friction 1, spinning 0.1, 30000 N/m, 1000 N s/m
+        for finger in FINGERS:  # nominally friction 1, a patch of 5 mm, 30000 N/m, 1000 N s/m
             found = dynamics(cell, cell.robot.body, finger)
             assert (found["stiffness"], found["damping"]) == (15000, 2000)
-            assert found["friction"] == 1.25 and found["spinning"] == pytest.approx(0.3)
+            assert found["friction"] == 1.25 and found["spinning"] == pytest.approx(0.015)
         assert dynamics(cell, cell.table)["friction"] == 0.75
         assert {dynamics(cell, body)["restitution"] for body in cell.bodies} == {0.1}
         parameters = pybullet.getPhysicsEngineParameters(physicsClientId=cell.client)

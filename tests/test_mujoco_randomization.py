@@ -75,7 +75,7 @@ def test_a_box_slides_where_the_tilt_exceeds_the_product_of_the_frictions(cell, 
 
 
 def test_finger_friction_counts_between_fingers_alone(cell):
-    """What the fingers carry, 2 mu F of 10 N each, against the weight of 0.1 kg at 70 m/s^2."""
+    """What the fingers carry, 2 mu F of 10 N each, against the weight of 0.1 kg at 60 m/s^2."""
     held = {}
     for finger in (1.0, 0.5):
         cell.build(cell.scene)
@@ -87,12 +87,12 @@ def test_finger_friction_counts_between_fingers_alone(cell):
         cell.step(120)
         assert cell.robot.holds(cell.bodies[0])
         before = cell.object_position(0)[2]
-        apply(cell, finger_friction=("scale", finger), gravity=("set", -70.0))
+        apply(cell, finger_friction=("scale", finger), gravity=("set", -60.0))
         cell.step(12)
         held[finger] = before - cell.object_position(0)[2]
-    # 10 N carry 7 N; beside 5 N there are 2 N left, which speed the cube up by 20 m/s^2.
+    # 10 N carry 6 N; beside 5 N there is 1 N left, which speeds the cube up by 10 m/s^2.
     assert held[1.0] < 2e-3
-    assert held[0.5] == pytest.approx(20 * 0.05**2 / 2, rel=0.1)
+    assert held[0.5] == pytest.approx(10 * 0.05**2 / 2, rel=0.1)
 
 
 def test_gravity_and_free_fall(cell):
@@ -148,14 +148,14 @@ def test_the_formula_of_restitution():
 
 @pytest.mark.parametrize(
     ("own", "change", "expected", "dimensions"),
-    [(1e-3, ("scale", [2.0]), 2e-3, 6), (0.0, ("scale", [2.0]), 1e-4, 4),
-     (0.0, ("set", [3e-3]), 3e-3, 6), (1e-3, ("set", [0.0]), 0.0, 4)],
+    [(1e-3, ("scale", [2.0]), 2e-3, {6}), (0.0, ("scale", [2.0]), 1e-4, {3, 4}),
+     (0.0, ("set", [3e-3]), 3e-3, {6}), (1e-3, ("set", [0.0]), 0.0, {3, 4})],
 )  # fmt: skip
 def test_rolling_friction_in_every_contact_of_an_object(
     built, box_set, own, change, expected, dimensions
 ):
     """An object without it keeps none where it is scaled; MuJoCo's 1e-4 has no effect in contacts
-    of four dimensions, which have no rolling friction."""
+    of three or four dimensions, which have no rolling friction."""
     model = replace(box_set[0], rolling_friction=own)
     at = Placement(model, np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
     built.build(Scene("isolated", 0, (at,)))
@@ -164,9 +164,9 @@ def test_rolling_friction_in_every_contact_of_an_object(
     shapes = model.geom_bodyid == built.bodies[0]
     assert (model.geom_friction[shapes, 2] == expected).all()
     assert (model.pair_friction[:, 3:] == expected).all()
-    assert {*model.pair_dim, *model.geom_condim[shapes]} == {dimensions}
+    assert {*model.pair_dim, *model.geom_condim[shapes]} == dimensions
     scene.apply({})
-    assert {*model.pair_dim, *model.geom_condim[shapes]} == {6 if own else 4}
+    assert {*model.pair_dim, *model.geom_condim[shapes]} == ({6} if own else {3, 4})
 
 
 def test_spinning_friction_brakes_what_turns_between_the_fingers(cell):

@@ -56,7 +56,7 @@ class SimConfig(Section):
 
 class RobotConfig(Section):
     home: JointVector
-    grip_force: Annotated[float, Field(gt=0, le=35)]  # beyond it the gear between fingers yields
+    grip_force: Annotated[float, Field(gt=0, le=70)]  # the Franka Hand's own limit
     velocity_scale: Share
     acceleration_scale: Share
 

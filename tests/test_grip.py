@@ -1,0 +1,109 @@
+"""What the fingers hold: force, torque about a contact's normal, and bars gripped off their centre,
+in every simulator that is installed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from envs.cell import Cell
+from envs.cell_layout import ObjectModel, Placement, Scene
+from envs.object_primitives import NativeShape
+from envs.panda_model import PATCH_RADIUS
+from envs.simulators import make_cell
+from tests.helpers.simulators import INSTALLED
+
+G = 9.81
+UPRIGHT = np.eye(3)
+ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a cylinder's axis, z
+
+
+@pytest.fixture(scope="module", params=INSTALLED)
+def cell(request, config):
+    with make_cell(config.model_copy(update={"simulator": request.param})) as cell:
+        yield cell
+
+
+def solid(box_set, shape: NativeShape, mass: float, friction: float) -> ObjectModel:
+    mesh = shape.mesh(fine=True)
+    return replace(
+        box_set[0], collision=shape, mass=mass, friction=friction, rolling_friction=0.0,
+        inertia=mass / mesh.volume * np.diag(mesh.moment_inertia), extents=np.array(mesh.extents),
+        parts=(np.asarray(shape.mesh().vertices),),
+    )  # fmt: skip
+
+
+def grip(cell: Cell, model: ObjectModel, force: float, off: float = 0.0, turned=UPRIGHT) -> None:
+    """Close the fingers of the arm at home on an object `off` metres along x from their middle."""
+    cell.build(Scene("isolated", 0, (Placement(model, np.array([0.5, 0, 0.5]), np.eye(4)[3]),)))
+    T_WO = np.eye(4)
+    T_WO[:3, :3], T_WO[:3, 3] = turned, cell.robot.tip_pose()[:3, 3] + [off, 0.0, 0.0]
+    cell.robot.command_gripper(0.0, force=force)
+    for _ in range(240):
+        cell.carry(0, T_WO, np.zeros(3), 0.0)
+        cell.step()
+
+
+@pytest.mark.parametrize("thickness", [0.004, 0.05])
+@pytest.mark.parametrize("force", [10.0, 30.0, 60.0])
+def test_the_fingers_press_as_hard_as_they_are_told(cell, box_set, force, thickness):
+    plate = NativeShape("box", (0.04, thickness, 0.04))
+    grip(cell, solid(box_set, plate, 0.1, 0.5), force)
+    cell.step(120)
+    assert cell.robot.grip_forces(cell.bodies[0]) == pytest.approx((force, force), rel=0.03)
+
+
+@pytest.mark.parametrize("friction", [0.4, 0.8])
+def test_a_patch_holds_two_thirds_of_its_radius_times_the_friction_force(cell, box_set, friction):
+    """A ball touches each finger in a point: all of the torque is the patch's, 2/3 r mu F."""
+    force, ball = 20.0, NativeShape("sphere", (0.03,))
+    limit = 2 * (2 / 3) * PATCH_RADIUS * friction * force
+    for torque, holds in ((0.85 * limit, True), (1.3 * limit, False)):
+        model = solid(box_set, ball, 0.1, friction)
+        grip(cell, model, force)
+        for _ in range(12):
+            twist(cell, torque)
+            cell.step()
+        moved = 0.0 if holds else (torque - limit) / model.inertia[1] * 0.05**2 / 2
+        assert turn_of(cell) == pytest.approx(moved, rel=0.25, abs=0.01)
+
+
+def twist(cell: Cell, torque: float) -> None:
+    """Apply N m about the world's y axis, along which the fingers close, for the next step."""
+    if cell.config.simulator == "pybullet":
+        import pybullet
+
+        pybullet.applyExternalTorque(
+            cell.bodies[0], -1, [0, torque, 0], pybullet.WORLD_FRAME, physicsClientId=cell.client
+        )
+    else:
+        cell.robot.data.xfrc_applied[cell.bodies[0], 4] = torque
+
+
+def turn_of(cell: Cell) -> float:
+    """rad about y since the object was put between the fingers."""
+    R = cell.object_pose(0)[:3, :3]
+    return float(np.arctan2(R[0, 2], R[0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "force", "off", "holds"),
+    [("box", 10.0, 0.02, True), ("box", 30.0, 0.045, True), ("box", 10.0, 0.07, False),
+     ("cylinder", 10.0, 0.015, True), ("cylinder", 30.0, 0.045, True),
+     ("cylinder", 10.0, 0.06, False)],
+)  # fmt: skip
+def test_a_bar_gripped_off_its_centre(cell, box_set, kind, force, off, holds):
+    """0.3 kg, 24 cm long: it tilts where its weight times `off` exceeds what friction holds.
+
+    A cylinder touches a finger along the 17.6 mm of its width. If it turns about the middle of the
+    line, friction holds mu F (width / 4 + 2/3 r) a finger while it can also bear the weight."""
+    shape, turned = NativeShape("box", (0.24, 0.02, 0.03)), UPRIGHT
+    if kind == "cylinder":
+        shape, turned = NativeShape("cylinder", (0.012, 0.24)), ALONG_X
+        bound = 2 * 0.5 * force * (0.0176 / 2 + 2 / 3 * PATCH_RADIUS)
+        assert holds or 0.3 * G * off > bound
+    grip(cell, solid(box_set, shape, 0.3, 0.5), force, off, turned)
+    cell.step(96)
+    axis = cell.object_pose(0)[:3, 0 if kind == "box" else 2]
+    tilt = np.degrees(np.arcsin(-axis[2]))
+    assert tilt < 1.0 if holds else tilt > 5.0
