@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from envs.cell import Cell
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
@@ -26,12 +27,35 @@ from envs.robot_kinematics import (
 from envs.robot_safety import ArmStoppedError, reaching_down
 from utils.config import Config
 from utils.errors import UserError
+from utils.result_records import loose
 from utils.transforms import Grasp, top_down_pose
 
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _RELEASE_SECONDS = 0.35  # in which the fingers open and the object falls into the bin
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
+
+
+class InHandMotion:
+    """How far an object has moved in the hand since it was gripped, the farthest seen so far.
+
+    turned: rad. slid: m along the fingertips, by that point of the object which was between them;
+    along the closing line both fingers move with the object.
+    """
+
+    def __init__(self, cell: Cell, index: int):
+        self._cell, self._index = cell, index
+        self.turned = self.slid = 0.0
+        self._gripped = self._pose_in_hand()
+
+    def _pose_in_hand(self) -> np.ndarray:
+        return np.linalg.inv(self._cell.robot.tip_pose()) @ self._cell.object_pose(self._index)
+
+    def look(self) -> None:
+        """Measure once more."""
+        moved = self._pose_in_hand() @ np.linalg.inv(self._gripped)
+        self.turned = max(self.turned, float(Rotation.from_matrix(moved[:3, :3]).magnitude()))
+        self.slid = max(self.slid, float(np.linalg.norm(moved[[0, 2], 3])))
 
 
 @dataclass(frozen=True)
@@ -47,7 +71,8 @@ class GraspOutcome:
     object_index: the object that the hand held, even if it lost the object or stopped later; None
     if it held nothing.
     detail: one more sentence on the failure, or empty. palm_stopped_at: metres, the height of E at
-    which something under the palm stopped the approach.
+    which something under the palm stopped the approach. motion: of the object in the hand; None if
+    it held nothing.
     """
 
     reason: str
@@ -55,6 +80,7 @@ class GraspOutcome:
     object_index: int | None = None
     detail: str = ""
     palm_stopped_at: float | None = None
+    motion: InHandMotion | None = None
 
     @property
     def success(self) -> bool:
@@ -120,17 +146,19 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
 
     Success: both fingers grip one object, which is off the table with its centre of mass above
     execution.lift_height for execution.hold_seconds and all the way to the bin (checked every
-    0.05 s). A picked object is retired. The arm is at home at the end of every attempt. Raises
-    PhysicsError when the simulation blows up.
+    0.05 s). With execution.strict, it also must not turn or slide in the hand on the way (see
+    `utils.result_records.loose`). A picked object is retired. The arm is at home at the end of
+    every attempt. Raises PhysicsError when the simulation blows up.
 
     approach: moves the open gripper around the object; everything after it is the same for all.
     """
     cell.check_physics()
-    start, held, reason, detail = cell.seconds, None, "success", ""
+    start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
         held, raised = _grip(cell, grasp, approach)
-        _lift(cell, held, raised)
-        _carry_to_bin(cell, held)
+        motion = InHandMotion(cell, held)
+        _lift(cell, held, raised, motion)
+        _carry_to_bin(cell, held, motion)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -143,7 +171,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     detail = "; ".join(filter(None, [detail, _go_home(cell)]))
     cell.check_physics()
     cell.retire_lost_objects()
-    return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at)
+    return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
 
 
 def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray]:
@@ -162,7 +190,7 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray
     return index, lifted
 
 
-def _lift(cell: Cell, index: int, lifted: np.ndarray) -> None:
+def _lift(cell: Cell, index: int, lifted: np.ndarray, motion: InHandMotion) -> None:
     """Raise the hand to `lifted` (4, 4) and hold the object there. Raises GraspFailure."""
     settings = cell.config.execution
     _follow(cell, _line(cell, cell.robot.q, lifted))
@@ -170,21 +198,27 @@ def _lift(cell: Cell, index: int, lifted: np.ndarray) -> None:
         raise GraspFailure("slipped")
     for _ in range(round(settings.hold_seconds / _CHECK_SECONDS)):
         cell.step(round(_CHECK_SECONDS / cell.dt))
-        _still_lifted(cell, index)
+        _still_lifted(cell, index, motion)
 
 
-def _still_lifted(cell: Cell, index: int) -> None:
+def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
     if not cell.is_lifted(index, cell.config.execution.lift_height):
         raise GraspFailure("dropped")
+    motion.look()
 
 
-def _carry_to_bin(cell: Cell, index: int) -> None:
+def _carry_to_bin(cell: Cell, index: int, motion: InHandMotion) -> None:
+    """Carry an object over the bin and let it go. Raises GraspFailure; with execution.strict also
+    where the object has moved in the hand."""
     posture = choose_posture(top_down_pose(OVER_BIN, -np.pi / 2), cell.home)
     carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
     every = round(_CHECK_SECONDS / cell.dt)
     for start in range(0, len(carry), every):
         _follow(cell, carry[start : start + every])
-        _still_lifted(cell, index)
+        _still_lifted(cell, index, motion)
+    moved = loose(motion.turned, motion.slid)
+    if moved and cell.config.execution.strict:
+        raise GraspFailure(moved[0])
     cell.robot.open_gripper()
     cell.step(round(_RELEASE_SECONDS / cell.dt))
     cell.retire(index)

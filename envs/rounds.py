@@ -124,6 +124,8 @@ def run_round(
                     grasp_to_image(grasp, frame.K, frame.T_WC),
                     detail=outcome.detail,
                     held=_name_of(scene, outcome.object_index),
+                    turned=None if outcome.motion is None else outcome.motion.turned,
+                    slid=None if outcome.motion is None else outcome.motion.slid,
                     **_turn_ms(approach),
                 )
             )

@@ -8,10 +8,12 @@ import pytest
 
 from envs.cell import Cell
 from envs.cell_layout import ObjectModel, Placement, Scene
+from envs.execution import execute_grasp
 from envs.object_primitives import NativeShape
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
 from tests.helpers.simulators import INSTALLED
+from utils.transforms import Grasp
 
 G = 9.81
 UPRIGHT = np.eye(3)
@@ -84,6 +86,24 @@ def turn_of(cell: Cell) -> float:
     """rad about y since the object was put between the fingers."""
     R = cell.object_pose(0)[:3, :3]
     return float(np.arctan2(R[0, 2], R[0, 0]))
+
+
+def test_a_bar_that_turns_in_the_hand_is_reported(config, box_set):
+    """Gripped 5 cm off its centre, 0.3 kg turn in the hand on the way up, and are still a success
+    unless execution.strict; gripped at its centre, they hardly do."""
+    model = solid(box_set, NativeShape("box", (0.14, 0.02, 0.03)), 0.3, 0.5)
+    scene = Scene("isolated", 0, (Placement(model, np.array([0.5, 0.0, 0.015]), np.eye(4)[3]),))
+    outcomes = []
+    for strict, off in ((False, 0.05), (True, 0.05), (True, 0.0)):
+        execution = config.execution.model_copy(update={"strict": strict})
+        with make_cell(config.model_copy(update={"execution": execution})) as cell:
+            cell.load(scene)
+            grasp = Grasp(np.array([0.5 - off, 0.0, 0.02]), np.pi / 2, 0.04, 1.0)
+            outcomes.append(execute_grasp(cell, grasp))
+    lenient, strict, centred = outcomes
+    assert (lenient.reason, strict.reason, centred.reason) == ("success", "turned", "success")
+    assert np.degrees(lenient.motion.turned) > 15 > 5 > np.degrees(centred.motion.turned)
+    assert centred.motion.slid < 0.005
 
 
 @pytest.mark.parametrize(

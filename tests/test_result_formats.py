@@ -42,7 +42,8 @@ def test_results_json_is_strict_and_complete(tmp_path):
         objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
         sim_seconds_per_pick picks_per_hour"""
     loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
-    assert set(content["rows"][0]) == {*fields.split(), "failures"} | loops
+    held = {"turned", "slid", "firm"}
+    assert set(content["rows"][0]) == {*fields.split(), "failures"} | loops | held
     assert content["rows"][1]["picks_per_hour"] is None
     (pair,) = content["comparisons"]
     assert (pair["first"], pair["second"]) == ("random", "heuristic")

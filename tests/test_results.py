@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, attempt
 from utils.config import dump_config, load_config
 from utils.errors import UserError
+from utils.result_formats import firm_in_words
 from utils.result_records import RoundRecord, append_round, policy_name
 from utils.results import compare, compare_runs, stop_reasons, summarise
 
@@ -28,7 +30,7 @@ def test_summary_by_hand():
     assert heuristic.picks_per_hour == pytest.approx(360)
     assert heuristic.failures == {
         "no_plan": 1, "planner_error": 0, "ik": 0, "lost": 0, "stopped": 0, "collision": 0,
-        "missed": 1, "slipped": 1, "dropped": 1, "physics": 0,
+        "missed": 1, "slipped": 1, "dropped": 1, "turned": 0, "slid": 0, "physics": 0,
     }  # fmt: skip
     assert (random.attempts, random.successes, random.success_rate) == (2, 0, 0.0)
     assert random.sim_seconds_per_pick is None and random.picks_per_hour is None
@@ -38,6 +40,19 @@ def test_summary_by_hand():
 def test_rounds_without_an_attempt_still_count_as_not_cleared():
     (row,) = summarise([ROUNDS[1], replace(ROUNDS[3], policy="heuristic")], seed=0)
     assert row.cleared_rate == pytest.approx(1 / 10)
+
+
+def test_what_moves_in_the_hand_is_no_firm_success():
+    """Of four successes one turns by 16 degrees, one slides by 11 mm, one does both; 14 degrees and
+    9 mm are firm. A failure is not firm, however little it moved."""
+    moves = [(16, 0.0), (0, 0.011), (16, 0.011), (14, 0.009)]
+    attempts = [
+        replace(attempt("success"), turned=np.radians(turned), slid=slid) for turned, slid in moves
+    ]
+    attempts.append(replace(attempt("dropped"), turned=0.0, slid=0.0))
+    (row,) = summarise([a_round("heuristic", 0, 5, 4, attempts)], seed=0)
+    assert (row.successes, row.turned, row.slid, row.firm) == (4, 2, 2, 1)
+    assert firm_in_words(row) == "20 %"
 
 
 def test_nothing_but_no_plan_is_undefined_not_zero():

@@ -132,6 +132,7 @@ class ExecutionConfig(Section):
     lift_height: Annotated[float, Field(gt=0, le=0.3)]
     hold_seconds: Annotated[float, Field(ge=0)]
     contact_stop: Positive
+    strict: bool
 
 
 class SafetyConfig(Section):

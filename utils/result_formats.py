@@ -117,6 +117,11 @@ def failures_in_words(row: Row) -> str:
     return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"
 
 
+def firm_in_words(row: Row) -> str:
+    """'94 %': share of the attempts in which the object also kept its place in the hand."""
+    return f"{100 * row.firm / row.attempts:.0f} %" if row.attempts else "-"
+
+
 def turn_ms_in_words(row: Row) -> str:
     """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' for an open loop."""
     known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
@@ -147,6 +152,7 @@ COLUMNS = (
         "success",
         lambda row: _share(row.success_rate, row.success_ci95, row.successes, row.attempts),
     ),
+    TableColumn("firm", firm_in_words, number=True),
     TableColumn(
         "cleared",
         lambda row: _share(

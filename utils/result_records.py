@@ -35,6 +35,8 @@ FAILURES = {  # reason: its name in tables, in the order in which a grasp can fa
     "missed": "missed",
     "slipped": "slipped",
     "dropped": "dropped",
+    "turned": "turned in the hand",
+    "slid": "slid in the hand",
     "physics": "simulation blew up",
 }
 ENDINGS = {  # why a round ended
@@ -45,6 +47,17 @@ ENDINGS = {  # why a round ended
     "lost": "the objects that were left fell off the table",
     "physics": "the simulation blew up",
 }
+
+
+# An object that moves farther than this in the hand was not held firmly.
+MOST_TURNED, MOST_SLID = math.radians(15), 0.01  # rad, m
+
+
+def loose(turned: float | None, slid: float | None) -> list[str]:
+    """Which of `turned` and `slid`, the keys of FAILURES, an object was that moved so far in the
+    hand; None stands for nothing that was held."""
+    moved = {"turned": (turned or 0.0) > MOST_TURNED, "slid": (slid or 0.0) > MOST_SLID}
+    return [how for how, far in moved.items() if far]
 
 
 def policy_name(planner: str, controller: str) -> str:
@@ -65,6 +78,7 @@ class AttemptRecord:
         without rendering.
     detail: a sentence on a failure.
     held: name of the object that was in the hand, if any, however the attempt ended.
+    turned, slid: rad and m by which it moved there; None without it.
     """
 
     success: bool
@@ -76,6 +90,8 @@ class AttemptRecord:
     detail: str = ""
     turn_ms_mean: float | None = None
     held: str | None = None
+    turned: float | None = None
+    slid: float | None = None
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:

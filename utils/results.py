@@ -17,7 +17,7 @@ from typing import Any
 
 from utils.config import read_config
 from utils.errors import UserError
-from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, read_rounds
+from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
 
 CLUTTER = ("packed", "pile")  # scenarios that are also compared together
@@ -31,6 +31,8 @@ class Row:
         independent.
     plan_ms_median: over all calls of the planner, also those that found nothing.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
+    turned, slid: successes in which the object moved in the hand by more than 15 degrees or 1 cm.
+        firm: successes in which it did neither.
     turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
         which the median over the attempts.
     """
@@ -55,6 +57,9 @@ class Row:
     controller: str = OPEN_LOOP
     turn_ms_p95: float | None = None
     turn_ms_mean: float | None = None
+    turned: int = 0
+    slid: int = 0
+    firm: int = 0
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -72,6 +77,7 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
     total = sum(record.objects_total for record in rounds)
     cleared = sum(record.objects_cleared for record in rounds)
     reasons = Counter(call.reason for call in calls)
+    moved = [loose(call.turned, call.slid) for call in calls if call.success]
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
     turns = [call.turn_ms for call in calls if call.turn_ms is not None]
@@ -95,6 +101,9 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
         controller=rounds[0].controller,
         turn_ms_p95=median(turns) if turns else None,
         turn_ms_mean=median(means) if means else None,
+        turned=sum("turned" in how for how in moved),
+        slid=sum("slid" in how for how in moved),
+        firm=sum(not how for how in moved),
     )
 
 
