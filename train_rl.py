@@ -25,6 +25,8 @@ import utils.installation  # noqa: F401 - ends in one sentence where a package i
 
 # The processes that simulate need the cores while a thread waits for another one.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# NumPy multiplies with one thread here as in a worker: the same bits, with or without workers.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 import sys
@@ -151,7 +153,7 @@ def train(
     """Train to the end, to a target, or until Ctrl-C (False); each evaluation adds a row to
     history."""
     processes, settings, watch = ppo.team, config.rl, Stopwatch()
-    collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, processes.device, watch)
+    collector = RolloutCollector(envs, ppo.layout, settings.rollout_steps, watch)
     per_update, total = settings.envs * settings.rollout_steps, updates_of(config)
     step = ppo.updates * per_update
     curves = Curves(run / "tensorboard", step, processes.is_main)
@@ -229,7 +231,7 @@ def evaluate(
     own, episodes = seeds[processes.rank :: processes.ranks], []
     if own:
         with envs.at_full_difficulty():
-            episodes = evaluate_policy(ppo.network, envs, ppo.layout, own, processes.device, watch)
+            episodes = evaluate_policy(ppo.network, envs, ppo.layout, own, watch)
     return {"update": ppo.updates, "step": step, **summary(processes.concatenate(episodes))}
 
 

@@ -3,7 +3,7 @@
 Same environments and number of them, same network and hyper-parameters, no normalising; every seed
 of both in a process of its own, one after the other and in turn. The final return is the mean over
 deterministic episodes of the last policy, from seeds that both are given. How fast the environments
-are without any learning bounds what any trainer can reach.
+take our training's actions again, with nobody learning, bounds what any trainer can reach.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -80,13 +80,15 @@ TASKS = {
 class Result:
     """Of one training. seconds: from the first step to the last update; cpu_seconds: in this time,
     of the process and its workers, which a busy machine lengthens less; megabytes: the most that
-    the process and its workers held together."""
+    the process and its workers held together; replay_seconds: of the same actions again, in all
+    environments at once, with no policy and nobody learning; None where that was not tried."""
 
     final_return: float
     steps: int
     seconds: float
     cpu_seconds: float
     megabytes: float
+    replay_seconds: float | None = None
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -118,6 +120,7 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
     returns = {who: [r.final_return for r in results[who]] for who in TRAIN}
     rate = {who: np.array([r.steps / r.seconds for r in results[who]]) for who in TRAIN}
     cpu = {who: np.array([r.cpu_seconds / r.steps for r in results[who]]) for who in TRAIN}
+    floor = np.array([r.steps / r.replay_seconds for r in results["ours"]])
     megabytes = {who: max(r.megabytes for r in results[who]) for who in TRAIN}
     low, high = interval(returns["sb3"])
     ours_low, ours_high = interval(returns["ours"])
@@ -131,8 +134,9 @@ def compare(env: str, seeds: int, steps: int) -> list[Metric]:
         Metric(f"{env}_speed_vs_sb3", float(np.median(rate["ours"] / rate["sb3"])), "x",
                at_least=1.3),
         Metric(f"{env}_steps_per_second", float(np.median(rate["ours"])), "1/s"),
-        Metric(f"{env}_steps_per_second_untrained",
-               in_own_process(env, "untrained", 0, steps), "1/s"),
+        Metric(f"{env}_steps_per_second_replayed", float(np.median(floor)), "1/s"),
+        Metric(f"{env}_speed_vs_replay", float(np.median(rate["ours"] / floor)), "x"),
+        Metric(f"{env}_sb3_speed_vs_replay", float(np.median(rate["sb3"] / floor)), "x"),
         Metric(f"{env}_cpu_vs_sb3", float(np.median(cpu["ours"] / cpu["sb3"])), "x"),
         Metric(f"{env}_memory", megabytes["ours"], "MB"),
         Metric(f"{env}_memory_vs_sb3", megabytes["ours"] / megabytes["sb3"], "x"),
@@ -189,24 +193,44 @@ def train_ours(env: str, seed: int, steps: int) -> Result:
     from envs.vector_env import training_envs
     from models.grasp_policy import make_ppo
     from models.ppo_rollouts import RolloutCollector, derived_seeds, evaluate_policy
-    from utils.distributed import ALONE
     from utils.runs import Stopwatch
 
     config = config_of(env, seed)
     count, watch = whole_updates(config, steps), Stopwatch()
     with training_envs(config, config.rl.envs) as envs:
         ppo = make_ppo(envs.observation_space, envs.action_space, config)
-        collector = RolloutCollector(envs, ppo.layout, config.rl.rollout_steps, ALONE.device, watch)
-        collector.restart(derived_seeds(envs.num_envs, seed))
+        collector = RolloutCollector(envs, ppo.layout, config.rl.rollout_steps, watch)
+        first_seeds = derived_seeds(envs.num_envs, seed)
+        collector.restart(first_seeds)
         ppo.generator.manual_seed(seed)
         start, cpu = time.perf_counter(), cpu_seconds()
+        actions = []
         for _ in range(count):
-            ppo.update(collector.collect(ppo.network, ppo.generator))
+            rollout = collector.collect(ppo.network, ppo.generator)
+            ppo.update(rollout)
+            actions.append(ppo.network.action(rollout.latents).numpy())
         spent = time.perf_counter() - start, cpu_seconds() - cpu, memory()
         seeds = range(FIRST_SEED, FIRST_SEED + EPISODES)
-        episodes = evaluate_policy(ppo.network, envs, ppo.layout, seeds, ALONE.device, watch)
+        episodes = evaluate_policy(ppo.network, envs, ppo.layout, seeds, watch)
+        start = time.perf_counter()
+        again = partial(replay, seeds=first_seeds, actions=np.concatenate(actions))
+        envs.each(again)
+        replayed = time.perf_counter() - start
     final = float(np.mean([episode.total for episode in episodes]))
-    return Result(final, count * envs.num_envs * config.rl.rollout_steps, *spent)
+    return Result(final, count * envs.num_envs * config.rl.rollout_steps, *spent, replayed)
+
+
+def replay(
+    env: gymnasium.Env, index: int, seeds: Sequence[int], actions: np.ndarray
+) -> Generator[None, None, None]:
+    """A task of `TrainingEnvs.each`: take the actions (T, N, A) of a training again."""
+    env.reset(seed=seeds[index])
+    for action in actions[:, index]:
+        _, _, terminated, truncated, _ = env.step(action)
+        yield
+        if terminated or truncated:
+            env.reset()
+            yield
 
 
 def train_sb3(env: str, seed: int, steps: int) -> Result:
@@ -259,27 +283,8 @@ def deterministic_return(model: Any, env: gymnasium.Env, seed: int) -> float:
     return total
 
 
-def step_only(env: str, seed: int, steps: int) -> float:
-    """Steps a second of the same environments with random actions and nothing learned."""
-    from envs.vector_env import training_envs
-
-    config = config_of(env, seed)
-    with training_envs(config, config.rl.envs) as envs:
-        envs.action_space.seed(seed)
-        envs.restart([seed] * envs.num_envs)
-        count, start = max(1, steps // envs.num_envs // 4), time.perf_counter()
-        for _ in range(count):
-            actions = np.stack([envs.action_space.sample() for _ in range(envs.num_envs)])
-            _, _, terminated, truncated, _ = envs.step(actions)
-            ended = terminated | truncated
-            if ended.any():
-                envs.restart([None] * envs.num_envs, ended)
-        return count * envs.num_envs / (time.perf_counter() - start)
-
-
 TRAIN = {"ours": train_ours, "sb3": train_sb3}
 RUN = {who: lambda *task, train=train: vars(train(*task)) for who, train in TRAIN.items()}
-RUN["untrained"] = step_only
 
 
 if __name__ == "__main__":

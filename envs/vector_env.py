@@ -9,16 +9,18 @@ knows no policy.
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import signal
 import sys
+import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
 import numpy as np
@@ -32,6 +34,9 @@ from utils.worker_process import worker_environment
 
 RANDOMIZED = "RandomizedGrasping-v0"
 OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # take the whole config as an argument
+ANSWERS = 10  # of a worker at least, in the time after which it counts as hung
+
+Result = TypeVar("Result")
 
 # Gymnasium reports a worker's error in several warnings; a WorkerError says it all once.
 warnings.filterwarnings("ignore", module=AsyncVectorEnv.__module__)
@@ -63,47 +68,47 @@ def full_difficulty(env_id: str) -> dict[str, Any]:
 
 
 class TrainingEnvs:
-    """`count` environments of one training, stepped together; see `training_envs`.
+    """`count` environments of one training; see `training_envs`.
 
-    They implement `models.ppo_rollouts.VectorEnvs`, which documents `restart` and `step`.
-    observation_space, action_space: of a single environment.
+    They implement `models.ppo_rollouts.Envs`. observation_space, action_space: of a single one.
     """
 
     def __init__(self, config: Config, count: int):
         self.num_envs = count
-        self._options: dict[str, Any] = {}
         self._id = config.rl.env_id
         self._timeout = config.rl.worker_timeout
         makers = [partial(make_env, config, index) for index in range(count)]
         self._parallel = config.rl.parallel and count > 1
         if self._parallel:
-            # Not forked from here: threads, GPU contexts and OpenGL do not survive that.
-            multiprocessing.set_forkserver_preload(loaded_here())
+            method = start_method()
+            if method == "forkserver":
+                multiprocessing.set_forkserver_preload(loaded_here())
             with worker_environment(), _as_worker_errors(self._died):
                 self._envs = AsyncVectorEnv(
-                    makers, context="forkserver", copy=False, autoreset_mode=AutoresetMode.DISABLED
-                )
+                    makers, shared_memory=False, context=method,
+                    autoreset_mode=AutoresetMode.DISABLED,
+                )  # fmt: skip
         else:
-            self._envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+            self._envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
-    def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
-        options = self._options | ({} if which is None else {"reset_mask": which})
+    def each(self, task: Callable[[gymnasium.Env, int], Generator[None, None, Any]]) -> list[Any]:
+        """What task(env, index) returns for each environment, in their order; tasks are described
+        at `models.ppo_rollouts.Envs`. Raises WorkerError."""
+        if not self._parallel:
+            return [finished(task(env, index)) for index, env in enumerate(self._envs.envs)]
+        # As bytes, because PyTorch would let tensors travel as files of shared memory.
+        sent: bytes | None = pickle.dumps(task)
+        between = self._timeout / ANSWERS
+        answers: list[bytes | None] = [None] * self.num_envs
         with _as_worker_errors(self._died):
-            if not self._parallel:
-                return self._envs.reset(seed=list(seeds), options=options or None)[0]
-            self._envs.reset_async(seed=list(seeds), options=options or None)
-            return self._envs.reset_wait(self._timeout)[0]
-
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        with _as_worker_errors(self._died):
-            if not self._parallel:
-                return self._envs.step(actions)
-            self._envs.step_async(actions)
-            return self._envs.step_wait(self._timeout)
+            while None in answers:
+                self._envs.call_async("go_on", sent, between)
+                new = self._envs.call_wait(self._timeout + between)
+                answers = [old or answer for old, answer in zip(answers, new)]
+                sent = None
+        return [pickle.loads(answer) for answer in answers if answer is not None]
 
     def record_episodes(self, folder: Path | None, first: int = 0) -> None:
         """Let randomised environments record every episode from now on, each in a new file of its
@@ -116,8 +121,7 @@ class TrainingEnvs:
             journals = [folder / f"env{first + number}.jsonl" for number in range(self.num_envs)]
             for journal in journals:
                 journal.unlink(missing_ok=True)
-        with _as_worker_errors(self._died):
-            self._envs.set_attr("journal", journals)
+        self._set("journal", journals)
 
     @contextmanager
     def at_full_difficulty(self) -> Iterator[None]:
@@ -134,11 +138,15 @@ class TrainingEnvs:
     @contextmanager
     def _reset_options(self, options: dict[str, Any]) -> Iterator[None]:
         """Resets of this project's environments get these options; others do not know them."""
-        self._options = options if self._id in OWN_ENVS else {}
+        self._set("reset_options", options if self._id in OWN_ENVS else {})
         try:
             yield
         finally:
-            self._options = {}
+            self._set("reset_options", {})
+
+    def _set(self, name: str, value: Any) -> None:
+        with _as_worker_errors(self._died):
+            self._envs.set_attr(name, value)
 
     @property
     def processes(self) -> list[multiprocessing.Process]:
@@ -167,6 +175,22 @@ class TrainingEnvs:
         dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes)
                 if not p.is_alive()]  # fmt: skip
         return f"worker process {', '.join(dead) or 'of an environment'} died (out of memory?)"
+
+
+def finished(task: Generator[None, None, Result]) -> Result:
+    """Run a task to its end; returns its result."""
+    while True:
+        try:
+            next(task)
+        except StopIteration as end:
+            return end.value
+
+
+def start_method() -> str:
+    """How worker processes are started: not forked from here, because threads, GPU contexts and
+    OpenGL do not survive that. Windows has no fork server."""
+    known = multiprocessing.get_all_start_methods()
+    return "forkserver" if "forkserver" in known else "spawn"
 
 
 @contextmanager
@@ -266,11 +290,14 @@ class CheckedEnv(gymnasium.Wrapper):
     """Checks the observations of an environment, and turns its errors into one message.
 
     The message is text, because an error that cannot be pickled would never leave its process.
+    reset_options: added to those of every reset.
     """
 
     def __init__(self, env: gymnasium.Env, index: int):
         super().__init__(env)
         self._index = index
+        self.reset_options: dict[str, Any] = {}
+        self._task: Iterator[None] = iter(())
         space = env.observation_space
         self._shapes = (
             {key: box.shape for key, box in space.items()}
@@ -278,8 +305,22 @@ class CheckedEnv(gymnasium.Wrapper):
             else space.shape
         )
 
-    def reset(self, **arguments: Any) -> tuple:
-        return self._checked(lambda: self.env.reset(**arguments))
+    def go_on(self, task: bytes | None, seconds: float) -> bytes | None:
+        """Begin a task of `TrainingEnvs.each`, or (None) go on with the one begun, for so many
+        seconds; returns its result, or None where it has not ended. Worker processes call this."""
+        if task is not None:
+            self._task = pickle.loads(task)(self, self._index)
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            try:
+                next(self._task)
+            except StopIteration as end:
+                return pickle.dumps(end.value)
+        return None
+
+    def reset(self, *, options: dict[str, Any] | None = None, **arguments: Any) -> tuple:
+        options = {**self.reset_options, **(options or {})} or None
+        return self._checked(lambda: self.env.reset(options=options, **arguments))
 
     def step(self, action: np.ndarray) -> tuple:
         return self._checked(lambda: self.env.step(action))

@@ -225,6 +225,10 @@ class GraspPolicyNetwork(nn.Module):
             return self.action_low + half * (latent.tanh() + 1)
         return torch.minimum(torch.maximum(latent, self.action_low), self.action_high)
 
+    def limited_log_std(self) -> torch.Tensor:
+        """(A,) logarithm of the Gaussian's deviation, within the limits of exploration."""
+        return self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
+
     def observe(self, observations: Observations, team: Team) -> None:
         """Add a rollout's observations to the statistics that normalise them."""
         if not self.normalise:
@@ -251,8 +255,8 @@ class GraspPolicyNetwork(nn.Module):
         return torch.cat([self.encoder(torch.cat(parts, 1)), state], -1)
 
     def _distribution(self, features: torch.Tensor) -> ActionDistribution:
-        log_std = self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
-        return ActionDistribution(self.mean_head(self.actor(features)), log_std, self.squash)
+        mean = self.mean_head(self.actor(features))
+        return ActionDistribution(mean, self.limited_log_std(), self.squash)
 
     def _value(self, features: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         if privileged.shape[-1]:

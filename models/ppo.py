@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from models.ppo_observations import ObservationLayout, Observations, RewardScaler
-from models.ppo_rollouts import NotFinite, Rollout, StepMemory, act, joined
+from models.ppo_rollouts import NotFinite, Rollout, StepMemory, joined
 from utils.checkpoint import load_checkpoint, load_weights, reading, save_checkpoint
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
@@ -123,8 +123,10 @@ class GraspPPO:
 
     def action(self, observation: Any) -> np.ndarray:
         """(A,) the deterministic action for one observation of one environment."""
-        latent = act(self.network, self.layout.read_one(observation), None, self.team.device)
-        return self.network.action(latent.to(self.team.device))[0].cpu().numpy()
+        seen = self.layout.read_one(observation).map(lambda part: part.to(self.team.device))
+        with torch.inference_mode():
+            latent = self.network(seen.image(), seen.state).mean
+            return self.network.action(latent)[0].cpu().numpy()
 
     # --- An update ------------------------------------------------------------------------------
 

@@ -53,8 +53,13 @@ class Observations(NamedTuple):
             tuple(map(change, self.images)), change(self.state), change(self.privileged)
         )
 
-    def rows(self, index: torch.Tensor | slice) -> Observations:
+    def rows(self, index: torch.Tensor | slice | int) -> Observations:
         return self.map(lambda part: part[index])
+
+    def copy_(self, other: Observations) -> None:
+        """Take over the numbers of a batch of the same shape."""
+        for room, part in zip((*self.images, *self[1:]), (*other.images, *other[1:])):
+            room.copy_(part)
 
 
 class Part(NamedTuple):
@@ -140,13 +145,13 @@ class ObservationLayout:
         )
 
     def write(self, observation: Any, room: Observations) -> None:
-        """Copy a batch of observations (B, ...) from an environment into room for it."""
+        """Copy a batch of observations (B, ...), or a single one, into room (B, ...) for it."""
         for part, image in zip(self.images, room.images):
             image.numpy()[...] = _entry(observation, part.key)
         for parts, vector in ((self.state, room.state), (self.privileged, room.privileged)):
             at, target = 0, vector.numpy()
             for part in parts:
-                values = _entry(observation, part.key).reshape(len(target), -1)
+                values = np.reshape(_entry(observation, part.key), (len(target), -1))
                 target[:, at : at + values.shape[1]] = values
                 at += values.shape[1]
 
@@ -174,13 +179,12 @@ class ObservationLayout:
         seen.write(batch, room)
         return room
 
-    def bad_number(self, observation: Any) -> tuple[str, int] | None:
-        """Key and row of a number of a batch that is not finite, or None."""
+    def bad_number(self, observation: Any) -> str | None:
+        """Key of an entry that is not finite, or None."""
         for part in self.parts():
-            values = _entry(observation, part.key)
+            values = np.asarray(_entry(observation, part.key))
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                rows = values.reshape(len(values), -1)
-                return part.key, int(np.flatnonzero(~np.isfinite(rows).all(1))[0])
+                return part.key
         return None
 
     def to_plain(self) -> dict[str, Any]:

@@ -6,9 +6,11 @@ learns to estimate the observations of `rl.estimated_observations`, which only a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
+import gymnasium
 from tqdm import tqdm
 
 from models.ppo_observations import ObservationLayout, Observations
@@ -16,8 +18,9 @@ from models.ppo_rollouts import (
     NETWORK,
     PRETRAINING,
     SIMULATION,
+    Envs,
     NotFinite,
-    VectorEnvs,
+    beside,
     derived_seeds,
 )
 from utils.runs import Stopwatch
@@ -30,7 +33,7 @@ IMAGES = 32  # that each environment shows before the estimator learns from them
 
 
 def pretrain_estimator(
-    ppo: GraspPPO, envs: VectorEnvs, images: int, seed: int, watch: Stopwatch, curves: Curves
+    ppo: GraspPPO, envs: Envs, images: int, seed: int, watch: Stopwatch, curves: Curves
 ) -> None:
     """Teach the estimator from at least `images` images of the environments of all processes.
 
@@ -45,8 +48,8 @@ def pretrain_estimator(
     with tqdm(total=chunks * per_chunk, unit="image", disable=not team.is_main) as bar:
         for chunk in range(chunks):
             with watch(SIMULATION):
-                shown = collect_images(envs, ppo.layout, IMAGES, seeds)
-                shown = shown.map(lambda part: part.to(team.device))
+                columns = envs.each(partial(show, layout=ppo.layout, count=IMAGES, seeds=seeds))
+                shown = beside(columns).map(lambda part: part.flatten(0, 1).to(team.device))
             with watch(NETWORK):
                 ppo.network.observe(shown, team)
                 loss = ppo.estimate_loss(shown)
@@ -59,16 +62,18 @@ def pretrain_estimator(
     ppo.memory.clear()
 
 
-def collect_images(
-    envs: VectorEnvs, layout: ObservationLayout, count: int, seeds: Sequence[int | None]
-) -> Observations:
-    """(count * N, ...) the first observations of `count` episodes of each of N environments; the
-    first episodes begin from `seeds`. Raises NotFinite."""
-    shown = layout.empty(count, envs.num_envs)
+def show(
+    env: gymnasium.Env, index: int, layout: ObservationLayout, count: int,
+    seeds: Sequence[int | None],
+) -> Generator[None, None, Observations]:  # fmt: skip
+    """A task of `Envs.each`: (count, ...) the first observations of `count` episodes; the first
+    episode begins from this environment's seed. Raises NotFinite."""
+    shown = layout.empty(count)
     for number in range(count):
-        observation = envs.restart(seeds if number == 0 else [None] * envs.num_envs)
+        observation, _ = env.reset(seed=seeds[index] if number == 0 else None)
+        yield
         bad = layout.bad_number(observation)
         if bad is not None:
-            raise NotFinite(f"the observation {bad[0]!r} of environment {bad[1]} is not finite")
-        layout.write(observation, shown.map(lambda part: part[number]))  # noqa: B023
-    return shown.map(lambda part: part.flatten(0, 1))
+            raise NotFinite(f"the observation {bad!r} of environment {index} is not finite")
+        layout.write(observation, shown.rows(slice(number, number + 1)))
+    return shown

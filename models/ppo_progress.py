@@ -125,7 +125,8 @@ def row_in_words(row: ProgressRow) -> str:
 
 
 def time_in_words(watch: Stopwatch) -> str:
-    """'12 s: 60 % simulation and rendering, 30 % network, 10 % overhead'."""
+    """'12 s: 60 % simulation and rendering, 30 % network, 10 % overhead'; the choice of actions
+    counts as simulation."""
     seconds = watch.seconds()
     total = sum(seconds.values())
     shares = ", ".join(f"{100 * part / total:.0f} % {name}" for name, part in seconds.items())

@@ -1,19 +1,24 @@
-"""Stepping many environments with a policy: rollouts to learn from, and deterministic evaluation.
+"""Playing many environments with a policy: rollouts to learn from, and deterministic evaluation.
 
-`VectorEnvs` is the interface of the environments; this module makes none. `RolloutCollector`
-collects rollouts, `evaluate_policy` plays whole episodes, `StepMemory` keeps past steps for the
-state estimator.
+`Envs` is the interface of the environments; this module makes none. `RolloutCollector` collects
+rollouts, `evaluate_policy` plays whole episodes, `StepMemory` keeps past steps for the state
+estimator. Each environment is played by an actor where it lives, so that it waits for no other one
+before a rollout or an evaluation has ended. What it does does not depend on the others' timing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
+import gymnasium
 import numpy as np
 import torch
 
+from models.ppo_actor import Actor, one_thread
 from models.ppo_observations import ObservationLayout, Observations
 from utils.errors import UserError
 from utils.runs import Stopwatch
@@ -23,22 +28,20 @@ SIMULATION, NETWORK = "simulation", "network"  # parts of the time that the stop
 TRAINING, EVALUATION, LEARNING, FRESH, PRETRAINING = range(5)
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
 
+Task = Callable[[gymnasium.Env, int], Generator[None, None, Any]]
 
-class VectorEnvs(Protocol):
-    """N environments stepped together, which never reset on their own."""
+
+class Envs(Protocol):
+    """N environments, which never reset on their own."""
 
     num_envs: int
 
-    def restart(self, seeds: Sequence[int | None], which: np.ndarray | None = None) -> Any:
-        """Begin new episodes, in all or in those where `which` (N,) is true; returns observations
-        of all. A seed of None goes on with the environment's own random numbers."""
+    def each(self, task: Task) -> list[Any]:
+        """What task(env, index) returns for each environment, in their order.
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Gymnasium's (observations, rewards, terminated, truncated, infos); the observations are
-        those after the step also where an episode ended with it. They may be overwritten by the
-        next call."""
+        A task is a generator that yields after every step and reset, so that one that hangs is
+        noticed. It may be sent to other processes, and its result back: both can be pickled.
+        """
 
 
 class NotFinite(UserError):
@@ -73,23 +76,41 @@ class Rollout:
     episodes: list[Episode]
 
 
+class Underway(NamedTuple):
+    """An episode under way. seen: (1, ...) its last observation; of what has gone before, total:
+    sum of rewards, length: steps."""
+
+    seen: Observations
+    total: float = 0.0
+    length: int = 0
+
+
+class Column(NamedTuple):
+    """A rollout's steps of one environment, all without the dimension N; observations: (T + 1,
+    ...), the last one too."""
+
+    observations: Observations
+    latents: np.ndarray
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    cut: list[int]
+    cut_final: Observations
+    episodes: list[Episode]
+    underway: Underway
+
+
 class RolloutCollector:
     """Collects rollouts of `steps` steps of each environment; each rollout continues the one before
     it."""
 
-    def __init__(
-        self, envs: VectorEnvs, layout: ObservationLayout, steps: int, device: torch.device,
-        watch: Stopwatch,
-    ):  # fmt: skip
-        self.envs, self.layout, self.steps = envs, layout, steps
-        self.device, self.watch = device, watch
-        self._tally = Tally(envs.num_envs)
+    def __init__(self, envs: Envs, layout: ObservationLayout, steps: int, watch: Stopwatch):
+        self.envs, self.layout, self.steps, self.watch = envs, layout, steps, watch
 
     def restart(self, seeds: Sequence[int]) -> None:
         """Begin new episodes in all environments; those under way do not count."""
         with self.watch(SIMULATION):
-            self._observation = self.envs.restart(seeds)
-        self._tally = Tally(self.envs.num_envs)
+            self._underway = self.envs.each(partial(begin, layout=self.layout, seeds=seeds))
 
     def collect(self, network, generator: torch.Generator, first_step: int = 0) -> Rollout:
         """A rollout with actions drawn from the policy.
@@ -97,140 +118,142 @@ class RolloutCollector:
         first_step: how many environment steps have gone before, for messages.
         Raises NotFinite on an observation or a reward that is no number.
         """
-        steps, envs = self.steps, self.envs.num_envs
-        noise = torch.randn(steps, envs, len(network.log_std), generator=generator)
-        seen, latents = self.layout.empty(steps, envs), torch.empty_like(noise)
-        rewards = np.empty((steps, envs))
-        terminated, truncated = np.empty((2, steps, envs), bool)
-        cut, cut_final, episodes = [], [], []
-        for t in range(steps):
-            now = seen.map(lambda part: part[t])  # noqa: B023, used at once
-            self._read(now, first_step + t * envs)
-            with self.watch(NETWORK):
-                latents[t] = act(network, now, noise[t], self.device)
-                actions = network.action(latents[t].to(self.device)).cpu().numpy()
-            with self.watch(SIMULATION):
-                step = self.envs.step(actions)
-            self._observation, rewards[t], terminated[t], truncated[t], infos = step
-            if not np.isfinite(rewards[t]).all():
-                env = int(np.flatnonzero(~np.isfinite(rewards[t]))[0])
-                raise self._not_finite("reward", env, first_step + t * envs)
-            ended = terminated[t] | truncated[t]
-            episodes += self._tally.add(rewards[t], ended, infos)
-            if ended.any():
-                timeouts = np.flatnonzero(truncated[t] & ~terminated[t])
-                if len(timeouts):  # before the reset overwrites what they are to be judged by
-                    after = self.layout.empty(envs)
-                    self._read(after, first_step + t * envs)
-                    cut += [(t, int(env)) for env in timeouts]
-                    cut_final.append(after.map(lambda part: part[timeouts]))  # noqa: B023
-                with self.watch(SIMULATION):
-                    self._observation = self.envs.restart([None] * envs, ended)
-        last = self.layout.empty(envs)
-        self._read(last, first_step + steps * envs)
+        size = self.steps, self.envs.num_envs, len(network.log_std)
+        noise = torch.randn(size, generator=generator).numpy()
+        with self.watch(NETWORK):
+            actor = Actor(network)
+        task = partial(
+            play, actor=actor, layout=self.layout, noise=noise, underway=self._underway,
+            first_step=first_step,
+        )  # fmt: skip
+        with self.watch(SIMULATION), one_thread():
+            columns: list[Column] = self.envs.each(task)
+        self._underway = [column.underway for column in columns]
+        seen = beside([column.observations for column in columns])
         return Rollout(
-            seen, last, latents, rewards, terminated, truncated, cut,
-            joined(cut_final) if cut else self.layout.empty(0), episodes,
+            seen.rows(slice(self.steps)), seen.rows(self.steps),
+            torch.from_numpy(np.stack([column.latents for column in columns], 1)),
+            np.stack([column.rewards for column in columns], 1),
+            np.stack([column.terminated for column in columns], 1),
+            np.stack([column.truncated for column in columns], 1),
+            [(t, env) for env, column in enumerate(columns) for t in column.cut],
+            joined([column.cut_final for column in columns]),
+            [episode for column in columns for episode in column.episodes],
         )  # fmt: skip
 
-    def _read(self, room: Observations, step: int) -> None:
-        bad = self.layout.bad_number(self._observation)
-        if bad is not None:
-            raise self._not_finite(f"observation {bad[0]!r}", bad[1], step)
-        self.layout.write(self._observation, room)
 
-    def _not_finite(self, what: str, env: int, step: int) -> NotFinite:
-        return NotFinite(f"the {what} of environment {env} is not finite at step {step}")
+def begin(
+    env: gymnasium.Env, index: int, layout: ObservationLayout, seeds: Sequence[int]
+) -> Generator[None, None, Underway]:
+    """A task: begin an episode from this environment's seed."""
+    observation, _ = env.reset(seed=seeds[index])
+    yield
+    room = layout.empty(1)
+    _read(observation, layout, room, f"of environment {index} is not finite at its first step")
+    return Underway(room)
 
 
-def act(
-    network, seen: Observations, noise: torch.Tensor | None, device: torch.device
-) -> torch.Tensor:
-    """(N, A) latents for observations (N, ...), on the CPU; the policy's mean without noise."""
-    with torch.inference_mode():
-        if device.type != "cpu":
-            seen = seen.map(lambda part: part.to(device))
-            noise = None if noise is None else noise.to(device)
-        distribution = network(seen.image(), seen.state)
-        latent = distribution.mean if noise is None else distribution.sample(noise)
-        return latent.cpu()
+def play(
+    env: gymnasium.Env, index: int, actor: Actor, layout: ObservationLayout, noise: np.ndarray,
+    underway: Sequence[Underway], first_step: int,
+) -> Generator[None, None, Column]:  # fmt: skip
+    """A task: play T steps with actions drawn by noise (T, N, A) from episodes under way."""
+    steps, envs, size = noise.shape
+    observations, latents = layout.empty(steps + 1), np.empty((steps, size), np.float32)
+    rewards, (terminated, truncated) = np.empty(steps), np.empty((2, steps), bool)
+    cut, cut_final, episodes = [], [layout.empty(0)], []
+    now, total, length = underway[index]
+    observations.rows(slice(1)).copy_(now)
+    for t in range(steps):
+        latents[t] = actor.latent(observations.rows(slice(t, t + 1)), noise[t, index])
+        observation, reward, terminated[t], truncated[t], info = env.step(actor.action(latents[t]))
+        yield
+        place = f"of environment {index} is not finite at step {first_step + t * envs}"
+        if not math.isfinite(reward):
+            raise NotFinite(f"the reward {place}")
+        rewards[t], total, length = reward, total + float(reward), length + 1
+        after = observations.rows(slice(t + 1, t + 2))
+        if truncated[t] and not terminated[t]:
+            _read(observation, layout, after, place)
+            cut.append(t)
+            cut_final.append(after.map(torch.clone))  # before the next episode overwrites it
+        if terminated[t] or truncated[t]:
+            episodes.append(Episode(total, length, _success(info)))
+            total, length = 0.0, 0
+            observation, _ = env.reset()
+            yield
+        _read(observation, layout, after, place)
+    last = Underway(observations.rows(slice(steps, None)).map(torch.clone), total, length)
+    return Column(
+        observations, latents, rewards, terminated, truncated, cut, joined(cut_final), episodes,
+        last,
+    )  # fmt: skip
+
+
+def evaluate_policy(
+    network, envs: Envs, layout: ObservationLayout, seeds: Sequence[int], watch: Stopwatch
+) -> list[Episode]:
+    """Deterministic episodes, one from each seed and in that order, whatever the number of
+    environments. Episodes under way are dropped: restart all environments afterwards."""
+    count = envs.num_envs
+    shares = [seeds[index::count] for index in range(count)]
+    with watch(NETWORK):
+        actor = Actor(network)
+    task = partial(play_episodes, actor=actor, layout=layout, shares=shares)
+    with watch(SIMULATION), one_thread():
+        played = envs.each(task)
+    return [played[number % count][number // count] for number in range(len(seeds))]
+
+
+def play_episodes(
+    env: gymnasium.Env, index: int, actor: Actor, layout: ObservationLayout,
+    shares: Sequence[Sequence[int]],
+) -> Generator[None, None, list[Episode]]:  # fmt: skip
+    """A task: play an episode without noise from each seed of this environment's share."""
+    episodes, room = [], layout.empty(1)
+    for seed in shares[index]:
+        observation, info = env.reset(seed=int(seed))
+        total, length, ended = 0.0, 0, False
+        place = f"in an evaluation, of the episode with seed {seed}, is not finite"
+        while not ended:
+            yield
+            _read(observation, layout, room, place)
+            action = actor.action(actor.latent(room))
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, length, ended = total + float(reward), length + 1, terminated or truncated
+        yield
+        episodes.append(Episode(total, length, _success(info)))
+    return episodes
+
+
+def _read(observation: Any, layout: ObservationLayout, room: Observations, place: str) -> None:
+    """Put an observation in room (1, ...) for it, if all of its numbers are finite."""
+    bad = layout.bad_number(observation)
+    if bad is not None:
+        raise NotFinite(f"the observation {bad!r} {place}")
+    layout.write(observation, room)
+
+
+def _success(info: dict[str, Any]) -> bool | None:
+    return bool(info[SUCCESS]) if SUCCESS in info else None
 
 
 def joined(parts: Sequence[Observations]) -> Observations:
     """Batches (B, ...) as one."""
+    return _together(torch.cat, parts, 0)
+
+
+def beside(columns: Sequence[Observations]) -> Observations:
+    """N columns (T, ...) side by side: (T, N, ...)."""
+    return _together(torch.stack, columns, 1)
+
+
+def _together(function: Callable, parts: Sequence[Observations], dim: int) -> Observations:
     return Observations(
-        tuple(torch.cat(images) for images in zip(*(part.images for part in parts))),
-        torch.cat([part.state for part in parts]),
-        torch.cat([part.privileged for part in parts]),
+        tuple(function(images, dim) for images in zip(*(part.images for part in parts))),
+        function([part.state for part in parts], dim),
+        function([part.privileged for part in parts], dim),
     )
-
-
-class Tally:
-    """Return and length of the episode under way in each of n environments."""
-
-    def __init__(self, n: int):
-        self._totals, self._lengths = np.zeros(n), np.zeros(n, int)
-
-    def add(self, rewards: np.ndarray, ended: np.ndarray, infos: dict[str, Any]) -> list[Episode]:
-        """Count a step; the episodes that ended with it, in the order of the environments."""
-        self._totals += rewards
-        self._lengths += 1
-        if not ended.any():
-            return []
-        reported = infos.get(f"_{SUCCESS}", np.zeros(len(ended), bool))
-        done = [
-            Episode(
-                float(self._totals[i]),
-                int(self._lengths[i]),
-                bool(infos[SUCCESS][i]) if reported[i] else None,
-            )
-            for i in np.flatnonzero(ended)
-        ]
-        self._totals[ended] = 0
-        self._lengths[ended] = 0
-        return done
-
-
-def evaluate_policy(
-    network, envs: VectorEnvs, layout: ObservationLayout, seeds: Sequence[int],
-    device: torch.device, watch: Stopwatch,
-) -> list[Episode]:  # fmt: skip
-    """Deterministic episodes, one from each seed and in that order, whatever the number of
-    environments. Episodes under way are dropped: restart all environments afterwards."""
-    count = envs.num_envs
-    episodes: list[Episode | None] = [None] * len(seeds)
-    at = np.arange(count)  # index of each environment's seed; beyond the last seed it idles
-    tally, room = Tally(count), layout.empty(count)
-
-    def seed(env: int) -> int:
-        return int(seeds[at[env]] if at[env] < len(seeds) else seeds[-1])
-
-    with watch(SIMULATION):
-        observation = envs.restart([seed(env) for env in range(count)])
-    waiting = len(seeds)
-    while waiting:
-        bad = layout.bad_number(observation)
-        if bad is not None:
-            raise NotFinite(
-                f"in an evaluation, the observation {bad[0]!r} of the episode with seed "
-                f"{seed(bad[1])} is not finite"
-            )
-        layout.write(observation, room)
-        with watch(NETWORK):
-            latents = act(network, room, None, device)
-            actions = network.action(latents.to(device)).cpu().numpy()
-        with watch(SIMULATION):
-            observation, rewards, terminated, truncated, infos = envs.step(actions)
-        ended = terminated | truncated
-        for env, episode in zip(np.flatnonzero(ended), tally.add(rewards, ended, infos)):
-            if at[env] < len(seeds):
-                episodes[at[env]] = episode
-                waiting -= 1
-            at[env] = max(at) + 1
-        if ended.any() and waiting:
-            with watch(SIMULATION):
-                observation = envs.restart([seed(env) for env in range(count)], ended)
-    return episodes
 
 
 def derived_seeds(count: int, *place: int) -> list[int]:

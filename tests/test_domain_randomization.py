@@ -596,6 +596,11 @@ def test_an_episode_that_began_near_is_replayed_too(tmp_path):
     assert again == first
 
 
+def one_step(env, index):
+    env.reset(seed=index)
+    yield env.step(np.zeros(env.action_space.shape, np.float32))
+
+
 def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
     config = load_config(
         None,
@@ -604,12 +609,9 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
     )  # fmt: skip
     with training_envs(config, 2) as several:
         several.record_episodes(tmp_path / "episodes", first=2)
-        several.restart([1, 2])
-        still = np.zeros((2, *several.action_space.shape), np.float32)
-        several.step(still)
+        several.each(one_step)
         several.record_episodes(None)
-        several.restart([3, 4])
-        several.step(still)
+        several.each(one_step)
     files = sorted((tmp_path / "episodes").iterdir())
     assert [file.name for file in files] == ["env2.jsonl", "env3.jsonl"]
     one, two = (json.loads(file.read_text()) for file in files)

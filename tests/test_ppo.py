@@ -22,9 +22,8 @@ from models.ppo_rollouts import (
 from tests.helpers.compare import same
 from tests.helpers.ppo_parts import (
     COUNTED,
-    CPU,
-    Counting,
     batch_of,
+    counting,
     ppo_of,
     rollout_of,
 )
@@ -102,7 +101,7 @@ def test_gae_equals_stable_baselines3():
 def test_what_an_update_learns_from():
     """Values, bootstraps and returns of the rollout above, put together by hand."""
     ppo = ppo_of("rl.normalise_rewards=false", "rl.gae_lambda=1", f"rl.gamma={GAMMA}")
-    collector = RolloutCollector(Counting(), COUNTED, 5, CPU, Stopwatch())
+    collector = RolloutCollector(counting(), COUNTED, 5, Stopwatch())
     collector.restart([0, 1])
     rollout = collector.collect(ppo.network, ppo.generator)
     batch, _ = ppo._prepare(rollout)

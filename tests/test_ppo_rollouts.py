@@ -18,8 +18,9 @@ from models.ppo_rollouts import (
 )
 from tests.helpers.ppo_parts import (
     COUNTED,
-    CPU,
-    Counting,
+    Count,
+    Several,
+    counting,
     ppo_of,
 )
 from utils.runs import Stopwatch
@@ -27,7 +28,7 @@ from utils.runs import Stopwatch
 
 def test_a_rollout_keeps_final_observations():
     ppo = ppo_of()
-    collector = RolloutCollector(Counting(), COUNTED, 5, CPU, Stopwatch())
+    collector = RolloutCollector(counting(), COUNTED, 5, Stopwatch())
     collector.restart([0, 1])
     rollout = collector.collect(ppo.network, ppo.generator)
     assert rollout.observations.state[..., 0].T.tolist() == [[0, 1, 2, 0, 1], [0, 1, 2, 3, 0]]
@@ -42,39 +43,38 @@ def test_a_rollout_keeps_final_observations():
 
 @pytest.mark.parametrize("bad", ["observation", "reward"])
 def test_numbers_that_are_not_finite_are_refused(bad):
-    class Broken(Counting):
-        def step(self, actions):
-            observation, rewards, *rest = super().step(actions)
-            if (observation[1] == 2).all():
-                (observation if bad == "observation" else rewards)[1] = np.nan
-            return observation, rewards, *rest
+    class Broken(Count):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            if observation == 2:
+                observation[:], reward = (
+                    (np.nan, reward) if bad == "observation" else (observation, np.nan)
+                )
+            return observation, reward, *rest
 
     ppo = ppo_of()
-    collector = RolloutCollector(Broken(), COUNTED, 5, CPU, Stopwatch())
+    envs = Several(Count(3, False), Broken(4, True))
+    collector = RolloutCollector(envs, COUNTED, 5, Stopwatch())
     collector.restart([0, 1])
-    with pytest.raises(NotFinite, match=f"{bad}.*of environment 1 .*step 10[24]"):
+    with pytest.raises(NotFinite, match=f"{bad}.*of environment 1 .*step 102"):
         collector.collect(ppo.network, ppo.generator, first_step=100)
 
 
 def test_evaluation_gives_each_seed_its_episode():
-    class Seeded(Counting):
+    class Seeded(Count):
         """The reward is the seed, the length differs between environments."""
 
-        def restart(self, seeds, which=None):
-            which = np.ones(2, bool) if which is None else which
-            if not hasattr(self, "count"):
-                self.count, self.seed = np.zeros((2, 1), np.float32), np.zeros(2)
-            self.count[which] = 0
-            self.seed[which] = np.array(seeds)[which]
-            return self.count
+        def reset(self, *, seed=None, options=None):
+            self.seed = seed
+            return super().reset()
 
-        def step(self, actions):
-            observation, _, *rest = super().step(actions)
+        def step(self, action):
+            observation, _, *rest = super().step(action)
             return observation, self.seed, *rest
 
-    episodes = evaluate_policy(
-        ppo_of().network, Seeded(), COUNTED, [10, 20, 30, 40, 50], CPU, Stopwatch()
-    )
+    envs = Several(Seeded(3, False), Seeded(4, True))
+    seeds = [10, 20, 30, 40, 50]
+    episodes = evaluate_policy(ppo_of().network, envs, COUNTED, seeds, Stopwatch())
     assert [e.total / e.length for e in episodes] == [10, 20, 30, 40, 50]
 
 

@@ -182,9 +182,7 @@ def test_evaluation_does_not_depend_on_how_many_environments_there_are():
         config = load_config(None, [*POINT, f"rl.envs={count}", "rl.batch_size=8"])
         with training_envs(config, count) as envs:
             ppo = ppo or make_ppo(envs.observation_space, envs.action_space, config)
-            episodes.append(
-                evaluate_policy(ppo.network, envs, ppo.layout, range(7), ALONE.device, Stopwatch())
-            )
+            episodes.append(evaluate_policy(ppo.network, envs, ppo.layout, range(7), Stopwatch()))
     for other in episodes[1:]:
         assert [e.length for e in other] == [e.length for e in episodes[0]]
         np.testing.assert_allclose(

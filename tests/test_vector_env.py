@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-import numpy as np
+import multiprocessing
+import os
+import time
 
-from envs.vector_env import training_envs
+import numpy as np
+import pytest
+
+from envs import vector_env
+from envs.vector_env import start_method, training_envs
 from models.grasp_policy import make_ppo
 from tests.helpers.quick_envs import POINT
 from utils.config import load_config
+
+
+def first_observation(env, index):
+    observation, _ = env.reset(seed=index + 1)
+    yield
+    return observation
+
+
+def height_at_reset(env, index):
+    observation = yield from first_observation(env, index)
+    return float(observation["end_effector_position"][2])
 
 
 def test_evaluations_are_at_full_difficulty():
@@ -15,13 +32,12 @@ def test_evaluations_are_at_full_difficulty():
     settings = ["rl.parallel=false", "env.near_share=1", "env.observations=[state]", seen]
     config = load_config(None, settings)
     with training_envs(config, 2) as envs:
-        training = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
+        training = envs.each(height_at_reset)
         with envs.at_full_difficulty():
-            evaluated = envs.restart([1, 2])["end_effector_position"][:, 2].copy()
-            again = envs.restart([1, 2], np.array([True, True]))["end_effector_position"][:, 2]
-            assert again.tolist() == evaluated.tolist()
-        after = envs.restart([1, 2])["end_effector_position"][:, 2]
-    assert max(training) < 0.2 < 0.4 < min(evaluated) and after.tolist() == training.tolist()
+            evaluated = envs.each(height_at_reset)
+            assert envs.each(height_at_reset) == evaluated
+        after = envs.each(height_at_reset)
+    assert max(training) < 0.2 < 0.4 < min(evaluated) and after == training
 
 
 def test_env_kwargs_and_info_reach_the_environment():
@@ -30,8 +46,32 @@ def test_env_kwargs_and_info_reach_the_environment():
                                 "rl.privileged_observations=goal"])  # fmt: skip
     with training_envs(config, 2) as envs:
         layout = make_ppo(envs.observation_space, envs.action_space, config).layout
-        observation = envs.restart([3, 4])
+        first, _ = envs.each(first_observation)
     assert [part.key for part in (*layout.images, *layout.state)] == ["rgb", "state"]
     assert [(part.key, part.shape) for part in layout.privileged] == [("goal", (2,))]
-    rng = np.random.default_rng(3)  # Gymnasium seeds its environments' generators like this
-    np.testing.assert_allclose(observation["goal"][0], rng.uniform(-1, 1, 2), rtol=1e-6)
+    rng = np.random.default_rng(1)  # Gymnasium seeds its environments' generators like this
+    np.testing.assert_allclose(first["goal"], rng.uniform(-1, 1, 2), rtol=1e-6)
+
+
+def processes_of(env, index):
+    """The worker's and its parent's, after three resets that outlast the time for one answer."""
+    for _ in range(3):
+        env.reset(seed=index)
+        time.sleep(0.02)
+        yield
+    return os.getpid(), os.getppid()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("methods", [["fork", "spawn", "forkserver"], ["spawn"]])
+def test_workers_carry_out_tasks_where_there_is_no_fork_server_too(monkeypatch, methods):
+    """Windows knows `spawn` alone."""
+    monkeypatch.setattr(vector_env, "ANSWERS", 2000)  # one each 10 ms
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: methods)
+    assert start_method() == methods[-1]
+    config = load_config(None, [*POINT, "rl.parallel=true", "rl.worker_timeout=20"])
+    with training_envs(config, 2) as envs:
+        first = envs.each(processes_of)
+        assert envs.each(processes_of) == first
+    assert len({os.getpid(), *(own for own, _ in first)}) == 3
+    assert all((parent == os.getpid()) == (methods[-1] == "spawn") for _, parent in first)

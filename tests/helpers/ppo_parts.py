@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 
+from envs.vector_env import finished
 from models.grasp_policy import (
     GraspPPO,
     policy_for,
@@ -21,8 +23,6 @@ from models.ppo_rollouts import (
 from utils.config import load_config
 from utils.distributed import ALONE
 
-CPU = torch.device("cpu")
-
 
 def settings_of(*overrides: str):
     small = ["rl.hidden_dim=16", "rl.image_feature_dim=8", "rl.conv_channels=[4,4]",
@@ -30,27 +30,40 @@ def settings_of(*overrides: str):
     return load_config(None, [*small, *overrides]).rl
 
 
-class Counting:
-    """Two environments whose observation counts the steps of the episode, and that say so by their
-    reward: the first is truncated after 3 steps, the second terminated after 4."""
+class Count(gymnasium.Env):
+    """Its observation counts the steps of the episode, and it says so by its reward: an episode is
+    truncated or terminated after `length` steps."""
 
-    num_envs = 2
+    def __init__(self, length: int, terminates: bool):
+        self.length, self.terminates = length, terminates
 
-    def restart(self, seeds, which=None):
-        if which is None:
-            self.seeds, self.count = list(seeds), np.zeros((2, 1), np.float32)
-        else:
-            self.count[which] = 0
-        return self.count
+    def reset(self, *, seed=None, options=None):
+        self.count = np.zeros(1, np.float32)
+        return self.count, {}
 
-    def step(self, actions):
-        self.count += 1
-        ends = self.count[:, 0] >= [3, 4]
-        infos = {"is_success": ends & [False, True], "_is_success": np.array([True, True])}
+    def step(self, action):
+        self.count += 1  # in place, as an environment may do
+        ends = bool(self.count[0] >= self.length)
+        info = {"is_success": ends and self.terminates}
         return (
-            self.count, self.count[:, 0].astype(float), ends & [False, True],
-            ends & [True, False], infos,
+            self.count, float(self.count[0]), ends and self.terminates,
+            ends and not self.terminates, info,
         )  # fmt: skip
+
+
+class Several:
+    """Environments of this process."""
+
+    def __init__(self, *envs: gymnasium.Env):
+        self.envs, self.num_envs = envs, len(envs)
+
+    def each(self, task):
+        return [finished(task(env, index)) for index, env in enumerate(self.envs)]
+
+
+def counting() -> Several:
+    """Two environments: the first is truncated after 3 steps, the second terminated after 4."""
+    return Several(Count(3, False), Count(4, True))
 
 
 COUNTED = ObservationLayout.of(spaces.Box(-np.inf, np.inf, (1,)))
