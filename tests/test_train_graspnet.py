@@ -205,10 +205,38 @@ def test_training_can_start_from_weights(finished, tmp_path, monkeypatch):
         torch.testing.assert_close(value, initial, rtol=0, atol=1e-8)
 
 
+# --- Several processes -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_processes(tiny_data, tmp_path_factory):
+    """A training of two epochs by two processes: its run folder, its arguments, what it printed."""
+    folder, arguments = tmp_path_factory.mktemp("two"), [*tiny_data[1], *SMALL, "train.epochs=2"]
+    printed = in_two_processes(folder, REPOSITORY / "train_graspnet.py", *arguments)
+    (run,) = (folder / "runs" / "train_graspnet").iterdir()
+    return run, arguments, printed
+
+
 @pytest.mark.slow
-def test_the_script_under_torchrun_leaves_one_run(tiny_data, tmp_path):
-    script = REPOSITORY / "train_graspnet.py"
-    printed = in_two_processes(tmp_path, script, *tiny_data[1], *SMALL, "train.epochs=1")
-    assert "2 process(es)" in printed and printed.count("best after epoch 1") == 1
-    (folder,) = (tmp_path / "runs" / "train_graspnet").iterdir()
-    assert json.loads((folder / "results.json").read_text())["best"]["step"] == 4
+def test_the_script_under_torchrun_leaves_one_run(two_processes):
+    run, _, printed = two_processes
+    assert "2 process(es)" in printed and printed.count("best after epoch") == 1
+    assert [row["step"] for row in history_of(run)] == [4, 8]
+
+
+@pytest.mark.slow
+def test_torchrun_replaces_a_lost_process_and_the_training_goes_on(two_processes, tmp_path):
+    """From the last checkpoint, in the run's folder, to the bits of an undisturbed training."""
+    undisturbed, arguments, _ = two_processes
+    module = "tests.helpers.lost_training"
+    printed = in_two_processes(tmp_path, "--max-restarts=1", "-m", module, *arguments)
+    assert (tmp_path / "lost").exists() and printed.count("2 process(es)") == 2
+    (run,) = (tmp_path / "runs" / "train_graspnet").iterdir()
+    assert history_of(run) == history_of(undisturbed)
+    ours, theirs = (load_checkpoint(folder / "last.pt", KIND) for folder in (run, undisturbed))
+    for part in ("step", "model", "optimizer", "scheduler", "extra"):
+        assert same(ours[part], theirs[part]), part
+
+
+def history_of(run: Path) -> list[dict[str, float]]:
+    return json.loads((run / "results.json").read_text())["history"]

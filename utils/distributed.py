@@ -111,7 +111,14 @@ def team(device: str, environment: Mapping[str, str], key: str = "train.device")
         return
     if chosen.type == "cuda":  # objects are broadcast by way of the current device
         torch.cuda.set_device(chosen)
-    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    # torchrun keeps its store when it starts the processes again: without a prefix they would find
+    # the addresses of those that are gone, and fail or wait for ever.
+    store, rank, _ = next(dist.rendezvous("env://"))
+    attempt = environment.get("TORCHELASTIC_RESTART_COUNT", "0")
+    dist.init_process_group(
+        "nccl" if chosen.type == "cuda" else "gloo",
+        store=dist.PrefixStore(f"attempt {attempt}", store), rank=rank, world_size=ranks,
+    )  # fmt: skip
     try:
         yield Team(dist.get_rank(), ranks, chosen)
     finally:
