@@ -86,8 +86,8 @@ def on_table(position: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """One rigid object. Lengths are metres in the body frame: origin at the centre of mass of
-    uniform density, axes as in the source.
+    """One rigid object. Lengths are metres in the body frame: origin at the centre of mass, axes as
+    in the source.
 
     parts: vertex arrays (V, 3) of the convex parts.
     mass: kg. inertia: (3,) moments about the body axes, kg m2.
@@ -96,6 +96,7 @@ class ObjectModel:
     collision: a native shape, or an OBJ file with one `o` group for each convex part.
     fine_visual: the original mesh for pictures, None where the collision shape is the original.
     extents: (3,) sides of the bounding box along the body axes.
+    remark: what of its file was not taken as it stands, or empty.
     """
 
     name: str
@@ -109,6 +110,7 @@ class ObjectModel:
     extents: np.ndarray
     rolling_friction: float = 0.0
     spinning_friction: float = 0.0
+    remark: str = ""
 
     def geometry(self) -> tuple[ConvexSolid, ...]:
         """The convex parts as solids, in the body frame."""

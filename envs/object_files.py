@@ -1,7 +1,6 @@
-"""Object files: the URDF and mesh files of a folder, and their geometry, colour and friction.
+"""Object files: the URDF and mesh files of a folder, their geometry, colour, friction and mass.
 
-Lengths and axes stay those of the file. This module knows no mass, no simulator and no
-object set.
+Lengths and axes stay those of the file. This module knows no simulator and no object set.
 """
 
 from __future__ import annotations
@@ -41,16 +40,30 @@ class FineVisual:
 
 
 @dataclass(frozen=True)
+class Inertial:
+    """What a URDF states of all its links together, in the file's axes.
+
+    mass: kg. centre_of_mass: (3,) m. inertia: (3, 3) kg m2 about the centre of mass.
+    """
+
+    mass: float
+    centre_of_mass: np.ndarray
+    inertia: np.ndarray
+
+
+@dataclass(frozen=True)
 class ObjectSource:
     """The content of an object file.
 
-    mesh: the solid geometry. visual: (mesh file, scale (3,), T (4, 4)) of a URDF that has a single
-    visual mesh. visual_mesh: all visual geometry of a URDF as one mesh. Pictures show the first of
-    visual, visual_mesh and the file itself that exists.
+    mesh: the solid geometry. inertial: None where the file states no mass. visual: (mesh file,
+    scale (3,), T (4, 4)) of a URDF that has a single visual mesh. visual_mesh: all visual geometry
+    of a URDF as one mesh. Pictures show the first of visual, visual_mesh and the file itself that
+    exists.
     """
 
     mesh: trimesh.Trimesh
     friction: float = DEFAULT_FRICTION
+    inertial: Inertial | None = None
     color: tuple[float, float, float, float] | None = None
     visual: tuple[Path, np.ndarray, np.ndarray] | None = None
     visual_mesh: trimesh.Trimesh | None = None
@@ -143,6 +156,7 @@ def _read_urdf(path: Path) -> ObjectSource:
         friction = DEFAULT_FRICTION if friction is None else float(friction.get("value"))
         if not 0 <= friction < math.inf:
             raise ValueError(f"its lateral_friction is {friction}")
+        inertial = _inertial(robot)
     except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
         raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
     if len(mesh.faces) == 0:
@@ -151,10 +165,35 @@ def _read_urdf(path: Path) -> ObjectSource:
     return ObjectSource(
         mesh=checked_mesh(mesh, str(path)),
         friction=friction,
+        inertial=inertial,
         color=_urdf_color(shown, robot),
         visual=_single_visual(shown, robot, path),
         visual_mesh=visual if len(visual.faces) else None,
     )
+
+
+def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
+    """The sum over all links. Raises ValueError for a mass that is no positive number."""
+    stated = []
+    for link in robot.robot.links:
+        if link.inertial is None or link.inertial.mass is None:
+            continue
+        mass, T = float(link.inertial.mass), robot.get_transform(link.name)
+        if not 0 <= mass < math.inf:
+            raise ValueError(f"the mass of its link {link.name} is {mass}")
+        if link.inertial.origin is not None:
+            T = T @ link.inertial.origin
+        own = np.zeros((3, 3)) if link.inertial.inertia is None else link.inertial.inertia
+        stated.append((mass, T[:3, 3], T[:3, :3] @ np.asarray(own, float) @ T[:3, :3].T))
+    total = sum(mass for mass, _, _ in stated)
+    if total == 0.0:
+        return None
+    centre = sum(mass * at for mass, at, _ in stated) / total
+    inertia = np.zeros((3, 3))
+    for mass, at, own in stated:  # the parallel axis theorem
+        off = at - centre
+        inertia += own + mass * (off @ off * np.eye(3) - np.outer(off, off))
+    return Inertial(total, centre, inertia)
 
 
 def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:

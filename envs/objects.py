@@ -20,8 +20,14 @@ import trimesh
 from tqdm import tqdm
 
 from envs.cell_layout import ObjectModel
-from envs.object_files import fine_visual, object_files, read_object
-from envs.object_meshes import ObjectError, decompose, mass_properties, write_parts_obj
+from envs.object_files import Inertial, fine_visual, object_files, read_object
+from envs.object_meshes import (
+    MassProperties,
+    ObjectError,
+    decompose,
+    mass_properties,
+    write_parts_obj,
+)
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
 from utils.errors import UserError, did_you_mean, one_line
@@ -33,8 +39,10 @@ PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
 
-# Of solid plastic. A random_urdfs object (median 37 cm3 at scale 0.65) then weighs 40 g.
-DEFAULT_DENSITY = 1000.0
+# kg/m3, the median of 26 of the YCB household objects, mass over the volume of their convex parts.
+DEFAULT_DENSITY = 700.0
+# An inertia below this share of that of a solid of even density is a placeholder, too.
+LEAST_INERTIA = 0.1
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
 LARGEST_EXTENT = 0.5
@@ -109,8 +117,8 @@ def load_object_set(
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
     fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
         so that the second longest side of its oriented bounding box has this many metres.
-    density: kg/m3 of the objects of `random_urdfs` or of a folder; `box` and `primitives` have
-        their own. No object weighs less than 0.02 kg.
+    density: kg/m3 of those objects of a folder whose file states no mass; `box` and `primitives`
+        have their own. No object weighs less than 0.02 kg.
     max_opening: m, of the gripper; a warning names the first object of a folder that is too wide
         for it.
     cache_dir: where convex parts are kept.
@@ -262,7 +270,10 @@ class FileSet(ObjectSet):
         self.files, self.scale = tuple(files), scale
         self.fit, self.density = settings.fit, settings.density
         self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
-        self._warned = False
+        # random_urdfs is known to hold a few that no hand can take, and placeholders for inertias;
+        # of a folder both are a surprise.
+        self._warned = name == "random_urdfs"
+        self._remarked = self._warned
 
     def __len__(self) -> int:
         return len(self.files)
@@ -272,7 +283,9 @@ class FileSet(ObjectSet):
         model = load_object(
             path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
         )
-        # random_urdfs is known to hold a few that no hand can take; of a folder it is a surprise.
+        if model.remark and not self._remarked:
+            self._remarked = True
+            warnings.warn(f"object {path}: {model.remark} (and so may others)", stacklevel=3)
         ungraspable = model.extents.min() > self.max_opening or model.extents.max() > LARGEST_EXTENT
         if ungraspable and not self._warned:
             self._warned = True
@@ -334,7 +347,8 @@ def load_object(
 ) -> ObjectModel:
     """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
 
-    scale, fit, density: as in `load_object_set`. Raises ObjectError naming the file.
+    scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
+    volume. Raises ObjectError naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
     source = read_object(path)
@@ -342,25 +356,68 @@ def load_object(
     solid = mass_properties(source.mesh, parts)
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
-    parts = tuple(scale * (part - solid.centre_of_mass) for part in parts)
+    inertial = body_of(source.inertial, solid, source.mesh, density)
+    replaced = source.inertial is not None and inertial is not source.inertial
+    parts = tuple(scale * (part - inertial.centre_of_mass) for part in parts)
     side = float(np.ptp(np.concatenate(parts), axis=0).max())
     if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
         raise ObjectError(
             f"object {path} is {side:.3g} m long, which no simulator bears; set objects.fit, for "
             "example to 0.06, or objects.scale"
         )
-    true_mass = density * solid.volume * scale**3
-    mass = max(true_mass, MIN_MASS)
+    mass = max(inertial.mass * scale**3, MIN_MASS)
     return ObjectModel(
         name=path.stem,
         parts=parts,
         mass=mass,
-        inertia=np.diag(solid.inertia) * density * scale**5 * (mass / true_mass),
+        inertia=np.diag(inertial.inertia) * scale**2 * (mass / inertial.mass),
         friction=source.friction,
         color=source.color or random_color(np.random.default_rng(list(path.stem.encode()))),
         collision=write_parts_obj(parts, cache_dir),
-        fine_visual=fine_visual(path, source, scale, solid.centre_of_mass, cache_dir),
+        fine_visual=fine_visual(path, source, scale, inertial.centre_of_mass, cache_dir),
         extents=np.ptp(np.concatenate(parts), axis=0),
+        remark="states an inertia that no body of its mass and shape can have; that of an even "
+        "density is taken instead"
+        if replaced
+        else "",
+    )
+
+
+def body_of(
+    stated: Inertial | None, solid: MassProperties, mesh: trimesh.Trimesh, density: float
+) -> Inertial:
+    """Mass, centre of mass and inertia of an object as its file states them.
+
+    density: kg/m3 where it states no mass. Where the inertia is a placeholder, so may the centre of
+    mass be: both are then those of a solid of even density and of the stated mass.
+    """
+    mass = density * solid.volume if stated is None else stated.mass
+    if stated is not None and is_possible(stated, solid, mesh):
+        return stated
+    return Inertial(mass, solid.centre_of_mass, mass / solid.volume * solid.inertia)
+
+
+def is_possible(stated: Inertial, solid: MassProperties, mesh: trimesh.Trimesh) -> bool:
+    """Whether a body of this shape, however its mass is spread, can have a stated inertia.
+
+    Its centre of mass lies within the bounding box. No principal moment is larger than the sum of
+    the two others, or than that of all the mass in the vertex that is farthest from the axis; none
+    is below LEAST_INERTIA of that of even density. Three equal moments of a body that is not as
+    long as it is wide, such as 1e-3 in many data sets, are a placeholder, too.
+    """
+    lower, upper = mesh.bounds
+    if not ((lower <= stated.centre_of_mass) & (stated.centre_of_mass <= upper)).all():
+        return False
+    moments, axes = np.linalg.eigh(stated.inertia)
+    even = np.linalg.eigvalsh(solid.inertia) * stated.mass / solid.volume
+    along = (mesh.vertices - stated.centre_of_mass) @ axes
+    squared = (along**2).sum(axis=1, keepdims=True) - along**2
+    isotropic = np.ptp(moments) < 1e-6 * moments.max() and even.max() > 1.2 * even.min()
+    return bool(
+        not isotropic
+        and (moments >= LEAST_INERTIA * even).all()
+        and (moments <= stated.mass * squared.max(axis=0)).all()
+        and moments[0] + moments[1] >= (1 - 1e-6) * moments[2]
     )
 
 

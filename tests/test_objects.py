@@ -80,6 +80,75 @@ def test_mass_and_inertia_of_a_mesh_box_are_the_closed_form(tmp_path):
     assert model.extents == pytest.approx([0.04, 0.05, 0.06], abs=1e-6)
 
 
+def _urdf_box(folder, mass: str, inertia: str, origin: str = "") -> Path:
+    """A box of 4 x 5 x 6 cm about the origin whose URDF states an inertial."""
+    path = folder / "box.urdf"
+    path.write_text(
+        f"""<robot name="box"><link name="a"><inertial>{origin}<mass value="{mass}"/>
+        <inertia {inertia}/></inertial>
+        <visual><geometry><box size="0.04 0.05 0.06"/></geometry></visual>
+        <collision><geometry><box size="0.04 0.05 0.06"/></geometry></collision></link></robot>"""
+    )
+    return path
+
+
+def _moments(mass: float, factor: float = 1.0) -> np.ndarray:
+    a, b, c = 0.04**2, 0.05**2, 0.06**2
+    return factor * mass / 12 * np.array([b + c, a + c, a + b])
+
+
+def _written(moments) -> str:
+    return " ".join(f'{name}="{value}"' for name, value in zip(("ixx", "iyy", "izz"), moments))
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 1.8])
+def test_a_stated_mass_and_inertia_count_and_grow_with_the_size(tmp_path, factor):
+    """A mass grows with the cube of the size, its inertia with the fifth power."""
+    path = _urdf_box(
+        tmp_path, "0.4", _written(_moments(0.4, factor)), '<origin xyz="0.005 0 -0.01"/>'
+    )
+    model = load_object(path, scale=0.9, density=5000, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(0.4 * 0.9**3) and not model.remark
+    assert model.inertia == pytest.approx(_moments(0.4, factor) * 0.9**5)
+    middle = (np.concatenate(model.parts).max(axis=0) + np.concatenate(model.parts).min(axis=0)) / 2
+    assert middle == pytest.approx(0.9 * np.array([-0.005, 0, 0.01]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "origin"),
+    [
+        ((1e-3,) * 3, ""),  # more than all of the mass in a corner would have
+        ((1e-4,) * 3, ""),  # a placeholder: the box is half as high again as it is wide
+        ((1.0, 1.0, 0.0), ""),  # as random_urdfs has it
+        (_moments(0.4, 0.05), ""),  # all of the mass near the middle
+        ((2e-4, 5e-5, 5e-5), ""),  # more than the two others together
+        (_moments(0.4), '<origin xyz="0.1 0 0"/>'),  # a centre of mass outside
+    ],
+)
+def test_of_an_impossible_inertia_the_mass_alone_counts(tmp_path, inertia, origin):
+    path = _urdf_box(tmp_path, "0.4", _written(inertia), origin)
+    model = load_object(path, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(0.4) and "inertia" in model.remark
+    assert model.inertia == pytest.approx(_moments(0.4))
+    assert np.concatenate(model.parts).mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+def test_a_folder_remarks_upon_impossible_inertias_once(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / "set" / name).mkdir(parents=True)
+        _urdf_box(tmp_path / "set" / name, "0.4", _written((1e-3,) * 3))
+    objects = load_object_set(str(tmp_path / "set"), cache_dir=tmp_path / "cache")
+    with pytest.warns(UserWarning, match="inertia that no body") as found:
+        assert [model.mass for model in objects] == pytest.approx([0.4, 0.4])
+    assert sum(issubclass(one.category, UserWarning) for one in found) == 1
+
+
+@pytest.mark.parametrize("mass", ["-0.1", "nan"])
+def test_a_mass_that_is_none_is_refused(tmp_path, mass):
+    with pytest.raises(ObjectError, match="mass of its link a"):
+        load_object(_urdf_box(tmp_path, mass, _written(_moments(0.4))), cache_dir=tmp_path)
+
+
 def test_a_light_object_is_given_the_least_mass_and_the_inertia_that_goes_with_it(tmp_path):
     trimesh.creation.box((0.01, 0.01, 0.01)).export(tmp_path / "dice.stl")
     model = load_object(tmp_path / "dice.stl", cache_dir=tmp_path)
