@@ -7,7 +7,7 @@ compiled. This module knows no cell, robot or camera.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from typing_extensions import Self
 
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
+    CERTAIN_REST_CHECKS,
     GRAVITY,
     REST_CHECK_STEPS,
     REST_SPEED,
@@ -75,6 +76,29 @@ def wake(model: mujoco.MjModel, data: mujoco.MjData, bodies: Iterable[int]) -> N
     for body in bodies:
         if not data.body_awake[body]:
             data.qvel[model.body_dofadr[body]] = _PUSH
+
+
+def settle(
+    data: mujoco.MjData, speeds: Sequence[int], config: Config, step: Callable[[int], None]
+) -> bool:
+    """Step until free bodies rest; False if they still move after scene.settle_seconds.
+
+    speeds: where the velocity of each begins in `data.qvel`. step: takes so many of the cell's
+    steps. Rings and crosses rock for seconds on the edges of their pieces, and a single check would
+    find them at rest where they turn round.
+    """
+    found = 0
+    for _ in range(int(config.scene.settle_seconds * config.sim.frequency / REST_CHECK_STEPS)):
+        step(REST_CHECK_STEPS)
+        found = found + 1 if all(_resting(data.qvel[at : at + 6]) for at in speeds) else 0
+        if found == CERTAIN_REST_CHECKS:
+            return True
+    return False
+
+
+def _resting(velocity: np.ndarray) -> bool:
+    linear, angular = np.abs(velocity).reshape(2, 3).max(axis=1)
+    return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
 
 
 def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
@@ -208,19 +232,11 @@ class MujocoTable(LayoutTable):
             self._free.append(body)
 
     def settle(self, bodies: Sequence[int]) -> bool:
-        checks = int(
-            self._config.scene.settle_seconds * self._config.sim.frequency / REST_CHECK_STEPS
-        )
-        for _ in range(checks):
-            self._mujoco.mj_step(self._model, self._data, REST_CHECK_STEPS * SUBSTEPS)
-            if all(map(self._resting, bodies)):
-                return True
-        return False
+        def step(count: int) -> None:
+            self._mujoco.mj_step(self._model, self._data, count * SUBSTEPS)
 
-    def _resting(self, body: int) -> bool:
-        start = self._joint(body).dofadr[0]
-        linear, angular = np.abs(self._data.qvel[start : start + 6]).reshape(2, 3).max(axis=1)
-        return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
+        speeds = [self._joint(body).dofadr[0] for body in bodies]
+        return settle(self._data, speeds, self._config, step)
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         start = self._joint(body).qposadr[0]

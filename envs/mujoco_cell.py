@@ -17,8 +17,6 @@ from envs.board import Board
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import (
     BIN_COLOUR,
-    REST_CHECK_STEPS,
-    REST_SPEED,
     TABLE_COLOUR,
     Scene,
     bin_walls,
@@ -33,6 +31,7 @@ from envs.mujoco_bodies import (
     add_box,
     add_object,
     set_up_physics,
+    settle,
     wake,
 )
 from envs.mujoco_camera import MujocoCamera, Window, add_view
@@ -140,15 +139,8 @@ class MujocoCell(Cell):
         return self._randomizable
 
     def _settle(self) -> None:
-        for _ in range(int(self.config.scene.settle_seconds / self.dt / REST_CHECK_STEPS)):
-            self.robot.step(REST_CHECK_STEPS)
-            if all(map(self._resting, self.remaining)):
-                break
-
-    def _resting(self, index: int) -> bool:
-        start = self._speeds[index]
-        linear, angular = np.abs(self.robot.data.qvel[start : start + 6]).reshape(2, 3).max(axis=1)
-        return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
+        speeds = [self._speeds[index] for index in self.remaining]
+        settle(self.robot.data, speeds, self.config, self.robot.step)
 
     def _advance(self, count: int) -> None:
         if self._window is None:

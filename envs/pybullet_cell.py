@@ -12,7 +12,7 @@ import pybullet
 
 from envs.board import Board
 from envs.cell import Cell, PhysicsError
-from envs.cell_layout import Scene
+from envs.cell_layout import CERTAIN_REST_CHECKS, Scene
 from envs.panda_urdf import write_panda
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
@@ -32,7 +32,6 @@ from utils.transforms import position_quaternion
 
 # As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
 _SLEEPING_RESIDUAL = 1e-6
-_SLEEPING_CHECKS = 5  # 0.2 s, in which a body that topples gets ten times as fast
 
 
 class PybulletCell(Cell):
@@ -124,7 +123,7 @@ class PybulletCell(Cell):
         A sleeping object lies still at no cost until something hits it. The solver stops a little
         earlier as well, which moves a free arm's joints by less than 0.5 mrad.
         """
-        if not settle(self.client, self.bodies, self.config, checks=_SLEEPING_CHECKS):
+        if not settle(self.client, self.bodies, self.config, checks=CERTAIN_REST_CHECKS):
             return False
         sleep = pybullet.ACTIVATION_STATE_ENABLE_SLEEPING | pybullet.ACTIVATION_STATE_SLEEP
         self._set_activation(sleep, _SLEEPING_RESIDUAL)

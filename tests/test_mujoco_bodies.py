@@ -1,0 +1,27 @@
+"""When bodies of a MuJoCo model count as resting."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from envs.mujoco_bodies import settle
+from utils.config import load_config
+
+
+@pytest.mark.parametrize(
+    ("rates", "rested"),
+    [([1.2, 0.08, 1.3] * 4 + [0.05] * 5, True), ([1.2, 0.08, 1.3] * 20, False)],
+    ids=["comes to rest", "rocks"],
+)
+def test_a_body_that_turns_round_while_it_rocks_does_not_rest(rates, rested):
+    """Turn rates in rad/s, 0.05 s apart; a body counts as resting below 0.1 rad/s."""
+    config = load_config(None, [f"scene.settle_seconds={0.05 * len(rates)}"])
+    data, left = SimpleNamespace(qvel=np.zeros(12)), iter(rates)
+
+    def step(count: int) -> None:
+        assert count == 12
+        data.qvel[10] = next(left)
+
+    assert settle(data, [0, 6], config, step) == rested
+    assert not list(left)
