@@ -363,7 +363,7 @@ class Cell(ABC):
                     "Depth noise follows the scene's seed; build or load a scene first"
                 )
             measure = seeded_noise(noise, NoiseStream.PLANNING, self.scene.seed, self.frames)
-            frame = replace(frame, depth=measure(frame.depth))
+            frame = replace(frame, depth=measure(frame.depth, frame.rgb))
         self.frames += 1
         return frame
 

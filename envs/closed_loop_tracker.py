@@ -53,7 +53,8 @@ class WristCamera:
     def __call__(self) -> WristImage | None:
         """Take an image now; the newest image that has arrived since the last call, or None."""
         cell = self.cell
-        depth = self._measure(cell.look(self.intrinsics, cell.camera_pose("wrist")).depth)
+        seen = cell.look(self.intrinsics, cell.camera_pose("wrist"))
+        depth = self._measure(seen.depth, seen.rgb)
         self._coming.append(WristImage(depth, cell.robot.q, cell.seconds))
         arrived = None
         while self._coming and cell.seconds - self._coming[0].seconds >= self.latency - 1e-9:

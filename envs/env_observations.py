@@ -162,7 +162,7 @@ class Observer:
         seed, stream = self._cell.scene.seed, NoiseStream.OBSERVATION
         measure = seeded_noise(self._depth_noise, stream, seed, self._frames)
         self._frames += 1
-        return image.rgb, measure(image.depth)[..., None]
+        return image.rgb, measure(image.depth, image.rgb)[..., None]
 
     def placeholder(self) -> dict[str, np.ndarray]:
         """An observation within its space for the end of an episode whose physics failed."""

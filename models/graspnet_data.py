@@ -31,7 +31,7 @@ from utils.augmentation import (
     apply_similarity,
 )
 from utils.config import Config
-from utils.depth import DepthNoise, KinectNoise
+from utils.depth import DepthNoise, KinectNoise, measure
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.grasp_data import SimulatedDataset
@@ -268,7 +268,10 @@ class NoisyShare:
     share: float
     noise: DepthNoise
 
-    def __call__(self, depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    def __call__(
+        self, depth: torch.Tensor, rng: np.random.Generator, rgb: torch.Tensor
+    ) -> torch.Tensor:
         if rng.random() >= self.share:
             return depth
-        return depth.new_tensor(self.noise(depth.cpu().numpy(), rng))
+        colours = rgb.permute(1, 2, 0).cpu().numpy()
+        return depth.new_tensor(measure(self.noise, depth.cpu().numpy(), rng, colours))

@@ -100,7 +100,8 @@ class RectangleExamples(Dataset):
             changed = self.augmentation.colour(torch.from_numpy(np.moveaxis(rgb, -1, 0)), rng)
             rgb = np.ascontiguousarray(changed.permute(1, 2, 0).numpy())
         if self.augmentation.depth_noise is not None:
-            depth = self.augmentation.depth_noise(torch.from_numpy(depth), rng).numpy()
+            colours = torch.from_numpy(np.moveaxis(rgb, -1, 0))
+            depth = self.augmentation.depth_noise(torch.from_numpy(depth), rng, colours).numpy()
         return rgb, depth
 
     def _corner(

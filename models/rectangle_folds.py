@@ -40,7 +40,7 @@ METRIC = "top-1, IoU > 0.25 and angle < 30 degrees"
 DEPTH_NOISE = 0.002  # m, standard deviation; real depth is noisy already
 
 
-def white_noise(depth: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+def white_noise(depth: torch.Tensor, rng: np.random.Generator, rgb: torch.Tensor) -> torch.Tensor:
     """Add normal deviates to depth (H, W) metres."""
     noise = rng.standard_normal(tuple(depth.shape), dtype=np.float32)
     return depth + DEPTH_NOISE * torch.from_numpy(noise)

@@ -189,7 +189,7 @@ def test_shift_leaves_unknown_behind():
 
 def test_augmentation_depends_on_its_generator_alone():
     image, before = labelled(), torch.get_rng_state()
-    augment = Augmentation(depth_noise=lambda depth, rng: depth + rng.normal())
+    augment = Augmentation(depth_noise=lambda depth, rng, rgb: depth + rng.normal())
     one, same, other = (augment(image, np.random.default_rng(s)) for s in (1, 1, 2))
     assert equal(one, same) and not equal(one, other)
     assert torch.equal(torch.get_rng_state(), before)

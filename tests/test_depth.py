@@ -19,7 +19,9 @@ from tests.helpers.box_frames import boxes_frame
 from utils.config import ConfigError, changed_keys, load_config, with_settings
 from utils.depth import (
     DEPTH_NOISES,
+    GammaNoise,
     KinectNoise,
+    RealSenseNoise,
     depth_of_plane,
     make_depth_noise,
     near_side,
@@ -168,12 +170,141 @@ def test_a_share_of_the_training_images_is_measured():
     """Alike whether the noise is applied to an array or to a tensor of the training."""
     noise, depth = KinectNoise(), torch.from_numpy(steps_and_slopes(64))
     rng = np.random.default_rng(0)
-    measured = NoisyShare(1.0, noise)(depth, rng)
+    rgb = torch.zeros(3, 64, 64, dtype=torch.uint8)
+    measured = NoisyShare(1.0, noise)(depth, rng, rgb)
     rng = np.random.default_rng(0)
     rng.random()  # whether this image is one of the share
     np.testing.assert_array_equal(measured.numpy(), noise(depth.numpy(), rng))
     assert measured.dtype == torch.float32 and (depth == 0).any()
-    assert NoisyShare(0.0, noise)(depth, rng) is depth
+    assert NoisyShare(0.0, noise)(depth, rng, rgb) is depth
+
+
+# --- Active stereo and Dex-Net's noise --------------------------------------------------------
+
+
+def spread_and_correlation(field: np.ndarray, apart: int) -> tuple[float, float]:
+    """Standard deviation, and correlation of values `apart` pixels apart along both axes."""
+    field = field.astype(float) - field.mean()
+    pairs = (field[:, apart:] * field[:, :-apart]).mean(), (field[apart:] * field[:-apart]).mean()
+    return field.std(), float(np.mean(pairs) / field.var())
+
+
+@pytest.mark.parametrize("z", [0.4, 0.8, 1.6])
+def test_active_stereo_errs_by_the_square_of_the_distance(z):
+    """Intel's formula with its D435: 1.2 mm at 0.57 m, 2.4 mm at 0.8 m; D415: 0.93 mm at 0.8 m."""
+    errors = RealSenseNoise()(plane(z, 400), np.random.default_rng(0)) - z
+    spread, correlation = spread_and_correlation(errors, 2)
+    assert spread == pytest.approx(z**2 * 0.08 / (424 * 0.05), rel=0.04)
+    assert abs(errors.mean()) < 0.1 * spread
+    assert correlation == pytest.approx(np.exp(-(2**2) / (2 * 2.5**2)), abs=0.03)
+    d415 = RealSenseNoise(1005, focal=1005, baseline=0.055)
+    ratio = (d415(plane(z, 400), np.random.default_rng(1)) - z).std() / spread
+    assert ratio == pytest.approx(424 * 0.05 / (1005 * 0.055), rel=0.08)
+
+
+def test_active_stereo_correlates_over_the_same_angle_at_every_resolution():
+    errors = RealSenseNoise(image_focal=848)(plane(0.8, 500), np.random.default_rng(0))
+    assert spread_and_correlation(errors, 4)[1] == pytest.approx(np.exp(-4 / 12.5), abs=0.04)
+
+
+def test_a_shadow_lies_on_the_left_as_wide_as_the_step_in_disparity():
+    depth = plane(0.8, 120)
+    depth[40:80, 60:90] = 0.6
+    noise = RealSenseNoise(subpixel=0, grazing=90)
+    hole = noise(depth, np.random.default_rng(0)) == 0
+    width = 424 * 0.05 * (1 / 0.6 - 1 / 0.8)  # 8.8 pixels
+    rows, cols = np.nonzero(hole)
+    assert set(rows) == set(range(40, 80)) and cols.max() == 59
+    assert len(rows) / 40 == pytest.approx(width, abs=1)
+
+
+def test_pixels_are_lost_on_dark_shiny_and_grazing_surfaces():
+    """The share lost is the probability that the docstring states."""
+    noise, depth = RealSenseNoise(), plane(0.8, 300)
+
+    def share_lost(level: int) -> float:
+        rgb = np.full((300, 300, 3), level, np.uint8)
+        return float((noise(depth, np.random.default_rng(2), rgb) == 0).mean())
+
+    assert [share_lost(level) for level in (40, 128, 250)] == [0, 0, 0]
+    assert share_lost(0) == share_lost(255) == 1
+    assert share_lost(20) == pytest.approx(0.5, abs=0.03)
+    assert share_lost(10) == pytest.approx(0.75, abs=0.03)
+    assert share_lost(252) == pytest.approx(0.4, abs=0.03)
+    assert (noise(depth, np.random.default_rng(2)) > 0).all()  # no colours, nothing dark
+
+    def tilted(degrees: float) -> np.ndarray:
+        """A plane turned about the image's rows: 1 / z is linear in the column."""
+        u = np.arange(200) - 99.5
+        inverse = (1 - np.tan(np.radians(degrees)) * u / 424) / 0.8
+        return np.broadcast_to(1 / inverse, (200, 200)).astype(np.float32)
+
+    holes = RealSenseNoise(baseline=1e-6, subpixel=0)  # no shadows, no errors
+    middle = np.s_[:, 90:110]
+    for degrees, share in ((0, 0.0), (65, 0.0), (75, 0.25), (80, 0.5)):
+        lost = [
+            (holes(tilted(degrees), np.random.default_rng(seed))[middle] == 0).mean()
+            for seed in range(20)
+        ]
+        assert np.mean(lost) == pytest.approx(share, abs=0.05)
+
+
+def test_gamma_noise_has_the_mean_and_variance_of_dex_net():
+    factors = [
+        GammaNoise(sigma=0)(plane(0.5, 2), np.random.default_rng(seed))[0, 0] / 0.5
+        for seed in range(20_000)
+    ]
+    assert np.mean(factors) == pytest.approx(1, abs=3 * np.sqrt(1e-3 / 20_000))
+    assert np.var(factors) == pytest.approx(1e-3, rel=0.04)
+    error = GammaNoise(shape=1e14)(plane(0.7, 500), np.random.default_rng(0)) - 0.7
+    spread, correlation = spread_and_correlation(error, 2)
+    assert spread == pytest.approx(0.005, rel=0.02)
+    assert correlation == pytest.approx(np.exp(-1), abs=0.02)  # d^2 / (2 l^2) = 4 / 4
+    assert spread_and_correlation(error, 6)[1] == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize("noise", [RealSenseNoise(), GammaNoise()])
+def test_every_noise_is_seeded_keeps_its_input_and_the_unknown(noise):
+    depth = steps_and_slopes(64)
+    before = depth.copy()
+    first = noise(depth, np.random.default_rng(5))
+    assert first.dtype == np.float32 and first.shape == depth.shape
+    np.testing.assert_array_equal(first, noise(depth, np.random.default_rng(5)))
+    assert (first != noise(depth, np.random.default_rng(6))).any()
+    np.testing.assert_array_equal(depth, before)
+    assert not first[depth == 0].any() and np.isfinite(first).all() and (first >= 0).all()
+    assert not noise(np.full((32, 32), np.nan), np.random.default_rng(0)).any()
+    with pytest.raises(ValueError, match=r"\(H, W\)"):
+        noise(np.ones((3, 4, 5)), np.random.default_rng(0))
+    after = []
+    for seen in (plane(0.8, 64), depth, plane(0.0, 64)):
+        rng = np.random.default_rng(0)
+        noise(seen, rng)
+        after.append(rng.random())
+    assert len(set(after)) == 1  # the generator advances alike whatever is seen
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("realsense", {"baseline": 0}, "RealSenseNoise.baseline must be > 0"),
+        ("realsense", {"dark": 300}, r"RealSenseNoise.dark must be in \[0, 255\], got 300"),
+        ("realsense", {"subpixel": -1}, "RealSenseNoise.subpixel must be in"),
+        ("gamma", {"shape": 0}, "GammaNoise.shape must be > 0"),
+        ("gamma", {"sigma": -1}, "GammaNoise.sigma must be >= 0"),
+    ],
+)
+def test_wrong_parameters_of_a_profile_are_refused(name, wrong, message):
+    with pytest.raises(UserError, match=message):
+        make_depth_noise(name, 480.0, wrong)
+
+
+def test_training_shows_colours_to_the_noise():
+    rgb = torch.full((3, 64, 64), 128, dtype=torch.uint8)
+    rgb[:, :32] = 0
+    depth = torch.full((64, 64), 0.8)
+    measured = NoisyShare(1.0, RealSenseNoise())(depth, np.random.default_rng(0), rgb)
+    assert not measured[:32].any() and (measured[32:] > 0).all()
 
 
 def gaussian(image_focal: float, sigma: float = 0.001):
@@ -184,7 +315,7 @@ def gaussian(image_focal: float, sigma: float = 0.001):
 def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
     assert make_depth_noise("none", 480.0, {"ignored": 1}) is None
     assert make_depth_noise("kinect", 390.0, {"step": 0.25}) == KinectNoise(390.0, step=0.25)
-    assert set(DEPTH_NOISES) == {"kinect"}
+    assert set(DEPTH_NOISES) == {"kinect", "realsense", "gamma"}
     own = make_depth_noise("tests.test_depth:gaussian", 480.0, {"sigma": 0.1})
     assert own(plane(0.8), np.random.default_rng(0)).std() == pytest.approx(0.1, rel=0.02)
 
@@ -192,7 +323,11 @@ def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("kinec", {}, "expected one of kinect, module:name, none; did you mean kinect"),
+        (
+            "kinec",
+            {},
+            "gamma, kinect, module:name, none, realsense; did you mean kinect",
+        ),
         ("kinect", {"nois": 1}, "depth_noise_args: 'kinect' does not take them.*'nois'"),
         ("kinect", {"noise": -1}, "KinectNoise.noise must be >= 0"),
         ("tests.test_depth:nothing", {}, "has no 'nothing'"),

@@ -16,7 +16,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
-TensorNoise = Callable[[torch.Tensor, np.random.Generator], torch.Tensor]
+# depth (H, W) metres, a generator, rgb (3, H, W) uint8 -> depth
+TensorNoise = Callable[[torch.Tensor, np.random.Generator, torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,7 @@ class Augmentation:
     (10 degrees) mixes no bins and so keeps hard labels hard; None does not round. max_shift: share
     of the image's side, in both directions. scale: lowest and highest, drawn uniformly in its
     logarithm. mirror: probability. colour: None keeps the colours. depth_noise: called last with
-    (depth (H, W) metres, rng), returns the noisy depth; unknown depth is 0.
+    (depth (H, W) metres, rng, rgb), returns the noisy depth; unknown depth is 0.
     """
 
     max_turn: float = np.pi
@@ -256,5 +257,5 @@ class Augmentation:
         if self.colour is not None:
             image = replace(image, rgb=self.colour(image.rgb, rng))
         if self.depth_noise is not None:
-            image = replace(image, depth=self.depth_noise(image.depth, rng))
+            image = replace(image, depth=self.depth_noise(image.depth, rng, image.rgb))
         return image

@@ -1,7 +1,8 @@
 """Depth images: the noise that real cameras add, and what unmeasured pixels may show.
 
 A depth noise is a callable `noise(depth, rng) -> depth` that turns a clean depth image into a
-measured one. `DEPTH_NOISES` lists the known ones; `make_depth_noise` makes one of them, or one of
+measured one; one with `sees_colours = True` is called with the colours too, `noise(depth, rng,
+rgb)`. `DEPTH_NOISES` lists the known ones; `make_depth_noise` makes one of them, or one of
 your own, for all that measure depth: the cell's cameras, the closed loop, the environments, the
 randomisation and the training. `seeded_noise` gives it the random numbers of a scene; `NoiseStream`
 lists who draws them.
@@ -9,7 +10,8 @@ lists who draws them.
 `KinectNoise` has four effects, after Handa et al., "A benchmark for RGB-D visual odometry, 3D
 reconstruction and SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single
 RGB-D image" (CVPR 2013), and Bohg et al., "Robot arm pose estimation through pixel-wise part
-classification" (ICRA 2014), whose window of projected dots makes the holes.
+classification" (ICRA 2014), whose window of projected dots makes the holes. `RealSenseNoise` is an
+active stereo camera, `GammaNoise` the noise with which Dex-Net 2.0 and GIGA were trained.
 
 Holes (pixels without a depth) lie at the edges of whatever stands up, in its shadow, and cover thin
 parts. `near_side`, `table_in_holes` and `fill_holes` fill them, each for another purpose. This
@@ -22,18 +24,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.special import ndtri
 
 from utils.errors import UserError, unknown_choice
 from utils.plugins import is_import_path, load_plugin
 from utils.transforms import RGBDFrame, deproject, known_depth
 
-# (H, W) float32 metres and a generator for the draws -> (H, W) float32 metres, 0 where unknown.
-DepthNoise = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+# (H, W) float32 metres and a generator for the draws, and (H, W, 3) uint8 colours for noises that
+# have `sees_colours` -> (H, W) float32 metres, 0 where unknown.
+DepthNoise = Callable[..., np.ndarray]
 
 _PATTERN_SEED = 1975  # the projector's pattern never changes; any number would do
 _DOT_CELL = 3  # sensor pixels: the pattern has one dot in each square of this side
@@ -212,9 +216,169 @@ def _farthest_first(reach: int) -> tuple[tuple[int, int], ...]:
     return tuple(sorted(disc, key=lambda offset: (-(offset[0] ** 2) - offset[1] ** 2, *offset)))
 
 
+@dataclass(frozen=True)
+class RealSenseNoise:
+    """An active stereo camera such as Intel's D435: errors that grow with the square of the
+    distance, shadows beside whatever stands up, and holes where the surface returns no pattern.
+
+    The standard deviation at distance z is z^2 subpixel / (focal x baseline), after Grunnet-Jepsen,
+    Sweetser and Woodfill, "Tuning depth cameras for best performance" (Intel RealSense), who expect
+    a sub-pixel error of 0.1 down to 0.05 px on a textured surface. focal, baseline: pixels and
+    metres of the sensor. The defaults are the D435's at 848 x 480 and 90 degrees; the D415 at
+    1280 x 720 and 65 degrees has 1005 px and 0.055 m, hence 0.4 times the error.
+    image_focal: pixels, focal length of the images that the noise is applied to.
+    correlation: pixels of the sensor; errors d pixels apart correlate by
+    exp(-d^2 / (2 correlation^2)), because neighbours share most of their matching window.
+
+    The second camera does not see what lies in the shadow on the left of an edge. Other pixels are
+    lost with a probability that rises from 0 to 1 between two limits: brightness falling from
+    `dark` to 0 (0..255), the least of the three channels rising from `shiny` to 255 (a reflection
+    that outshines the pattern), and the surface's tilt against the image plane rising from
+    `grazing` to 90 degrees, which a step in depth does too. These limits, and the correlation, are
+    choices; no data sheet states them. Without colours, dark and shiny surfaces are measured.
+    """
+
+    sees_colours: ClassVar[bool] = True
+
+    image_focal: float = 424.0
+    focal: float = 424.0
+    baseline: float = 0.05
+    subpixel: float = 0.08
+    correlation: float = 2.5
+    dark: float = 40.0
+    shiny: float = 250.0
+    grazing: float = 70.0
+
+    def __post_init__(self) -> None:
+        for name in ("image_focal", "focal", "baseline"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"RealSenseNoise.{name} must be > 0, got {getattr(self, name)}")
+        for name, most in (
+            ("subpixel", np.inf), ("correlation", np.inf), ("dark", 255), ("shiny", 255),
+            ("grazing", 90),
+        ):  # fmt: skip
+            if not 0 <= getattr(self, name) <= most:
+                raise ValueError(
+                    f"RealSenseNoise.{name} must be in [0, {most}], got {getattr(self, name)}"
+                )
+
+    def __call__(
+        self, depth: np.ndarray, rng: np.random.Generator, rgb: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(H, W) float32 metres as measured; 0 where there is no measurement.
+
+        depth: (H, W) metres along the optical axis, 0 (or NaN) where unknown. rgb: (H, W, 3) uint8.
+        """
+        depth = _depth_image(depth, "RealSenseNoise")
+        length = self.correlation * self.image_focal / self.focal
+        error, luck = (correlated_field(depth.shape, length, rng) for _ in range(2))
+        known = known_depth(depth)
+        inverse = np.zeros_like(depth)
+        np.divide(1, depth, out=inverse, where=known)
+        # The error is of the disparity, which is focal x baseline / depth.
+        unit = self.subpixel / (self.focal * self.baseline)
+        noisy = inverse + np.float32(unit) * error
+        lost = luck < ndtri(self._lost(depth, known, rgb))
+        kept = known & (noisy > 0) & ~lost & ~self._in_shadow(inverse, known)
+        measured = np.zeros_like(depth)
+        np.divide(1, noisy, out=measured, where=kept)
+        return measured
+
+    def _in_shadow(self, inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """(H, W) bool, pixels that the second camera does not see.
+
+        It sees a pixel of column u at u minus the disparity; a pixel further right that lands
+        further left is nearer and hides it.
+        """
+        u = np.arange(inverse.shape[1], dtype=np.float32)
+        lands = np.where(known, u - np.float32(self.image_focal * self.baseline) * inverse, np.inf)
+        leftmost = np.minimum.accumulate(lands[:, ::-1], axis=1)[:, ::-1]
+        return lands > leftmost
+
+    def _lost(self, depth: np.ndarray, known: np.ndarray, rgb: np.ndarray | None) -> np.ndarray:
+        """(H, W) probability that a pixel has no measurement."""
+        filled = np.where(known, depth, depth[known].mean() if known.any() else 1.0)
+        dz_dv, dz_du = np.gradient(filled)
+        tilt = np.degrees(np.arctan(np.hypot(dz_du, dz_dv) * self.image_focal / filled))
+        seen = 1 - _ramp(tilt, self.grazing, 90.0)
+        if rgb is not None:
+            colours = np.asarray(rgb, np.float32)
+            seen = seen * _ramp(colours @ _BRIGHTNESS, 0.0, self.dark)
+            seen = seen * (1 - _ramp(colours.min(axis=-1), self.shiny, 255.0))
+        return 1 - seen
+
+
+@dataclass(frozen=True)
+class GammaNoise:
+    """The noise of Dex-Net 2.0 (Mahler et al., RSS 2017, its depth images z' = alpha z + epsilon),
+    which GIGA (Jiang et al., RSS 2021) trains with as well.
+
+    alpha is one Gamma variable for each image, of shape `shape` and scale 1 / shape (mean 1,
+    variance 1 / shape). epsilon is a Gaussian process of mean 0 and standard deviation `sigma`
+    (metres), whose values d pixels apart correlate by exp(-d^2 / (2 correlation^2)). The published
+    code of both draws epsilon on a grid of every fourth pixel and interpolates; correlation=4 comes
+    near to it. image_focal is ignored: the pixels are the image's.
+    """
+
+    image_focal: float = 0.0
+    shape: float = 1000.0
+    sigma: float = 0.005
+    correlation: float = 2**0.5
+
+    def __post_init__(self) -> None:
+        if not self.shape > 0:
+            raise ValueError(f"GammaNoise.shape must be > 0, got {self.shape}")
+        for name in ("sigma", "correlation"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"GammaNoise.{name} must be >= 0, got {getattr(self, name)}")
+
+    def __call__(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) float32 metres; unknown pixels (0 or NaN) are 0."""
+        depth = _depth_image(depth, "GammaNoise")
+        factor = np.float32(rng.gamma(self.shape, 1 / self.shape))
+        error = np.float32(self.sigma) * correlated_field(depth.shape, self.correlation, rng)
+        measured = factor * depth + error
+        return np.where(known_depth(depth) & (measured > 0), measured, np.float32(0))
+
+
+_BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue; ITU-R BT.601
+
+
+def _depth_image(depth: np.ndarray, name: str) -> np.ndarray:
+    """(H, W) float32; ValueError for another number of axes or less than two pixels either way."""
+    depth = np.asarray(depth, dtype=np.float32)
+    if depth.ndim != 2 or min(depth.shape) < 2:
+        raise ValueError(f"{name}: depth must be (H, W), 2 x 2 or more, got {depth.shape}")
+    return depth
+
+
+def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
+    """0 up to `low`, 1 from `high`, linear between; a step at `high` where both are equal."""
+    if low >= high:
+        return (value >= high).astype(np.float32)
+    return np.clip((value - low) / (high - low), 0, 1)
+
+
+def correlated_field(shape: tuple[int, ...], length: float, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) float32 normal deviates of variance 1, d pixels apart correlated by
+    exp(-d^2 / (2 length^2)); independent for length 0. The borders are like the rest."""
+    width = length / 2**0.5  # a Gaussian correlated with itself is sqrt(2) times as wide
+    half = int(np.ceil(4 * width))
+    across = np.arange(-half, half + 1)
+    kernel = np.exp(-(across**2) / (2 * width**2)) if half else np.ones(1)
+    kernel = (kernel / np.linalg.norm(kernel)).astype(np.float32)
+    white = rng.standard_normal([side + 2 * half for side in shape], dtype=np.float32)
+    field = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel)
+    return field[half : half + shape[0], half : half + shape[1]]
+
+
 # A noise is made by a call with the image's focal length in pixels (image_focal) and its own
 # parameters as keyword arguments. A new noise is one more entry; "none" is no noise.
-DEPTH_NOISES: dict[str, Callable[..., DepthNoise]] = {"kinect": KinectNoise}
+DEPTH_NOISES: dict[str, Callable[..., DepthNoise]] = {
+    "kinect": KinectNoise,
+    "realsense": RealSenseNoise,
+    "gamma": GammaNoise,
+}
 
 
 def make_depth_noise(
@@ -257,18 +421,31 @@ class NoiseStream(IntEnum):
     OBSERVATION = 5  # images of the environment (`envs.env_observations.Observer`)
 
 
+def measure(
+    noise: DepthNoise,
+    depth: np.ndarray,
+    rng: np.random.Generator,
+    rgb: np.ndarray | None = None,
+) -> np.ndarray:
+    """(H, W) metres as measured; rgb (H, W, 3) uint8 reaches the noises that look at colours."""
+    if getattr(noise, "sees_colours", False):
+        return noise(depth, rng, rgb)
+    return noise(depth, rng)
+
+
 def seeded_noise(
     noise: DepthNoise | None, stream: NoiseStream, seed: int, frame: int
-) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from a clean depth image to the measured one; the same image for no noise.
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A function from a clean depth image and its colours to the measured depth; for no noise, the
+    clean one.
 
     seed: of the scene. frame: the number of images before. Further calls of one function go on with
     its random numbers.
     """
     if noise is None:
-        return lambda depth: depth
+        return lambda depth, rgb: depth
     rng = np.random.default_rng([seed, frame, stream])
-    return lambda depth: noise(depth, rng)
+    return lambda depth, rgb: measure(noise, depth, rng, rgb)
 
 
 # --- Holes ----------------------------------------------------------------------------------
