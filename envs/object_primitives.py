@@ -1,4 +1,5 @@
-"""Procedural solids: eleven families, each object determined by its index alone.
+"""Procedural solids: eleven families and four that no training sees, each object determined by its
+index alone.
 
 A hand that opens 0.08 m can grasp every one of them in every resting pose: across the whole, across
 a bar, or across a wall with one finger inside. This module knows no simulator.
@@ -15,6 +16,7 @@ import trimesh
 FAMILIES = (
     "box", "cylinder", "sphere", "capsule", "L", "T", "U", "cross", "ring", "bowl", "mug",
 )  # fmt: skip
+UNSEEN_FAMILIES = ("frustum", "wedge", "Z", "dumbbell")
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _MASS_RANGE = (0.03, 0.3)
@@ -61,10 +63,12 @@ class Primitive:
     color: tuple[float, float, float, float]
 
 
-def make_primitive(index: int, scale: float = 1.0) -> Primitive:
-    """The object of this index; families take turns, so any run of indices is balanced."""
-    rng = np.random.default_rng([_SEED, index])
-    family = FAMILIES[index % len(FAMILIES)]
+def make_primitive(index: int, scale: float = 1.0, unseen: bool = False) -> Primitive:
+    """The object of this index; families take turns, so any run of indices is balanced. unseen:
+    of UNSEEN_FAMILIES, which count by themselves."""
+    families = UNSEEN_FAMILIES if unseen else FAMILIES
+    rng = np.random.default_rng([_SEED, index, 1] if unseen else [_SEED, index])
+    family = families[index % len(families)]
     shape = _SHAPES[family](rng)
     native = None
     if isinstance(shape, NativeShape):
@@ -122,6 +126,38 @@ def _cross(rng) -> list[np.ndarray]:
         _box((-a / 2, -w / 2, 0), (a / 2, w / 2, h)),
         _box((-w / 2, w / 2, 0), (w / 2, b / 2, h)),
         _box((-w / 2, -b / 2, 0), (w / 2, -w / 2, h)),
+    ]
+
+
+def _z_shape(rng) -> list[np.ndarray]:
+    a, b, w, h = _bars(rng)
+    return [
+        _box((-w / 2, -b / 2, 0), (w / 2, b / 2, h)),
+        _box((-a / 2, b / 2, 0), (w / 2, b / 2 + w, h)),
+        _box((-w / 2, -b / 2 - w, 0), (a / 2, -b / 2, h)),
+    ]
+
+
+def _frustum(rng) -> list[np.ndarray]:
+    bottom, top, height = rng.uniform((0.022, 0.012, 0.04), (0.03, 0.02, 0.1))
+    return [_disc(bottom, top, 0, height)]
+
+
+def _wedge(rng) -> list[np.ndarray]:
+    """A right triangle's prism, which the hand spans along its axis."""
+    a, b, length = rng.uniform((0.04, 0.03, 0.025), (0.09, 0.06, 0.055))
+    triangle = np.array([(0, 0), (a, 0), (0, b)])
+    return [np.array([(x, y, z) for x, z in triangle for y in (0.0, length)])]
+
+
+def _dumbbell(rng) -> list[np.ndarray]:
+    radius, weight, bar, reach = rng.uniform(
+        (0.018, 0.012, 0.007, 0.03), (0.028, 0.025, 0.012, 0.06)
+    )
+    return [
+        _disc(radius, radius, 0, weight),
+        _disc(bar, bar, weight, weight + reach),
+        _disc(radius, radius, weight + reach, 2 * weight + reach),
     ]
 
 
@@ -214,4 +250,8 @@ _SHAPES = {
     "ring": _ring,
     "bowl": _bowl,
     "mug": _mug,
+    "frustum": _frustum,
+    "wedge": _wedge,
+    "Z": _z_shape,
+    "dumbbell": _dumbbell,
 }

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import trimesh
@@ -35,7 +35,7 @@ from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
-PRIMITIVES_TRAIN, PRIMITIVES_TOTAL = 900, 1000
+PRIMITIVES_TRAIN, PRIMITIVES_TOTAL, PRIMITIVES_UNSEEN = 900, 1000, 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
 
@@ -50,6 +50,9 @@ SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 1e3  # m
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
 ROLLING_FRICTION = 0.0005
+
+
+Split = Literal["train", "test", "unseen_families"]
 
 
 class ObjectSet(ABC, Sequence[ObjectModel]):
@@ -91,7 +94,7 @@ class ObjectPart(ObjectSet):
 class SetSettings:
     """What an object set is made with; `load_object_set` describes each field."""
 
-    split: Literal["train", "test"]
+    split: Split
     scale: float | None
     fit: float | None
     density: float
@@ -102,7 +105,7 @@ class SetSettings:
 def load_object_set(
     name_or_path: str,
     *,
-    split: Literal["train", "test"] = "test",
+    split: Split = "test",
     scale: float | None = None,
     fit: float | None = None,
     density: float = DEFAULT_DENSITY,
@@ -113,7 +116,8 @@ def load_object_set(
 
     name_or_path: a name, a folder, or an import path `module:name` of an `ObjectSet`, of a folder's
         path, or of a function that takes `SetSettings` and returns one of the two.
-    split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in both.
+    split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in each.
+        unseen_families: 100 objects of `primitives` of four families that the others do not have.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
     fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
         so that the second longest side of its oriented bounding box has this many metres.
@@ -125,8 +129,8 @@ def load_object_set(
     Raises UserError for an unknown name, a missing or empty folder, a plug-in that cannot be used,
     a split or number that is not allowed; a broken mesh raises it when its object is asked for.
     """
-    if split not in ("train", "test"):
-        raise ObjectError(f"objects.split is {split!r}; allowed are 'train' and 'test'")
+    if split not in get_args(Split):
+        raise ObjectError(f"objects.split is {split!r}; allowed are {', '.join(get_args(Split))}")
     for key, value in {"scale": scale, "fit": fit, "density": density}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ObjectError(f"objects.{key} is {value}; it must be a number above 0")
@@ -223,21 +227,25 @@ class BoxSet(ObjectSet):
 
 
 class PrimitiveSet(ObjectSet):
-    """Procedural solids of the eleven families of `envs.object_primitives`: 900 for training, 100
-    for tests."""
+    """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
+    for tests, and 100 of the families that no training sees."""
 
     def __init__(self, settings: SetSettings) -> None:
         _refuse_fit("primitives", settings)
         super().__init__("primitives")
-        train, test = range(PRIMITIVES_TRAIN), range(PRIMITIVES_TRAIN, PRIMITIVES_TOTAL)
-        self.indices = train if settings.split == "train" else test
+        self.indices = {
+            "train": range(PRIMITIVES_TRAIN),
+            "test": range(PRIMITIVES_TRAIN, PRIMITIVES_TOTAL),
+            "unseen_families": range(PRIMITIVES_UNSEEN),
+        }[settings.split]
+        self.unseen = settings.split == "unseen_families"
         self.scale, self.cache_dir = settings.scale or 1.0, settings.cache_dir
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def _build(self, index: int) -> ObjectModel:
-        shape = make_primitive(self.indices[index], self.scale)
+        shape = make_primitive(self.indices[index], self.scale, self.unseen)
         if shape.native is not None:
             return _native_model(
                 shape.name, shape.native, shape.density, shape.friction, shape.color
@@ -300,6 +308,11 @@ class FileSet(ObjectSet):
 
 
 def _random_urdfs(settings: SetSettings) -> ObjectSet:
+    if settings.split == "unseen_families":
+        raise ObjectError(
+            "objects.split=unseen_families: random_urdfs has no families; use primitives, or "
+            "objects.split=test"
+        )
     nominal = RANDOM_URDFS_SCALE if settings.fit is None else 1.0
     files = _random_urdf_files(settings.split)
     return FileSet("random_urdfs", files, settings.scale or nominal, settings)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from envs.object_primitives import FAMILIES, make_primitive
+from envs.object_primitives import FAMILIES, UNSEEN_FAMILIES, make_primitive
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
 from envs.pybullet_files import data_folder
 from tests.helpers.simulators import needs_pybullet, pybullet
@@ -274,6 +274,48 @@ def test_families_are_equally_frequent(tmp_path):
     assert counts.max() - counts.min() <= 1
 
 
+def test_unseen_families_have_the_closed_form_volume_and_fit_the_hand():
+    """Round parts are prisms and frusta over a regular 16-gon, 8 r^2 sin(pi / 8)."""
+
+    def gon(r0: float, r1: float, height: float) -> float:
+        return 8 * np.sin(np.pi / 8) * height / 3 * (r0**2 + r0 * r1 + r1**2)
+
+    for index in range(40):
+        shape = make_primitive(index, unseen=True)
+        family, part = UNSEEN_FAMILIES[index % 4], shape.parts[0]
+        assert shape.name == f"{family}_{index:04d}"
+        volumes = [trimesh.convex.convex_hull(part).volume for part in shape.parts]
+        low, high = part[:16], part[16:]
+        if family == "frustum":
+            expected = [gon(low[0, 0], high[0, 0], high[0, 2])]
+            assert np.ptp(part[:, 0]) <= 0.06
+        elif family == "wedge":
+            x, y, z = part.max(axis=0)
+            expected = [x * y * z / 2]
+            assert y <= 0.06  # between its two parallel triangles
+        elif family == "Z":
+            expected = [np.prod(np.ptp(box, axis=0)) for box in shape.parts]
+            assert max(np.ptp(box, axis=0).min() for box in shape.parts) <= 0.06
+        else:
+            expected = [gon(p[0, 0], p[0, 0], np.ptp(p[:, 2])) for p in shape.parts]
+            assert np.ptp(part[:, 0]) <= 0.06
+        assert volumes == pytest.approx(expected, rel=1e-6)
+        assert 0.03 - 1e-6 <= shape.density * sum(volumes) <= 0.3 + 1e-6
+        hulls = [trimesh.convex.convex_hull(part) for part in shape.parts]
+        if len(hulls) > 1:  # the parts touch but do not overlap
+            union = trimesh.boolean.union(hulls, engine="manifold")
+            assert union.volume == pytest.approx(sum(volumes), rel=1e-3)
+
+
+def test_unseen_families_are_in_no_other_split(tmp_path):
+    assert not set(UNSEEN_FAMILIES) & set(FAMILIES)
+    unseen = load_object_set("primitives", split="unseen_families", cache_dir=tmp_path)
+    assert len(unseen) == 100
+    assert [unseen[index].name.split("_")[0] for index in range(4)] == list(UNSEEN_FAMILIES)
+    with pytest.raises(ObjectError, match="random_urdfs has no families"):
+        load_object_set("random_urdfs", split="unseen_families", cache_dir=tmp_path)
+
+
 def test_a_primitive_depends_on_its_index_alone():
     for index in (0, 10, 905):
         first, second = make_primitive(index), make_primitive(index)
@@ -483,7 +525,7 @@ def test_a_plug_in_without_objects_is_named(plug_in, tmp_path, path, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"split": "val"}, "objects.split is 'val'; allowed are 'train' and 'test'"),
+        ({"split": "val"}, "objects.split is 'val'; allowed are train, test, unseen_families"),
         ({"scale": -1.0}, "objects.scale is -1.0"),
         ({"density": float("nan")}, "objects.density is nan"),
         ({"fit": 0.06}, "objects.fit does not apply"),
