@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
-from envs.cell_scenes import LAYOUTS, make_scene
+from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
 from envs.simulators import make_cell
 from models.graspnet import GraspNet, create_model, to_input
@@ -196,7 +196,7 @@ def label_metrics(model: GraspNet, count: int) -> list[Metric]:
     images = []
     with make_cell(config) as cell:
         for number in range(count):
-            layout = LAYOUTS[number // 2 % len(LAYOUTS)]
+            layout = ("isolated", "packed", "pile")[number // 2 % 3]
             cell.load(make_scene(layout, sets[number % 2], FIRST_SEED + number, config))
             frame = cell.frame(with_truth=True)
             images.append(labelled(frame, dense_labels(frame, GripperGeometry(), workspace)))

@@ -1,7 +1,8 @@
 """Scene layouts: which objects lie where, as a pure function of a seed.
 
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
-dropped through a box whose walls are then taken away. The last two follow VGN (Breyer et al.,
+dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
+whatever `scene.count` says. `packed` and `pile` follow VGN (Breyer et al.,
 "Volumetric Grasping Network", CoRL 2020). The objects come to rest in the simulator
 `scene.simulator`, whichever simulator the scene is for, so that all simulators start from the same
 poses. The scene itself is data (`envs.cell_layout.Scene`). This module knows no robot, camera or
@@ -19,7 +20,8 @@ from envs.simulators import make_layout_table
 from utils.config import Config
 from utils.errors import UserError
 
-LAYOUTS = ("isolated", "packed", "pile")
+LAYOUTS = ("isolated", "packed", "pile", "dense")  # their places are part of the scenes' seeds
+DENSE_COUNT = 15
 
 _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the table
 _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
@@ -43,8 +45,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     if layout not in LAYOUTS:
         raise SceneError(f"unknown scene layout {layout!r}; allowed are {', '.join(LAYOUTS)}")
     rng = np.random.default_rng([seed, LAYOUTS.index(layout)])
-    arrange = {"isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up}[layout]
-    count = 1 if layout == "isolated" else config.scene.count
+    arrange = _ARRANGEMENTS[layout]
+    count = {"isolated": 1, "dense": DENSE_COUNT}.get(layout, config.scene.count)
     for _ in range(_TRIES):
         chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
@@ -135,3 +137,8 @@ def _stands(table: LayoutTable, body: int, rotation: Rotation, others: list[int]
 def _lowest(model: ObjectModel, rotation: Rotation) -> float:
     """Height in metres of the lowest point relative to the centre of mass."""
     return min(float(rotation.apply(part)[:, 2].min()) for part in model.parts)
+
+
+_ARRANGEMENTS = {
+    "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
+}  # fmt: skip

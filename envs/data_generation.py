@@ -22,7 +22,7 @@ from tqdm import tqdm
 from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
-from envs.cell_scenes import LAYOUTS, SceneError, make_scene
+from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.simulators import cell_class
@@ -228,8 +228,9 @@ def draw_scene(
     Raises UserError if none of MOST_DRAWS draws gives a scene.
     """
     rng = np.random.default_rng([config.seed, seed])
+    layouts, shares = zip(*_LAYOUT_SHARES.items())
     for _ in range(MOST_DRAWS):
-        layout = LAYOUTS[rng.choice(len(LAYOUTS), p=[_LAYOUT_SHARES[name] for name in LAYOUTS])]
+        layout = layouts[rng.choice(len(layouts), p=shares)]
         name = config.data.object_sets[rng.integers(len(config.data.object_sets))]
         count = int(rng.integers(2, config.data.max_objects + 1))
         crowded = with_settings(config, "scene", {"count": count})

@@ -276,6 +276,7 @@ SCENARIOS = {
     "isolated": Scenario("isolated"),
     "packed": Scenario("packed"),
     "pile": Scenario("pile"),
+    "dense": Scenario("dense"),
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),
     "moving_5cm": Scenario("isolated", speed=0.05),

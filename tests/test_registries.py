@@ -38,7 +38,10 @@ def test_the_defaults_comment_lists_every_entry(key):
     [
         ("evaluate.scenarios=pil", "evaluate.scenarios: got 'pil', .* did you mean pile?"),
         ("evaluate.controllers=ibsv", "evaluate.controllers: got 'ibsv', .* did you mean ibvs?"),
-        ("env.scenario=moved", "env.scenario: got 'moved', expected one of isolated, packed, pile"),
+        (
+            "env.scenario=moved",
+            "env.scenario: got 'moved', expected one of dense, isolated, packed",
+        ),
         ("simulator=pybulet", "simulator: got 'pybulet', .* did you mean pybullet?"),
         ("data.kind=cornel", "data.kind: got 'cornel', .* did you mean cornell?"),
         ("train.backbone=vgg", "train.backbone: got 'vgg', expected one of .*grconvnet"),
