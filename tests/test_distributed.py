@@ -43,12 +43,24 @@ def test_a_process_takes_its_gpu_before_it_talks_to_the_others(monkeypatch):
     calls = []
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "set_device", calls.append)
-    monkeypatch.setattr(torch.distributed, "init_process_group", calls.append)
+
+    def init(backend, store, rank, world_size):
+        calls.append(backend)
+        store.set("address", "of this attempt")
+        assert (rank, world_size) == (1, 2)
+
+    kept = torch.distributed.HashStore()
+    met = iter([(kept, 1, 2)])
+    monkeypatch.setattr(torch.distributed, "rendezvous", lambda url: met)
+    monkeypatch.setattr(torch.distributed, "init_process_group", init)
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
     monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: None)
-    with team("cuda", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}) as us:
+    started_again = {"WORLD_SIZE": "2", "LOCAL_RANK": "1", "TORCHELASTIC_RESTART_COUNT": "3"}
+    with team("cuda", started_again) as us:
         assert us == Team(1, 2, torch.device("cuda", 1))
     assert calls == [torch.device("cuda", 1), "nccl"]
+    # torchrun keeps the store: what one attempt writes there, the next one must not read.
+    assert not kept.check(["address"]) and kept.get("attempt 3/address") == b"of this attempt"
 
 
 def test_errors_name_the_key_of_the_script():
