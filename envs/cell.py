@@ -252,10 +252,11 @@ class Cell(ABC):
     def enable_sleeping(self) -> bool:
         """Let objects at rest sleep, which saves the solver's time until the robot touches
         something; returns whether they do. `disable_sleeping` has to be called at the first touch.
+        MuJoCo's cell lets them sleep always, and needs neither.
         """
         return False
 
-    def disable_sleeping(self) -> None:  # noqa: B027 - a simulator without sleep has nothing to undo
+    def disable_sleeping(self) -> None:  # noqa: B027 - MuJoCo wakes by itself
         """Undo `enable_sleeping`."""
 
     def check_physics(self) -> None:
