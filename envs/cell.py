@@ -325,7 +325,7 @@ class Cell(ABC):
         return on_table(position) and margin <= _REACH * self.config.workspace.size
 
     def truth(self) -> SceneGeometry:
-        """The true geometry of the objects still in the round."""
+        """The true geometry of the objects still in the round, and of the scene's walls."""
         if self.scene is None:
             raise ValueError("There is no scene; build or load one first")
         solids = []
@@ -338,7 +338,7 @@ class Cell(ABC):
                     model.friction,
                 )
             )
-        return SceneGeometry(tuple(solids))
+        return SceneGeometry(tuple(solids), walls=tuple(wall.solid() for wall in self.scene.walls))
 
     # --- Camera -------------------------------------------------------------------------------
 

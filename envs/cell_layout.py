@@ -7,6 +7,7 @@ lays scenes out. This module knows no simulator and no robot.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -49,6 +50,11 @@ class Box(NamedTuple):
 
     half_size: np.ndarray
     position: np.ndarray
+
+    def solid(self) -> ConvexSolid:
+        """The box in W."""
+        corners = np.array(list(itertools.product((-1, 1), repeat=3)))
+        return ConvexSolid.from_vertices(self.position + corners * self.half_size)
 
 
 def table_box() -> Box:
@@ -136,11 +142,13 @@ class Placement:
 @dataclass(frozen=True)
 class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
-    drawn."""
+    drawn. walls: stand on the table and are part of it: of its colour and friction, and what
+    touches them touches the table."""
 
     layout: str
     seed: int
     placements: tuple[Placement, ...]
+    walls: tuple[Box, ...] = ()
 
 
 EMPTY = Scene("isolated", 0, ())
@@ -149,12 +157,15 @@ EMPTY = Scene("isolated", 0, ())
 class LayoutTable(ABC):
     """A table alone, on which objects are put down and come to rest. Use it in a `with` block.
 
-    models: the objects that may be put on it, each as often as it stands there. Bodies are the
-    table's own numbers. Entering takes everything off the table.
+    models: the objects that may be put on it, each as often as it stands there. walls: of the
+    scene, which stay (`Scene.walls`). Bodies are the table's own numbers. Entering takes everything
+    else off the table.
     """
 
     @abstractmethod
-    def __init__(self, config: Config, models: Sequence[ObjectModel]): ...
+    def __init__(
+        self, config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()
+    ): ...
 
     @abstractmethod
     def __enter__(self) -> Self: ...
@@ -168,7 +179,7 @@ class LayoutTable(ABC):
 
     @abstractmethod
     def put_walls(self, walls: Iterable[Box]) -> list[int]:
-        """Add immovable walls; their body numbers."""
+        """Add immovable walls that can be removed; their body numbers."""
 
     @abstractmethod
     def remove(self, body: int) -> None:

@@ -2,30 +2,37 @@
 
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
-whatever `scene.count` says. `packed` and `pile` follow VGN (Breyer et al.,
-"Volumetric Grasping Network", CoRL 2020). The objects come to rest in the simulator
-`scene.simulator`, whichever simulator the scene is for, so that all simulators start from the same
-poses. The scene itself is data (`envs.cell_layout.Scene`). This module knows no robot, camera or
-task.
+whatever `scene.count` says. `bin`: objects dropped between walls around the workspace, which stay.
+`packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
+
+The objects come to rest in the simulator `scene.simulator`, whichever simulator the scene is for,
+so that all simulators start from the same poses. The scene itself is data
+(`envs.cell_layout.Scene`). This module knows no robot, camera or task.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import LayoutTable, ObjectModel, Placement, Scene, square_walls
+from envs.cell_layout import Box, LayoutTable, ObjectModel, Placement, Scene, square_walls
 from envs.objects import ObjectSet
 from envs.simulators import make_layout_table
 from utils.config import Config
 from utils.errors import UserError
 
-LAYOUTS = ("isolated", "packed", "pile", "dense")  # their places are part of the scenes' seeds
+# Their places are part of the scenes' seeds.
+LAYOUTS = ("isolated", "packed", "pile", "dense", "bin")
 DENSE_COUNT = 15
 
 _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the table
 _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
 _PILE_WALLS = {"half_size": 0.12, "height": 0.30, "thickness": 0.02}  # m
+# m, around the default workspace: the overhead camera, 0.8 m up, sees their outer edges at
+# 0.16 x 0.8 / 0.7 = 0.183 m from the middle, and the image ends at 0.2 m.
+_WALL_HEIGHT, _WALL_THICKNESS = 0.10, 0.01
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
 _PACKED_GAP = 0.004  # m, least distance between neighbours
 _TRIES = 50
@@ -47,22 +54,29 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     rng = np.random.default_rng([seed, LAYOUTS.index(layout)])
     arrange = _ARRANGEMENTS[layout]
     count = {"isolated": 1, "dense": DENSE_COUNT}.get(layout, config.scene.count)
+    walls = tuple(_walls_around(config)) if layout == "bin" else ()
     for _ in range(_TRIES):
         chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
-        with make_layout_table(config, models) as table:
+        with make_layout_table(config, models, walls) as table:
             bodies = arrange(table, models, rng, config)
             if bodies is None or not table.settle(bodies):
                 continue
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
-            return Scene(layout, seed, placements)
+            return Scene(layout, seed, placements, walls)
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
         f"inside the {config.workspace.size} m workspace in {_TRIES} tries; use smaller objects "
         "(objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
+
+
+def _walls_around(config: Config) -> Iterator[Box]:
+    """Walls on the edges of the workspace."""
+    centre, half_size = np.array(config.workspace.center), config.workspace.size / 2
+    return square_walls(centre, half_size, _WALL_HEIGHT, _WALL_THICKNESS)
 
 
 def _inside(position: np.ndarray, config: Config) -> bool:
@@ -80,7 +94,15 @@ def _drop_one(table: LayoutTable, models: list[ObjectModel], rng, config: Config
 
 
 def _pile_up(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int]:
-    walls = table.put_walls(square_walls(config.workspace.center, **_PILE_WALLS))
+    frame = table.put_walls(square_walls(config.workspace.center, **_PILE_WALLS))
+    bodies = _drop_all(table, models, rng, config)
+    for wall in frame:
+        table.remove(wall)
+    return bodies
+
+
+def _drop_all(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int]:
+    """Objects dropped over the middle of the workspace, each when those before it rest."""
     bodies = []
     for model in models:
         rotation = Rotation.random(rng=rng)
@@ -89,8 +111,6 @@ def _pile_up(table: LayoutTable, models: list[ObjectModel], rng, config: Config)
         position[2] = _PILE_DROP_HEIGHT - _lowest(model, rotation)
         bodies.append(table.put(model, position, rotation.as_quat()))
         table.settle(bodies[-1:])
-    for wall in walls:
-        table.remove(wall)
     return bodies
 
 
@@ -141,4 +161,5 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
+    "bin": _drop_all,
 }  # fmt: skip

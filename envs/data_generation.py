@@ -239,7 +239,7 @@ def draw_scene(
             scene = make_scene(layout, sets[name, split], scene_seed, crowded)
         except SceneError:  # too many for this layout: another draw, from the same generator
             continue
-        return Scene(layout, seed, scene.placements), name
+        return replace(scene, seed=seed), name
     raise UserError(
         f"none of {MOST_DRAWS} scenes drawn for seed {seed} came to rest inside the workspace; use "
         "smaller objects (objects.scale, objects.fit), fewer (data.max_objects) or a larger "
@@ -282,7 +282,7 @@ def _part(scene: Scene, rng: np.random.Generator) -> Scene:
     total = len(scene.placements)
     count = int(rng.integers(max(total - 3, 1), total + 1))
     kept = np.sort(rng.choice(total, count, replace=False))
-    return Scene(scene.layout, scene.seed, tuple(scene.placements[i] for i in kept))
+    return replace(scene, placements=tuple(scene.placements[i] for i in kept))
 
 
 def with_other_physics(scene: Scene, config: Config, number: int) -> Scene:

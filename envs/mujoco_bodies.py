@@ -101,15 +101,17 @@ def _resting(velocity: np.ndarray) -> bool:
     return bool(linear < REST_SPEED and angular < 10 * REST_SPEED)
 
 
-def add_box(spec: mujoco.MjSpec, name: str, box: Box, colour) -> None:
-    """Add an immovable box."""
+def add_boxes(spec: mujoco.MjSpec, name: str, boxes: Sequence[Box], colour) -> None:
+    """Add boxes as one immovable body, which stands where the first one is."""
     mujoco = load_mujoco()
-    body = spec.worldbody.add_body(name=name, pos=list(box.position))
-    geom = body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=list(box.half_size), rgba=list(colour)
-    )
-    geom.friction = [NO_FRICTION, 0.0, ROLLING]
-    geom.solref[0] = CONTACT_TIME
+    body = spec.worldbody.add_body(name=name, pos=list(boxes[0].position))
+    for box in boxes:
+        geom = body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=list(box.half_size), rgba=list(colour),
+            pos=list(box.position - boxes[0].position),
+        )  # fmt: skip
+        geom.friction = [NO_FRICTION, 0.0, ROLLING]
+        geom.solref[0] = CONTACT_TIME
 
 
 def add_object(
@@ -185,14 +187,14 @@ class MujocoTable(LayoutTable):
     them. A body's number is that of its object, or after these that of a wall.
     """
 
-    def __init__(self, config: Config, models: Sequence[ObjectModel]):
-        self._config, self._models = config, list(models)
+    def __init__(self, config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()):
+        self._config, self._models, self._standing = config, list(models), walls
         self._mujoco = load_mujoco()
 
     def __enter__(self) -> Self:
         self._spec = set_up_physics(self._mujoco.MjSpec())
         self._spec.option.timestep = 1.0 / self._config.sim.frequency / SUBSTEPS
-        add_box(self._spec, "table", table_box(), TABLE_COLOUR)
+        add_boxes(self._spec, "table", [table_box(), *self._standing], TABLE_COLOUR)
         for number, model in enumerate(self._models):
             body = add_object(self._spec, _name(number), model, _PARKED, (0.0, 0.0, 0.0, 1.0))
             body.gravcomp = 1.0  # else the compiled model would never compensate gravity
@@ -217,7 +219,7 @@ class MujocoTable(LayoutTable):
     def put_walls(self, walls: Iterable[Box]) -> list[int]:
         first = len(self._models) + self._walls
         for number, wall in enumerate(walls, first):
-            add_box(self._spec, _name(number), wall, WALL_COLOUR)
+            add_boxes(self._spec, _name(number), [wall], WALL_COLOUR)
             self._walls += 1
         self._model, self._data = self._spec.recompile(self._model, self._data)
         for number in range(len(self._models)):  # a compiled model is as the specification says

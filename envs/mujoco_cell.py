@@ -28,7 +28,7 @@ from envs.mujoco_bodies import (
     ROLLING,
     SUBSTEPS,
     add_board,
-    add_box,
+    add_boxes,
     add_object,
     set_up_physics,
     settle,
@@ -55,9 +55,9 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
     for name in FINGERS:
         for geom in spec.body(name).geoms:
             geom.friction = [NO_FRICTION, 0.0, ROLLING]
-    add_box(spec, "table", table_box(), TABLE_COLOUR)
+    add_boxes(spec, "table", [table_box(), *scene.walls], TABLE_COLOUR)
     for i, wall in enumerate(bin_walls()):
-        add_box(spec, f"bin{i}", wall, BIN_COLOUR)
+        add_boxes(spec, f"bin{i}", [wall], BIN_COLOUR)
     for i, placed in enumerate(scene.placements):
         add_object(spec, f"object{i}", placed.model, placed.position, placed.quaternion)
     # The base stands on the table.

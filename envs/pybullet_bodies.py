@@ -78,9 +78,31 @@ def static_box(client: int, half_size, position, colour) -> int:
     )
 
 
-def add_table(client: int) -> int:
-    """The table, its top at z = 0. Returns its body number."""
-    table = static_box(client, *table_box(), TABLE_COLOUR)
+def _static_boxes(client: int, boxes: Sequence[Box], colour) -> int:
+    """Several boxes as one immovable body, which stands where the first one is."""
+    kinds, half_sizes = [pybullet.GEOM_BOX] * len(boxes), [box.half_size.tolist() for box in boxes]
+    places = [(box.position - boxes[0].position).tolist() for box in boxes]
+    return pybullet.createMultiBody(
+        0,
+        pybullet.createCollisionShapeArray(
+            kinds, halfExtents=half_sizes, collisionFramePositions=places, physicsClientId=client
+        ),
+        pybullet.createVisualShapeArray(
+            kinds, halfExtents=half_sizes, visualFramePositions=places,
+            rgbaColors=[colour] * len(boxes), physicsClientId=client,
+        ),
+        boxes[0].position.tolist(),
+        useMaximalCoordinates=True,
+        physicsClientId=client,
+    )  # fmt: skip
+
+
+def add_table(client: int, walls: Sequence[Box] = ()) -> int:
+    """The table, its top at z = 0, with walls that are part of it. Returns its body number."""
+    if walls:
+        table = _static_boxes(client, [table_box(), *walls], TABLE_COLOUR)
+    else:
+        table = static_box(client, *table_box(), TABLE_COLOUR)
     # Bullet combines lateral friction as the product, and rolling friction as the sum of each
     # body's times the other's lateral one: with 1 and 0 here the object's own coefficients count.
     pybullet.changeDynamics(
@@ -265,8 +287,8 @@ class PybulletTable(LayoutTable):
     _turn: ClassVar[threading.RLock] = threading.RLock()
     _in_use: ClassVar[bool] = False
 
-    def __init__(self, config: Config, models: Sequence[ObjectModel]):
-        self._config = config
+    def __init__(self, config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()):
+        self._config, self._walls = config, walls
 
     def __enter__(self) -> Self:
         PybulletTable._turn.acquire()
@@ -278,7 +300,7 @@ class PybulletTable(LayoutTable):
             PybulletTable._client = pybullet.connect(pybullet.DIRECT)
             atexit.register(PybulletTable._disconnect)
         set_up_physics(self._client, self._config.sim)
-        add_table(self._client)
+        add_table(self._client, self._walls)
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -55,7 +55,7 @@ class PybulletCell(Cell):
         # Resetting states alone would leave the solver's memory behind (bullet3 #2442). A build
         # takes about 8 ms and leaks nothing.
         set_up_physics(self.client, self.config.sim)
-        self.table = add_table(self.client)
+        self.table = add_table(self.client, scene.walls)
         self.bin = add_bin(self.client)
         self.robot = PybulletPanda(
             self.client, self.dt, self._urdf, self.gripper, self.config.robot.grip_force,

@@ -277,6 +277,7 @@ SCENARIOS = {
     "packed": Scenario("packed"),
     "pile": Scenario("pile"),
     "dense": Scenario("dense"),
+    "bin": Scenario("bin"),
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),
     "moving_5cm": Scenario("isolated", speed=0.05),

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from envs.cell import Cell, not_randomizable
-from envs.cell_layout import LayoutTable, ObjectModel
+from envs.cell_layout import Box, LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError, unknown_choice
@@ -87,11 +87,13 @@ def make_cell(config: Config, gui: bool = False) -> Cell:
     return cell
 
 
-def make_layout_table(config: Config, models: Sequence[ObjectModel]) -> LayoutTable:
+def make_layout_table(
+    config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()
+) -> LayoutTable:
     """A table on which a scene of these objects is laid out, in the simulator `scene.simulator`."""
     name = config.scene.simulator
     simulator = _simulator(name, "scene.simulator")
-    return simulator.load(simulator.layout_table, name)(config, models)
+    return simulator.load(simulator.layout_table, name)(config, models, walls)
 
 
 def check_simulator(config: Config) -> None:

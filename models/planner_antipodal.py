@@ -19,7 +19,7 @@ import numpy as np
 from models.planner_candidates import Candidates, SearchSettings
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import contact_levels, fit_faces
-from utils.height_map import HeightMap
+from utils.height_map import WALL_LABEL, HeightMap
 from utils.transforms import Grasp
 
 
@@ -93,11 +93,13 @@ def dense_candidates(
     """Runs of matter that may fit between the fingers, for every angle, fingertip height and row
     of the map."""
     cell, lowest = heights.cell, heights.table_height + settings.table_clearance
-    levels = np.arange(lowest, heights.height.max() - settings.min_engagement, settings.level_step)
+    no_wall = heights.label != WALL_LABEL
+    highest = heights.height.max(where=no_wall, initial=lowest)
+    levels = np.arange(lowest, highest - settings.min_engagement, settings.level_step)
     if len(levels) == 0 or len(heights.centres) == 0:  # nothing but slivers stands on the table
         return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
     # A square that holds all graspable matter, and fingers beside it, at any angle.
-    matter = np.argwhere(heights.height > lowest)[:, ::-1]
+    matter = np.argwhere((heights.height > lowest) & no_wall)[:, ::-1]
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
     beside = max(settings.rooms) + 2 * thickness
@@ -157,6 +159,7 @@ def dense_candidates(
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
         score *= (
             reach
+            * (inside != WALL_LABEL)
             * (facing > settings.min_facing)
             * np.clip(rise / settings.good_engagement, 0.2, 1)
         )
@@ -262,6 +265,7 @@ def measure(
 
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    left_over &= np.minimum(*ends) != WALL_LABEL
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
     near, opening, covered = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
     opening[left_over] = _widest_opening(

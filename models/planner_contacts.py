@@ -73,8 +73,9 @@ def _pad_contacts(
     travel = np.full((2, N * L), np.inf)
     owner = np.full((2, N * L), -1)
     facing = np.zeros((2, N * L))
-    for number, item in enumerate(scene.objects):
-        for solid in item.solids:
+    bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
+    for number, solids in [*bodies, (-1, scene.walls)]:  # -1 is not an object to be held
+        for solid in solids:
             middle = (solid.vertices.max(axis=0) + solid.vertices.min(axis=0)) / 2
             radius = np.linalg.norm(solid.vertices - middle, axis=1).max()
             offset_ = middle - flat

@@ -75,7 +75,7 @@ def labelled_by_centres(
     miss = np.linalg.norm(votes[:, None] - centres, axis=2)
     count, owner = len(centres), miss.argmin(axis=1)
     owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
-    label = np.full(heights.label.shape, -1)
+    label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
 
     rise = height - heights.table_height

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from envs.cell_layout import square_walls
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
@@ -49,6 +50,25 @@ def test_packed_objects_stand_apart(primitives, laid_out):
         for body in bodies:
             assert not table.is_near(body, [one for one in bodies if one != body], 5e-4)
             assert table.is_near(body, [one for one in bodies if one != body], 0.3)
+
+
+def test_the_walls_of_a_bin_hold_what_is_in_it(primitives, laid_out):
+    """All of every object is between the walls, which stand on the edges of the workspace."""
+    workspace = laid_out.workspace
+    for seed in (3, 4):
+        scene = make_scene("bin", primitives, seed, laid_out)
+        for axis in (0, 1):
+            edges = sorted(
+                (w.position + s * w.half_size)[axis] for w in scene.walls for s in (-1, 1)
+            )
+            assert np.subtract(edges, workspace.center[axis])[[0, 1, -2, -1]] == pytest.approx(
+                [-0.16, -0.16, 0.16, 0.16]
+            )
+        assert [wall.position[2] + wall.half_size[2] for wall in scene.walls] == [0.1] * 4
+        for placed in scene.placements:
+            turn = Rotation.from_quat(placed.quaternion)
+            corners = placed.position + turn.apply(np.concatenate(placed.model.parts))
+            assert np.abs(corners[:, :2] - workspace.center).max() < workspace.size / 2 + 1e-3
 
 
 def test_a_cube_on_a_table(box_set, laid_out):

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.planners import HeuristicPlanner
-from tests.helpers.box_frames import boxes_frame
+from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HOLE_RISE,
+    WALL_LABEL,
     height_map_from_frame,
     height_map_from_scene,
     local_maxima,
@@ -76,6 +77,30 @@ def test_height_maps_of_a_known_box() -> None:
         np.testing.assert_allclose(heights.height[outside], 0.0, atol=1e-4)
         assert set(heights.label[inside]) == {0} and set(heights.label[outside]) == {-1}
         np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+def test_walls_around_the_workspace_are_obstacles_and_no_objects() -> None:
+    box, walls = ((0.06, 0.08, 0.05), 0.0, (0.47, 0.03)), bin_walls()
+    frame = boxes_frame([box, *walls], walls=4)
+    for heights in (
+        height_map_from_frame(frame, Workspace()),
+        height_map_from_scene(frame.truth, Workspace()),
+    ):
+        for size, _, place in walls:
+            along = np.linspace(-0.4, 0.4, 31)[:, None] * size[:2]
+            at = heights.index(np.array(place) + along)
+            np.testing.assert_allclose(heights.height[at], 0.10, atol=1e-4)
+            assert (heights.label[at] == WALL_LABEL).all()
+        assert heights.label[heights.index(np.array([0.47, 0.03]))] == 0
+        assert len(heights.centres) == 1
+        np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+def test_what_lies_beyond_the_workspace_without_surrounding_it_is_an_object() -> None:
+    """Two long boxes pushed over two edges, 28 cm together."""
+    boxes = [((0.03, 0.14, 0.05), 0.0, (0.5 + side * 0.17, 0.0)) for side in (-1, 1)]
+    heights = height_map_from_frame(boxes_frame(boxes), Workspace())
+    assert set(np.unique(heights.label)) == {-1, 0, 1}
 
 
 def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None:

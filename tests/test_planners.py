@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from models.planners import PLANNERS, make_planner, needs_truth, reset_planner
-from tests.helpers.box_frames import boxes_frame
+from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import dense_labels
@@ -110,6 +110,20 @@ def test_no_finger_goes_into_a_one_centimetre_gap(name: str) -> None:
             finger = grasp.position + side * (grasp.width / 2 + 0.007) * grasp.closing_direction
             in_gap = abs(finger[0] - 0.5) < 0.012 and abs(finger[1]) < 0.03
             assert not in_gap or grasp.position[2] - 0.0072 > 0.05
+
+
+@pytest.mark.parametrize("name", DELIBERATE)
+def test_no_finger_goes_between_a_wall_and_a_box_beside_it(name: str) -> None:
+    """A finger is 14 mm thick and the gap 10 mm wide: only along the wall, which is 10 cm high, is
+    there room, and nowhere a reason to grasp the wall itself."""
+    cube = ((0.045, 0.045, 0.045), 0.0, (0.5 + 0.15 - 0.01 - 0.0225, 0.0))
+    free = planner(name)(boxes_frame([cube]))
+    assert any(abs(grasp.closing_direction[0]) > 0.9 for grasp in free)
+    grasps = planner(name)(boxes_frame([cube, *bin_walls()], walls=4))
+    assert grasps
+    for grasp in grasps:
+        assert np.abs(grasp.position[:2] - cube[2]).max() < 0.03
+        assert abs(grasp.closing_direction[1]) > 0.9
 
 
 @pytest.mark.parametrize("degrees", [0, 35, 90])

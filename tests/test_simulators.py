@@ -8,18 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs.cell import Camera, Cell
-from envs.cell_layout import Placement, Scene
+from envs.cell import TABLE_OR_BACKGROUND, Camera, Cell
+from envs.cell_layout import Placement, Scene, square_walls
 from envs.execution import execute_grasp
 from envs.objects import load_object_set
 from envs.robot import Robot
 from envs.simulators import SIMULATORS, cell_class, check_simulator, make_cell, make_layout_table
 from models.planners import make_planner
-from tests.helpers.simulators import INSTALLED
+from tests.helpers.simulators import INSTALLED, move
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import Workspace
-from utils.transforms import Grasp
+from utils.height_map import WALL_LABEL, height_map_from_frame, height_map_from_scene
+from utils.transforms import Grasp, project
 
 WIDE = 0.10  # m
 SIDE = 0.09  # m, of a cube that the Panda's own hand cannot take
@@ -99,6 +100,49 @@ def test_a_simulator_brings_nothing_under_another_name(simulator, box_set):
                     assert own.parameters.keys() == inspect.signature(method).parameters.keys()
             added |= {name for name in dir(type(thing)) if not name.startswith("_")} - {*dir(base)}
         assert added - {"camera"} == OWN[simulator]  # Cell.camera is an attribute
+
+
+@pytest.fixture(scope="module", params=INSTALLED)
+def walled(request, box_set):
+    """A cell with a cube between walls of 10 cm, and its scene."""
+    walls = tuple(square_walls(np.array([0.5, 0.0]), 0.15, 0.10, 0.01))
+    at = Placement(box_set[0], np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
+    with _cell(request.param) as cell:
+        cell.load(Scene("bin", 0, (at,), walls))
+        yield cell
+
+
+def test_walls_are_seen_where_they_stand(walled):
+    """Their tops are 0.7 m before the camera, which is 0.8 m over the table."""
+    frame = walled.frame(with_truth=True)
+    for off, z, error in ((0.155, 0.1, 1e-3), (0.1505, 0.05, 0.008), (0.1, 0.0, 1e-3)):
+        for side in (-1, 1):  # the top, the inner face, the table before it
+            (u, v), _ = project(np.array([0.5 + side * off, 0.03, z]), frame.K, frame.T_WC)
+            assert frame.depth[round(v), round(u)] == pytest.approx(0.8 - z, abs=error)
+            assert frame.segmentation[round(v), round(u)] == TABLE_OR_BACKGROUND
+    heights = height_map_from_frame(frame, Workspace())
+    exact = height_map_from_scene(frame.truth, Workspace())
+    for found in (heights, exact):
+        at = found.index(np.array([[0.655, 0.0], [0.345, 0.1], [0.4, 0.155], [0.6, -0.155]]))
+        assert (found.label[at] == WALL_LABEL).all()
+        np.testing.assert_allclose(found.height[at], 0.1, atol=1e-3)
+
+
+def test_a_wall_is_part_of_the_table(walled):
+    """What touches it touches the table, it is painted as the table is, and it stops the hand."""
+    walled.load(walled.scene)
+    for x, touches in ((0.55, False), (0.6203, True)):  # the wall begins at x = 0.65
+        move(walled, 0, position=(x, 0.0, 0.06))
+        walled.step()
+        assert walled.touches_table(0) == touches
+    walled.load(walled.scene)
+    walled.randomizable().paint([(1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)])
+    frame = walled.frame()
+    (u, v), _ = project(np.array([0.655, 0.0, 0.1]), frame.K, frame.T_WC)
+    red, green, blue = frame.rgb[round(v), round(u)]
+    assert red > 100 > max(green, blue)
+    outcome = execute_grasp(walled, Grasp(np.array([0.62, 0.0, 0.03]), 0.0, 0.08, 1.0))
+    assert outcome.reason == "collision"
 
 
 def test_an_unknown_simulator_is_refused():

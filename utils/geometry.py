@@ -46,10 +46,12 @@ class SolidObject:
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """All objects of a scene in W; the table is the half-space z <= table_height."""
+    """All objects of a scene in W; the table is the half-space z <= table_height, and walls stand
+    on it."""
 
     objects: tuple[SolidObject, ...]
     table_height: float = 0.0
+    walls: tuple[ConvexSolid, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ _RIM = 0.004  # m of map beyond the hand around every grasp
 _SMALLEST_HALF = 0.004  # m, half the smallest opening that is tried
 _NEAR_FACE = 0.008  # m, lines across the pad within this gap belong to the face that is fitted
 _TOUCH = 0.0025  # m, and those within this gap touch it
+_NOTHING = np.iinfo(np.int16).min  # in place of the label of what a line touches
 
 
 class RelaxedMargins(NamedTuple):
@@ -354,11 +355,13 @@ def _faces(
         tilt = (np.arctan2(back_left, rise) + np.arctan2(back_right, rise)) / 2
     inner = np.int32(2)
     labels = np.concatenate([
-        np.where(gap < _TOUCH, turned.at(turned.label, index, lines[None], steps[end] + inward), -2)
+        np.where(
+            gap < _TOUCH, turned.at(turned.label, index, lines[None], steps[end] + inward), _NOTHING
+        )
         for gap, end, inward in zip(gaps, low[1:], (inner, -inner))
     ], axis=1)  # fmt: skip
     label = np.maximum(labels.max(axis=1), 0)
-    touched &= ((labels == label[:, None]) | (labels == -2)).all(axis=1)
+    touched &= ((labels == label[:, None]) | (labels == _NOTHING)).all(axis=1)
     return _Faces(
         touched, label, left, right, engagement, wedge, turn, tilt, cover,
     )  # fmt: skip

@@ -22,6 +22,7 @@ from utils.transforms import RGBDFrame, deproject, known_depth
 # this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
+WALL_LABEL = -2
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class HeightMap:
         height nearby, as if nothing were there.
     ceiling: (R, C) metres in W, the highest that matter could reach which was hidden or not
         measured; equals `height` where the surface was measured.
-    label: (R, C) int, which object the cell belongs to; -1 for the table.
+    label: (R, C) int, which object the cell belongs to; -1 for the table, WALL_LABEL for walls
+        around the workspace.
     centres: (M, 3) each label's centre of mass in W, or an estimate of it.
     """
 
@@ -101,7 +103,7 @@ def height_map_from_frame(
         nearer = replace(frame, depth=np.where(measured, 0, frame.depth - HOLE_RISE))
         risen = _highest(_surface_points(nearer, origin, cell), grid.shape[:2])
         ceiling = np.maximum(ceiling, risen)
-    label = label_pieces(height, table, cell)
+    label = label_walls(label_pieces(height, table, cell), grid, workspace, cell)
     centres = _column_centroids(height - table, label, grid, table)
     # Where even the surroundings are unknown any matter is possible: a wall, not an object.
     unknown = hidden & np.isfinite(
@@ -118,8 +120,9 @@ def height_map_from_scene(
     grid, origin = grid_points(workspace, margin, cell)
     height = np.full(grid.shape[:2], scene.table_height)
     label = np.full(grid.shape[:2], -1)
-    for number, item in enumerate(scene.objects):
-        for solid in item.solids:
+    bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
+    for number, solids in [*bodies, (WALL_LABEL, scene.walls)]:
+        for solid in solids:
             low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
             high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
             low, high = np.maximum(low, 0), np.maximum(high, 0)
@@ -153,6 +156,33 @@ def label_pieces(
         box = np.s_[y : y + rows, x : x + columns]
         label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2)
     return label
+
+
+def label_walls(
+    label: np.ndarray, grid: np.ndarray, workspace: Workspace, cell: float
+) -> np.ndarray:
+    """The labels (R, C) of `label_pieces`, with WALL_LABEL on walls around the workspace.
+
+    Pieces that lie mostly outside the workspace are walls if together they are as long as one of
+    its sides; what has merely been pushed over the edge never is. grid: (R, C, 2) cells in W.
+    """
+    rows, cols = (
+        np.nonzero(np.abs(line - middle) <= workspace.size / 2)[0]
+        for line, middle in zip((grid[:, 0, 1], grid[0, :, 0]), workspace.centre[::-1])
+    )
+    inner = label[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    count = label.max() + 1
+    within, everywhere = (
+        np.bincount(part.ravel() + 1, minlength=count + 1)[1:] for part in (inner, label)
+    )
+    outside = within < everywhere / 2
+    if not outside.any():
+        return label
+    wall = np.append(outside, False)[label]
+    if cell * max(wall.any(axis=0).sum(), wall.any(axis=1).sum()) < workspace.size:
+        return label
+    number = np.append(np.cumsum(~outside) - 1, -1)  # of the pieces that are left
+    return np.where(wall, WALL_LABEL, number[label])
 
 
 def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float) -> np.ndarray:

@@ -17,9 +17,10 @@ def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
 
 
 def boxes_frame(
-    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]],
+    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]], walls: int = 0
 ) -> RGBDFrame:
-    """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula."""
+    """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula. The
+    last `walls` of them are walls."""
     v, u = np.mgrid[0:224, 0:224]
     rays = (
         np.stack([(u - 111.5) / 390.6, (v - 111.5) / 390.6, np.ones_like(u)], axis=-1)
@@ -39,4 +40,16 @@ def boxes_frame(
         solid = ConvexSolid.from_vertices(CORNERS * half).transformed(T)
         objects.append(SolidObject((solid,), T[:3, 3], 0.7))
     rgb = np.zeros((224, 224, 3), np.uint8)
-    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=SceneGeometry(tuple(objects)))
+    count = len(objects) - walls
+    truth = SceneGeometry(
+        tuple(objects[:count]), walls=tuple(wall.solids[0] for wall in objects[count:])
+    )
+    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=truth)
+
+
+def bin_walls(half: float = 0.15, height: float = 0.10, thick: float = 0.01) -> list:
+    """Four walls of a bin around the middle of the workspace, as boxes of `boxes_frame`."""
+    off, long = half + thick / 2, 2 * (half + thick)
+    return [((thick, long, height), 0.0, (0.5 + side * off, 0.0)) for side in (-1, 1)] + [
+        ((long, thick, height), 0.0, (0.5, side * off)) for side in (-1, 1)
+    ]
