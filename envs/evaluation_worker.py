@@ -56,7 +56,7 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     with open_executor(config.compute, config.evaluate.workers) as workers:
         for name, objects in sets.items():
             if name not in OBJECT_SETS:
-                prepare(objects, workers)
+                prepare(objects, workers, config.gripper.geometry)
 
 
 def privileged_policies(config: Config) -> set[str]:

@@ -11,7 +11,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -30,6 +30,7 @@ from envs.object_meshes import (
 )
 from envs.object_primitives import NativeShape, make_primitive, random_color
 from envs.pybullet_files import data_folder
+from models.graspable import is_graspable
 from utils.errors import UserError, did_you_mean, one_line
 from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
@@ -123,8 +124,8 @@ def load_object_set(
         so that the second longest side of its oriented bounding box has this many metres.
     density: kg/m3 of those objects of a folder whose file states no mass; `box` and `primitives`
         have their own. No object weighs less than 0.02 kg.
-    max_opening: m, of the gripper; a warning names the first object of a folder that is too wide
-        for it.
+    max_opening: m, of the gripper; a warning names the first object of a folder that is far too
+        large for it.
     cache_dir: where convex parts are kept.
     Raises UserError for an unknown name, a missing or empty folder, a plug-in that cannot be used,
     a split or number that is not allowed; a broken mesh raises it when its object is asked for.
@@ -192,18 +193,44 @@ def _no_objects(path: str, found: object, where: str) -> ObjectError:
     )
 
 
-def prepare(objects: ObjectSet, workers: Workers) -> None:
-    """Make every object of a set, in parallel, so that the cache holds it."""
-    made: Iterable[tuple[int, ObjectModel]]
+def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> None:
+    """Make every object of a set, in parallel, so that the cache holds it. One remark names those
+    that do not fit the gripper."""
+    make, indices = partial(_make, objects, gripper), range(len(objects))
+    made: Iterable[tuple[int, ObjectModel, bool]]
     if min(workers.size(), len(objects)) > 1:
-        made = completed(workers, partial(_make, objects), range(len(objects)))
+        made = completed(workers, make, indices)
     else:  # no process has to be started
-        made = map(partial(_make, objects), range(len(objects)))
-    objects._models.update(tqdm(made, total=len(objects), desc=f"objects {objects.name}"))
+        made = map(make, indices)
+    too_large = {}
+    for index, model, fitting in tqdm(made, total=len(objects), desc=f"objects {objects.name}"):
+        objects._models[index] = model
+        if not fitting:
+            too_large[index] = model.name
+    if too_large:
+        names = ", ".join(too_large[index] for index in sorted(too_large))
+        warnings.warn(
+            f"{len(too_large)} of {len(objects)} objects of {objects.name} do not fit a hand that "
+            f"opens {gripper.max_opening} m, however they lie: {names}; tables count the others "
+            "apart, too",
+            stacklevel=2,
+        )
 
 
-def _make(objects: ObjectSet, index: int) -> tuple[int, ObjectModel]:
-    return index, objects[index]
+def _make(
+    objects: ObjectSet, gripper: GripperGeometry, index: int
+) -> tuple[int, ObjectModel, bool]:
+    model = objects[index]
+    return index, model, fits(model, gripper)
+
+
+@lru_cache(maxsize=1024)
+def fits(model: ObjectModel, gripper: GripperGeometry) -> bool:
+    """Whether the gripper can take an object in a pose in which it can rest on the table
+    (`models.graspable`). The answer is kept: it takes about 0.05 s."""
+    return bool(model.extents.max() <= LARGEST_EXTENT) and is_graspable(
+        model.geometry(), model.friction, gripper
+    )
 
 
 # --- the sets -------------------------------------------------------------------------------
@@ -294,8 +321,7 @@ class FileSet(ObjectSet):
         if model.remark and not self._remarked:
             self._remarked = True
             warnings.warn(f"object {path}: {model.remark} (and so may others)", stacklevel=3)
-        ungraspable = model.extents.min() > self.max_opening or model.extents.max() > LARGEST_EXTENT
-        if ungraspable and not self._warned:
+        if model.extents.max() > LARGEST_EXTENT and not self._warned:
             self._warned = True
             sides = " x ".join(f"{side:.3g}" for side in model.extents)
             warnings.warn(

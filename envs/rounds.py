@@ -21,6 +21,7 @@ from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop
+from envs.objects import fits
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from models.planners import Planner, needs_truth, reset_planner
@@ -83,6 +84,11 @@ def run_round(
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
     calibration = conditions.calibration(cell)
+    too_large = {
+        index
+        for index, placed in enumerate(scene.placements)
+        if not fits(placed.model, cell.gripper)
+    }
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
     stops: list[float | None] = []  # heights at which these met something under the palm
@@ -111,10 +117,12 @@ def run_round(
                 approach = ClosedLoop(cell, controller, seen, calibration, taught, late)
             elif approach_by is not None:
                 approach = approach_by
+            aim = nearest_object(cell, grasp) if too_large else None
             with disturbed(cell, conditions.motion(cell, len(attempts))):
                 outcome = execute_grasp(cell, grasp, approach)
             if approach_by is not None and approach_by.closed_at is not None:
                 grasp = approach_by.closed_at
+            held = outcome.object_index
             attempts.append(
                 AttemptRecord(
                     outcome.success,
@@ -123,9 +131,10 @@ def run_round(
                     outcome.sim_seconds,
                     grasp_to_image(grasp, frame.K, frame.T_WC),
                     detail=outcome.detail,
-                    held=_name_of(scene, outcome.object_index),
+                    held=_name_of(scene, held),
                     turned=None if outcome.motion is None else outcome.motion.turned,
                     slid=None if outcome.motion is None else outcome.motion.slid,
+                    graspable=(aim if held is None else held) not in too_large,
                     **_turn_ms(approach),
                 )
             )
@@ -146,7 +155,7 @@ def run_round(
         ended = "lost"
     return RoundRecord(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
-        cleared, tuple(attempts), ended, controller, cell.sample,
+        cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
     )  # fmt: skip
 
 
@@ -177,6 +186,16 @@ def calibrated(cell: Cell, calibration: CameraCalibration, frame: RGBDFrame) -> 
         return calibration.frame(frame, mount, T_WE)
     except TargetLostError:
         return replace(calibration, levelled=False).frame(frame, mount, T_WE)
+
+
+def nearest_object(cell: Cell, grasp: Grasp) -> int:
+    """The number of the object that is nearest to the point between the fingertips of a grasp."""
+    solids = [item.solids for item in cell.truth().objects]
+    gaps = [
+        min((solid.normals @ grasp.position - solid.offsets).max() for solid in parts)
+        for parts in solids
+    ]
+    return sorted(cell.remaining)[int(np.argmin(gaps))]
 
 
 def _name_of(scene: Scene, index: int | None) -> str | None:

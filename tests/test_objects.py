@@ -16,6 +16,7 @@ from tests.helpers.simulators import needs_pybullet, pybullet
 from utils.config import load_config
 from utils.errors import UserError
 from utils.executor import open_executor
+from utils.geometry import GripperGeometry
 
 if pybullet is not None:
     from envs.pybullet_bodies import spawn
@@ -346,10 +347,27 @@ def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
     parallel = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "b")
     for objects, count in ((serial, 1), (parallel, 2)):
         with open_executor(load_config().compute, count) as workers:
-            prepare(objects, workers)
+            prepare(objects, workers, GripperGeometry())
     for a, b in zip(serial, parallel, strict=True):
         assert a.name == b.name and a.mass == b.mass
         assert Path(b.collision).parent == tmp_path / "b" and b.collision.exists()
+
+
+def test_what_does_not_fit_the_hand_is_named_once(tmp_path):
+    (tmp_path / "mixed").mkdir()
+    for name, sides in {
+        "book": (0.04, 0.15, 0.2),
+        "die": (0.1,) * 3,
+        "brick": (0.09, 0.1, 0.2),
+    }.items():
+        trimesh.creation.box(sides).export(tmp_path / "mixed" / f"{name}.stl")
+    for hand, names in ((GripperGeometry(), "brick, die"), (GripperGeometry(0.098), "die")):
+        objects = load_object_set(str(tmp_path / "mixed"), cache_dir=tmp_path / "cache")
+        count = len(names.split())
+        with open_executor(load_config().compute, 1) as workers, pytest.warns(
+            UserWarning, match=f"{count} of 3 .* {hand.max_opening} m.*: {names};"
+        ):
+            prepare(objects, workers, hand)
 
 
 # --- random_urdfs ---------------------------------------------------------------------------

@@ -12,6 +12,8 @@ from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.geometry import GripperGeometry, Workspace
+from utils.result_formats import format_table
+from utils.results import summarise
 from utils.transforms import Grasp
 
 
@@ -118,6 +120,30 @@ def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -
     assert [id(grasp) for grasp in tried] == [id(g) for g in (*bad, good[0], *bad, good[1])]
     assert [attempt.success for attempt in record.attempts] == [False, False, True] * 2
     assert (record.ended, record.objects_cleared) == ("cleared", 2)
+
+
+def test_attempts_at_what_does_not_fit_the_hand_are_counted_apart(cell, config, box_set) -> None:
+    """A cube of 6 cm, and beside it one of 9 cm that is tried first."""
+    wide = load_object_set("box", scale=1.5, cache_dir=config.cache_folder)[0]
+    places = [(0.5, -0.1, 0.03), (0.5, 0.1, 0.045)]
+    scene = Scene(
+        "packed",
+        0,
+        tuple(Placement(m, np.array(p), np.eye(4)[3]) for m, p in zip((box_set[0], wide), places)),
+    )
+    plans = iter([places[1], places[0], places[1], places[1]])
+
+    def plan(frame):
+        return [Grasp(np.array(next(plans)), 0.0, 0.08, 1.0)]
+
+    record = run_round(cell, scene, plan, policy="x", objects="box", max_failures=2)
+    assert [attempt.success for attempt in record.attempts] == [False, True, False, False]
+    assert [attempt.graspable for attempt in record.attempts] == [False, True, False, False]
+    assert (record.objects_total, record.ungraspable) == (2, 1)
+    (row,) = summarise([record], 0)
+    assert (row.attempts, row.successes, row.objects_total) == (4, 1, 2)
+    assert (row.graspable_attempts, row.graspable_successes, row.graspable_total) == (1, 1, 1)
+    assert "100 % 1/1, 100 % 1/1" in format_table([row])
 
 
 def test_physics_that_blows_up_ends_the_round(cell, box_set, monkeypatch):

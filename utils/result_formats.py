@@ -122,6 +122,16 @@ def firm_in_words(row: Row) -> str:
     return f"{100 * row.firm / row.attempts:.0f} %" if row.attempts else "-"
 
 
+def graspable_in_words(row: Row) -> str:
+    """'98 % 49/50, 96 % 48/50': attempts at objects that fit the gripper that succeed, and such
+    objects that are cleared."""
+    shares = (
+        (row.graspable_successes, row.graspable_attempts),
+        (row.graspable_successes, row.graspable_total),
+    )
+    return ", ".join(f"{100 * k / n:.0f} % {k}/{n}" if n else "-" for k, n in shares)
+
+
 def turn_ms_in_words(row: Row) -> str:
     """'8.1, 14.2': mean and 95th percentile of a closed loop's turns, ms; '-' for an open loop."""
     known = [ms for ms in (row.turn_ms_mean, row.turn_ms_p95) if ms is not None]
@@ -158,6 +168,11 @@ COLUMNS = (
         lambda row: _share(
             row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total
         ),
+    ),
+    TableColumn(
+        "success, cleared of graspable",
+        graspable_in_words,
+        known=lambda row: row.graspable_total < row.objects_total,
     ),
     TableColumn("plan ms", lambda row: _decimal(row.plan_ms_median, 1), number=True),
     TableColumn(

@@ -79,6 +79,7 @@ class AttemptRecord:
     detail: a sentence on a failure.
     held: name of the object that was in the hand, if any, however the attempt ended.
     turned, slid: rad and m by which it moved there; None without it.
+    graspable: whether the object that was held, or at which the grasp aimed, fits the gripper.
     """
 
     success: bool
@@ -92,6 +93,7 @@ class AttemptRecord:
     held: str | None = None
     turned: float | None = None
     slid: float | None = None
+    graspable: bool = True
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -113,6 +115,7 @@ class RoundRecord:
     attempts: a round that ended with "no_plan" or "planner_error" has this reason at its end.
     controller: how the arm reached the grasps.
     randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
+    ungraspable: how many of the scene's objects do not fit the gripper.
     """
 
     policy: str
@@ -125,6 +128,7 @@ class RoundRecord:
     ended: str
     controller: str = OPEN_LOOP
     randomization: dict[str, Any] | None = None
+    ungraspable: int = 0
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:
@@ -221,15 +225,18 @@ def _round(content: dict[str, Any]) -> RoundRecord:
 
 _ROUND_TYPES = {
     "policy": str, "scenario": str, "objects": str, "seed": int, "objects_total": int,
-    "objects_cleared": int, "ended": str, "controller": str,
+    "objects_cleared": int, "ended": str, "controller": str, "ungraspable": int,
 }  # fmt: skip
-_ATTEMPT_TYPES = {"success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float}
+_ATTEMPT_TYPES = {
+    "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
+}  # fmt: skip
+_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True}  # missing in older files
 _GRASP_NUMBERS = ("angle", "depth", "width", "quality")
 
 
 def _check_types(content: dict[str, Any], types: dict[str, type]) -> None:
     for name, kind in types.items():
-        value = content[name] if name != "controller" else content.get(name, OPEN_LOOP)
+        value = content.get(name, _ADDED[name]) if name in _ADDED else content[name]
         if not (_is_number(value) if kind is float else type(value) is kind):
             raise ValueError(f"{name} is {value!r:.40}")
 

@@ -33,6 +33,8 @@ class Row:
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
     turned, slid: successes in which the object moved in the hand by more than 15 degrees or 1 cm.
         firm: successes in which it did neither.
+    graspable_*: of objects that fit the gripper (`envs.objects.fits`) alone. An attempt belongs to
+        the object that it held, or at which it aimed.
     turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
         which the median over the attempts.
     """
@@ -60,6 +62,9 @@ class Row:
     turned: int = 0
     slid: int = 0
     firm: int = 0
+    graspable_attempts: int = 0
+    graspable_successes: int = 0
+    graspable_total: int = 0
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -77,6 +82,7 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
     total = sum(record.objects_total for record in rounds)
     cleared = sum(record.objects_cleared for record in rounds)
     reasons = Counter(call.reason for call in calls)
+    fitting = [call for call in calls if call.graspable]
     moved = [loose(call.turned, call.slid) for call in calls if call.success]
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
@@ -104,6 +110,9 @@ def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) ->
         turned=sum("turned" in how for how in moved),
         slid=sum("slid" in how for how in moved),
         firm=sum(not how for how in moved),
+        graspable_attempts=sum(call.executed for call in fitting),
+        graspable_successes=sum(call.success for call in fitting),
+        graspable_total=total - sum(record.ungraspable for record in rounds),
     )
 
 
