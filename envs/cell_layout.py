@@ -126,6 +126,13 @@ class ObjectModel:
         return self._solids
 
     @cached_property
+    def narrowest(self) -> float:
+        """m, the smallest distance of a face of the convex hull from the corner farthest from
+        it."""
+        hull = ConvexSolid.from_vertices(np.concatenate(self.parts))
+        return float(np.ptp(hull.vertices @ hull.normals.T, axis=0).min())
+
+    @cached_property
     def _solids(self) -> tuple[ConvexSolid, ...]:
         return tuple(ConvexSolid.from_vertices(part) for part in self.parts)
 

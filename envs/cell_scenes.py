@@ -3,6 +3,7 @@
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
 whatever `scene.count` says. `bin`: objects dropped between walls around the workspace, which stay.
+`household`: a pile of objects as different in size as the set has them, see `_mixed`.
 `packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
 
 The objects come to rest in the simulator `scene.simulator`, whichever simulator the scene is for,
@@ -22,9 +23,10 @@ from envs.objects import ObjectSet
 from envs.simulators import make_layout_table
 from utils.config import Config
 from utils.errors import UserError
+from utils.grasp_quality import RELAXED
 
 # Their places are part of the scenes' seeds.
-LAYOUTS = ("isolated", "packed", "pile", "dense", "bin")
+LAYOUTS = ("isolated", "packed", "pile", "dense", "bin", "household")
 DENSE_COUNT = 15
 
 _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the table
@@ -56,7 +58,10 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     count = {"isolated": 1, "dense": DENSE_COUNT}.get(layout, config.scene.count)
     walls = tuple(_walls_around(config)) if layout == "bin" else ()
     for _ in range(_TRIES):
-        chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
+        if layout == "household":
+            chosen = _mixed(objects, count, rng, config)
+        else:
+            chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
         with make_layout_table(config, models, walls) as table:
             bodies = arrange(table, models, rng, config)
@@ -71,6 +76,21 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         f"inside the {config.workspace.size} m workspace in {_TRIES} tries; use smaller objects "
         "(objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
+
+
+def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:
+    """Numbers (count,) of objects of mixed sizes, in random order: those that the hand spans where
+    they are narrowest are sorted by that width and cut into `count` equal parts, and one is drawn
+    from each. No object is scaled, so that sizes and masses are true."""
+    widest = config.gripper.max_opening - 2 * RELAXED.room
+    fitting = objects.by_width(widest)
+    if not fitting:
+        raise SceneError(
+            f"no object of {objects.name!r} is less than {widest:.3f} m wide, so that the hand "
+            "spans none; use smaller objects (objects.scale, objects.fit)"
+        )
+    places = (np.arange(count) + rng.uniform(size=count)) * len(fitting) / count
+    return rng.permutation(np.array(fitting)[places.astype(int)])
 
 
 def _walls_around(config: Config) -> Iterator[Box]:
@@ -161,5 +181,5 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
-    "bin": _drop_all,
+    "bin": _drop_all, "household": _pile_up,
 }  # fmt: skip

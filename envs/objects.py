@@ -62,6 +62,7 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
     def __init__(self, name: str) -> None:
         self.name = name
         self._models: dict[int, ObjectModel] = {}
+        self._order: list[int] | None = None
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -69,6 +70,13 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
     @abstractmethod
     def _build(self, index: int) -> ObjectModel:
         """Make the object; raises ObjectError if it cannot be made."""
+
+    def by_width(self, widest: float) -> list[int]:
+        """Numbers of the objects that are at most `widest` metres wide where they are narrowest,
+        the narrowest first. The first call makes all objects."""
+        if self._order is None:
+            self._order = sorted(range(len(self)), key=lambda index: self[index].narrowest)
+        return [index for index in self._order if self[index].narrowest <= widest]
 
     def __getitem__(self, index: int) -> ObjectModel:
         index = range(len(self))[index]  # negative indices, and IndexError past the end

@@ -278,6 +278,7 @@ SCENARIOS = {
     "pile": Scenario("pile"),
     "dense": Scenario("dense"),
     "bin": Scenario("bin"),
+    "household": Scenario("household"),
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),
     "moving_5cm": Scenario("isolated", speed=0.05),

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.cell_layout import square_walls
 from envs.cell_scenes import LAYOUTS, SceneError, make_scene
-from envs.objects import load_object_set
+from envs.objects import ObjectPart, load_object_set
 from envs.simulators import make_layout_table
 from tests.helpers.simulators import INSTALLED
 from utils.config import with_settings
@@ -25,7 +25,10 @@ def primitives(config):
 
 @pytest.mark.parametrize(
     "layout",
-    [pytest.param(name, marks=pytest.mark.slow) if name == "dense" else name for name in LAYOUTS],
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in ("dense", "household") else name
+        for name in LAYOUTS
+    ],
 )
 def test_scene_is_a_pure_function_of_its_seed(layout, primitives, laid_out):
     first = make_scene(layout, primitives, 7, laid_out)
@@ -41,6 +44,29 @@ def test_scene_is_a_pure_function_of_its_seed(layout, primitives, laid_out):
     for placement in first.placements:
         offset = abs(placement.position[:2] - laid_out.workspace.center)
         assert offset.max() <= laid_out.workspace.size / 2 and placement.position[2] > 0
+
+
+def test_a_household_is_as_mixed_as_its_set(primitives, config):
+    """One object of each fifth of the set, sorted by the smallest width; none that the hand cannot
+    span; and a set of one gives five of it."""
+    some = ObjectPart(primitives, range(25))
+    widths = sorted(model.narrowest for model in some)
+    assert widths[-1] < 0.074  # so that all of them count
+    names = set()
+    for seed in range(4):
+        scene = make_scene("household", some, seed, config)
+        drawn = sorted(placed.model.narrowest for placed in scene.placements)
+        for number, width in enumerate(drawn):
+            assert widths[5 * number] <= width <= widths[5 * number + 4]
+        names |= {placed.model.name for placed in scene.placements}
+    assert len(names) > 10
+    narrow = with_settings(config, "gripper", {"max_opening": widths[9] + 0.0061})
+    scene = make_scene("household", some, 0, narrow)
+    assert max(placed.model.narrowest for placed in scene.placements) <= widths[9]
+    cubes = load_object_set("box", cache_dir=config.cache_folder)
+    assert len(make_scene("household", cubes, 0, config).placements) == 5
+    with pytest.raises(SceneError, match="no object of 'box' is less than 0.034 m wide"):
+        make_scene("household", cubes, 0, with_settings(config, "gripper", {"max_opening": 0.04}))
 
 
 def test_packed_objects_stand_apart(primitives, laid_out):

@@ -353,6 +353,15 @@ def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
         assert Path(b.collision).parent == tmp_path / "b" and b.collision.exists()
 
 
+def test_the_narrowest_width_of_a_turned_box_is_its_smallest_side(tmp_path):
+    box = trimesh.creation.box((0.03, 0.05, 0.12))
+    box.apply_transform(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3)))
+    box.export(tmp_path / "box.stl")
+    model = load_object(tmp_path / "box.stl", cache_dir=tmp_path)
+    assert model.extents.min() > 0.05
+    assert model.narrowest == pytest.approx(0.03, abs=1e-6)
+
+
 def test_what_does_not_fit_the_hand_is_named_once(tmp_path):
     (tmp_path / "mixed").mkdir()
     for name, sides in {
@@ -364,8 +373,9 @@ def test_what_does_not_fit_the_hand_is_named_once(tmp_path):
     for hand, names in ((GripperGeometry(), "brick, die"), (GripperGeometry(0.098), "die")):
         objects = load_object_set(str(tmp_path / "mixed"), cache_dir=tmp_path / "cache")
         count = len(names.split())
-        with open_executor(load_config().compute, 1) as workers, pytest.warns(
-            UserWarning, match=f"{count} of 3 .* {hand.max_opening} m.*: {names};"
+        with (
+            open_executor(load_config().compute, 1) as workers,
+            pytest.warns(UserWarning, match=f"{count} of 3 .* {hand.max_opening} m.*: {names};"),
         ):
             prepare(objects, workers, hand)
 

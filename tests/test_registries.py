@@ -40,7 +40,7 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("evaluate.controllers=ibsv", "evaluate.controllers: got 'ibsv', .* did you mean ibvs?"),
         (
             "env.scenario=moved",
-            "env.scenario: got 'moved', expected one of bin, dense, isolated, packed, pile",
+            "env.scenario: got 'moved', expected one of bin, dense, household, isolated, packed",
         ),
         ("simulator=pybulet", "simulator: got 'pybulet', .* did you mean pybullet?"),
         ("data.kind=cornel", "data.kind: got 'cornel', .* did you mean cornell?"),
