@@ -22,7 +22,7 @@ from threading import Event
 
 import numpy as np
 
-from benchmarks.soak_files import KINDS
+from benchmarks.soak_files import KINDS, Kind
 from benchmarks.soak_tally import Tally
 from models.ppo import KIND as POLICY
 from utils import executor
@@ -90,25 +90,26 @@ def soak_disk(scale: float, seed: int, stop: Event) -> Iterator[Tally]:
                 before = times * whole
                 path.write_bytes(before)
                 fill(disk, int(random.integers(2 * len(before))) if times == 1 else 0)
-                sound, lost, written = _try_to_write(kind.write, path, before)
+                sound, lost, written = _try_to_write(kind, path, before, whole)
                 full.add(sound, lost)
                 refused += not written
                 (disk / "filler").unlink()
                 path.write_bytes(before)
                 make_read_only(disk, True)
-                sound, lost, written = _try_to_write(kind.write, path, before)
+                sound, lost, written = _try_to_write(kind, path, before, whole)
                 locked.add(sound and not written, lost)
                 make_read_only(disk, False)
             full.note = f"{refused} of the writes found no room"
 
 
-def _try_to_write(
-    write: Callable[[Path], object], path: Path, before: bytes
-) -> tuple[bool, int, bool]:
+def _try_to_write(kind: Kind, path: Path, before: bytes, whole: bytes) -> tuple[bool, int, bool]:
     """Whether a write ended as it should, the number of files that are lost by it, and whether it
-    was done."""
+    was done.
+
+    before: what the file holds. whole: what a write adds to a journal.
+    """
     try:
-        write(path)
+        kind.write(path)
         sound = written = True
     except UserError:
         strays = [one for one in path.parent.iterdir() if one.name.startswith(f".{path.name}.")]
@@ -116,11 +117,25 @@ def _try_to_write(
     except OSError:
         sound = written = False
     after = path.read_bytes()
-    if path.name == JOURNAL:
-        lost = not (after.startswith(before) and after.endswith(b"\n"))
+    if kind.name == JOURNAL:
+        kept = after.startswith(before) and after.endswith(b"\n")
+        kept &= not written or after == before + whole
     else:
-        lost = after != before and (not written or len(after) < len(before) // 2)
-    return sound, int(lost), written
+        kept = _is_read(kind, after) if written else after == before
+    return sound, int(not kept), written
+
+
+def _is_read(kind: Kind, content: bytes) -> bool:
+    """Whether the program reads a file with this content."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "written" / kind.name
+        path.parent.mkdir()
+        path.write_bytes(content)
+        try:
+            kind.read(path)
+        except Exception:
+            return False
+    return True
 
 
 # --- Workers --------------------------------------------------------------------------------------
@@ -133,36 +148,37 @@ def soak_workers(scale: float, seed: int, stop: Event) -> Iterator[Tally]:
 
     executor.FREEZE_SECONDS = TIMEOUT
     local = with_settings(load_config(), "compute", {"timeout": TIMEOUT}).compute
-    faults = {"hang": _hang, "freeze": _freeze, "are slow": _nap}
-    for name, fault in faults.items():
+    for name in FAULTS:
         tally = Tally(f"local workers {name}")
         yield tally
-        _disturb(local, fault, round(CALLS * scale), tally, stop)
+        _disturb(local, name, round(CALLS * scale), tally, stop)
     with local_cluster(2) as (address, _):
         cluster = local.model_copy(update={"scheduler": address})
         for name in ("hang", "are slow"):  # one that freezes costs five minutes
             tally = Tally(f"cluster's workers {name}")
             yield tally
-            _disturb(cluster, faults[name], round(CALLS * scale), tally, stop)
+            _disturb(cluster, name, round(CALLS * scale), tally, stop)
 
 
-def _disturb(
-    compute: ComputeConfig, fault: Callable[[], object], count: int, tally: Tally, stop: Event
-) -> None:
+def _disturb(compute: ComputeConfig, fault: str, count: int, tally: Tally, stop: Event) -> None:
     """Make `count` calls, each of which is disturbed when it is made for the first time."""
     if stop.is_set():
         return
+    disturb, times = FAULTS[fault]
     with TemporaryDirectory() as folder, open_executor(compute, 2) as workers:
-        calls = partial(first_time, Path(folder), fault)
+        calls = partial(first_time, Path(folder), disturb)
         for number, square in completed(workers, calls, range(max(count, 1))):
-            tally.add((Path(folder) / str(number)).exists(), lost=square != number**2)
+            made = (Path(folder) / str(number)).stat().st_size
+            tally.add(made == times, lost=square != number**2)
 
 
 def first_time(folder: Path, fault: Callable[[], object], number: int) -> tuple[int, int]:
-    """A number and its square; the first call for a number is disturbed."""
-    begun = folder / str(number)
-    if not begun.exists():
-        begun.touch()
+    """A number and its square; the first call for a number is disturbed. The number's file in the
+    folder has a byte for each call."""
+    with (folder / str(number)).open("ab") as calls:
+        calls.write(b".")
+        first = calls.tell() == 1
+    if first:
         fault()
     return number, number**2
 
@@ -179,6 +195,10 @@ def _nap() -> None:
     time.sleep(0.6 * TIMEOUT)
 
 
+# What is done to a call, and how often it is made until there is a result: what is slow counts.
+FAULTS = {"hang": (_hang, 2), "freeze": (_freeze, 2), "are slow": (_nap, 1)}
+
+
 # --- Scripts that are stopped ---------------------------------------------------------------------
 
 EVALUATION = (
@@ -191,6 +211,7 @@ TRAINING = (
     "rl.rollout_steps=64", "rl.batch_size=64", "rl.total_steps=8192", "rl.evaluate_every=4",
     "rl.evaluation_episodes=2",
 )  # fmt: skip
+ANNOUNCED = b"results in "  # of what the scripts print when they begin
 
 
 def soak_stopped(scale: float, seed: int, stop: Event) -> Iterator[Tally]:
@@ -234,30 +255,35 @@ def _stopped(
     its results differ, and how often it was stopped."""
     sound, count = True, 0
     for _ in range(2):
-        status = _run(command, place, number, random.uniform(0.3, 0.9) * seconds)
+        status, announced = _run(command, place, number, random.uniform(0.3, 0.9) * seconds)
         count += status != 0
-        # Python itself is still starting where the signal ends it.
-        sound &= status in (0, TERMINATED, -number)
-    sound &= _run(command, place) == 0
+        if number == signal.SIGTERM and status == -number:
+            # Python itself is still starting or already ending where SIGTERM finds no handler.
+            sound &= not announced or result(_run_folder(place)) == expected
+        else:
+            sound &= status in (0, TERMINATED, -signal.SIGKILL)
+    sound &= _run(command, place)[0] == 0
     got = result(_run_folder(place))
     return sound, sum(a != b for a, b in zip(expected, got)) + abs(len(expected) - len(got)), count
 
 
 def _run(
     command: Sequence[str], place: Path, number: int | None = None, after: float | None = None
-) -> int:
+) -> tuple[int, bool]:
     """Run a script in a folder, or go on there, and send it a signal after so many seconds; its
-    exit status."""
+    exit status, and whether it has announced what it does, as a script does once it has begun."""
     place.mkdir(exist_ok=True)
     run, script = _run_folder(place), [sys.executable, str(REPOSITORY / command[0])]
     arguments = list(command[1:]) if run is None else ["--resume", str(run)]
-    with (place / "log").open("a") as log:
+    with (place / "log").open("w+b") as log:
         process = subprocess.Popen([*script, *arguments], cwd=place, stdout=log, stderr=log)
         try:
-            return process.wait(after)
+            status = process.wait(after)
         except subprocess.TimeoutExpired:
             process.send_signal(number)
-            return process.wait()
+            status = process.wait()
+        log.seek(0)
+        return status, ANNOUNCED in log.read()
 
 
 def _run_folder(place: Path) -> Path | None:

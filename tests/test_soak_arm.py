@@ -8,9 +8,11 @@ import pytest
 
 from benchmarks.soak_arm import (
     MODES,
+    SAMPLED,
     LimitWatch,
     hostile_actions,
     hostile_episodes,
+    judge_memory,
     soak_memory,
 )
 from benchmarks.soak_tally import Tally
@@ -62,3 +64,13 @@ def test_memory_is_measured_over_resets_and_steps():
     (tally,) = soak_memory(INSTALLED[0], 2e-4, 0, Event())
     assert tally.tried == tally.survived >= 200
     assert "resets, actions of 4 physics steps" in tally.note
+    assert tally.note.endswith("too few episodes to judge the memory")
+
+
+@pytest.mark.parametrize(("kilobytes", "survived"), [(3.9, 12), (4.1, 0)])
+def test_memory_is_judged_by_the_episode_however_short_the_run(kilobytes, survived):
+    tally = Tally("memory", tried=12, survived=12)
+    beginning = [int(1e6), int(9e8), int(2e8)]  # does not count
+    judge_memory(tally, beginning + [int(3e8 + n * SAMPLED * 1e3 * kilobytes) for n in range(4)])
+    assert tally.survived == survived
+    assert tally.note == f"; 301 MB at the end, +{kilobytes} kB an episode in the second half"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from benchmarks.soak_files import KINDS, damaged, problem
+from benchmarks.soak_files import COUNTS_PEAKS, KINDS, Kind, damaged, problem
 from utils.errors import UserError
 
 BY_NAME = {kind.name: kind for kind in KINDS}
@@ -40,6 +42,15 @@ def test_a_damaged_file_is_one_sentence_or_works(sound, name, seed):
     path.write_bytes(damaged(content, np.random.default_rng(seed)))
     assert problem(BY_NAME[name], path) is None
     assert sound[name].read_bytes() == content
+
+
+@pytest.mark.skipif(not COUNTS_PEAKS, reason="this system does not count peaks of the memory")
+def test_memory_that_is_given_back_counts(tmp_path):
+    def read(path):
+        np.ones(int(600e6), np.uint8)
+
+    assert problem(Kind("bomb", Path.touch, read), tmp_path) == "it takes too much memory"
+    assert problem(Kind("nothing", Path.touch, Path.exists), tmp_path) is None
 
 
 @pytest.mark.parametrize("name", ["colour.png", "depth.npy", "shard.h5", "network.pt", "parts.npz"])

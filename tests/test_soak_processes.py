@@ -1,12 +1,29 @@
-"""Disks that are full or read-only, where this process may mount one."""
+"""Disks that are full or read-only, where this process may mount one; workers and scripts."""
 
+import signal
+import sys
 from contextlib import ExitStack
 from threading import Event
 
+import numpy as np
 import pytest
 
-from benchmarks.soak_processes import WRITTEN, small_disk, soak_disk
+from benchmarks.soak_files import KINDS, Kind
+from benchmarks.soak_processes import (
+    FAULTS,
+    JOURNAL,
+    WRITTEN,
+    _disturb,
+    _stopped,
+    _try_to_write,
+    small_disk,
+    soak_disk,
+)
+from benchmarks.soak_tally import Tally
+from utils.config import load_config
 from utils.errors import UserError
+
+# --- Disks ----------------------------------------------------------------------------------------
 
 
 def test_what_is_written_to_a_full_or_read_only_disk_is_not_lost():
@@ -19,3 +36,65 @@ def test_what_is_written_to_a_full_or_read_only_disk_is_not_lost():
     assert len(tallies) == 2 * len(WRITTEN)
     for tally in tallies:
         assert tally.tried == tally.survived == 5 and tally.lost == 0, tally
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_written_file_that_is_not_whole_is_lost(tmp_path, name):
+    (kind,) = [one for one in KINDS if one.name == name]
+    path = tmp_path / name
+    kind.write(path)
+    whole = path.read_bytes()
+    assert _try_to_write(kind, path, whole, whole) == (True, 0, True)
+
+    def write_most(path):
+        with path.open("ab" if name == JOURNAL else "wb") as file:
+            file.write(whole[: len(whole) * 9 // 10])
+
+    path.write_bytes(whole)
+    most = Kind(name, write_most, kind.read)
+    assert _try_to_write(most, path, whole, whole) == (True, 1, True)
+
+
+# --- Workers --------------------------------------------------------------------------------------
+
+
+def test_a_call_that_is_slow_may_be_made_once_only(monkeypatch):
+    monkeypatch.setitem(FAULTS, "are slow", (bool, 1))
+    tally = Tally("workers are slow")
+    _disturb(load_config().compute, "are slow", 2, tally, Event())
+    assert (tally.tried, tally.survived, tally.lost) == (2, 2, 0)
+    monkeypatch.setitem(FAULTS, "hang", (bool, 2))  # is not made again
+    tally = Tally("workers hang")
+    _disturb(load_config().compute, "hang", 2, tally, Event())
+    assert (tally.tried, tally.survived, tally.lost) == (2, 0, 0)
+
+
+# --- Scripts that are stopped ---------------------------------------------------------------------
+
+SCRIPT = """
+import pathlib, signal, sys, time
+if HANDLES:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+run = pathlib.Path("runs/evaluate/one")
+run.mkdir(parents=True, exist_ok=True)
+for name in ("config.yaml", "environment.json"):
+    (run / name).touch()
+print("results in", run, flush=True)
+turns = run / "turns"
+with turns.open("a") as file:
+    file.write(".")
+time.sleep(60 if turns.stat().st_size < 3 else 0)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGTERM that a script can handle")
+@pytest.mark.parametrize("handles", [True, False])
+def test_sigterm_without_a_handler_is_noticed(tmp_path, handles):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.replace("HANDLES", str(handles)))
+    results = iter([["unfinished"], ["unfinished"], ["whole"]][2 * handles :])
+    sound, lost, stops = _stopped(
+        [str(script)], tmp_path / "place", signal.SIGTERM, 2.0, np.random.default_rng(0),
+        lambda run: next(results), ["whole"],
+    )  # fmt: skip
+    assert (sound, lost, stops) == (handles, 0, 2)
