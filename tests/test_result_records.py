@@ -1,6 +1,7 @@
 """Records that contradict themselves, the journal, and samples that others can play again."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -62,6 +63,15 @@ def test_a_journal_holds_every_round(tmp_path):
     assert read.attempts[0].grasp.pixel == [3.5, 4.25] and read.attempts[0].held == "mug"
     assert differing_rounds([record], [read]) == []
     assert read_rounds(tmp_path / "none.jsonl") == []
+
+
+def test_each_line_of_a_journal_is_on_the_disk_at_once(tmp_path, monkeypatch):
+    path, sizes = tmp_path / "rounds.jsonl", []
+    monkeypatch.setattr(os, "fsync", lambda number: sizes.append(os.fstat(number).st_size))
+    for record in ROUNDS[:2]:
+        append_round(path, record)
+        assert sizes[-1] == path.stat().st_size
+    assert len(sizes) == 2 and sizes[0] < sizes[1]
 
 
 def test_a_journal_of_an_older_version_is_read(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import signal
 import subprocess
@@ -71,6 +72,19 @@ def test_run_folder_errors(tmp_path):
 def test_git_state_outside_a_repository(tmp_path):
     assert git_state(tmp_path) == (None, None)
     assert set(environment()) >= {"commit", "dirty", "platform", "packages", "cpu_count"}
+
+
+def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, monkeypatch):
+    """Otherwise an empty file may be left where the power fails after the renaming."""
+    path, on_disk = tmp_path / "last.pt", []
+    path.write_bytes(b"before")
+
+    def fsync(number):
+        on_disk.append((os.fstat(number).st_ino, os.fstat(number).st_size, path.read_bytes()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_atomic(path, b"afterwards")
+    assert on_disk == [(path.stat().st_ino, 10, b"before")]
 
 
 def test_json_refuses_nan(tmp_path):

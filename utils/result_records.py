@@ -158,8 +158,8 @@ class RoundRecord:
 
 
 def append_round(path: Path, record: RoundRecord) -> None:
-    """Add a finished round to the journal, or nothing. Raises UserError where it cannot be written,
-    as on a full disk."""
+    """Add a finished round to the journal, on the disk, or nothing. Raises UserError where it cannot
+    be written, as on a full disk."""
     line = _line(record).encode()
     try:
         with path.open("ab", buffering=0) as journal:
@@ -168,6 +168,7 @@ def append_round(path: Path, record: RoundRecord) -> None:
             if written < len(line):  # the disk is full: the next write would say so
                 journal.truncate(end)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(journal.fileno())
     except OSError as error:
         raise cannot_write(path, error) from error
 

@@ -142,7 +142,8 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing: into a temporary neighbour, then renamed into place.
+    """Write a whole file or nothing, even if the power fails: into a temporary neighbour that is on
+    the disk before it is renamed into place.
 
     Raises UserError where that cannot be done, as on a full disk or in a read-only folder.
     """
@@ -154,6 +155,8 @@ def write_atomic(path: Path, content: str | bytes) -> None:
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
             os.chmod(temporary, 0o644)
             os.replace(temporary, path)
         except BaseException:
