@@ -31,6 +31,16 @@ def test_devices(monkeypatch):
         choose_device("cuda:2")
 
 
+@pytest.mark.parametrize("name", ["auto", "cuda"])
+def test_more_processes_than_gpus_are_told_how_many_may_start(name, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    assert choose_device(name, local_rank=0) == torch.device("cuda", 0)
+    told = r"^rl.device: .* has 1; .*\(--nproc_per_node=1\), or set rl.device=cpu$"
+    with pytest.raises(UserError, match=told):
+        choose_device(name, local_rank=1, key="rl.device")
+
+
 def test_several_processes_do_not_share_one_gpu():
     with (
         pytest.raises(UserError, match="cuda:0: 2 processes cannot share one GPU.*cuda or auto"),

@@ -126,7 +126,8 @@ def team(device: str, environment: Mapping[str, str], key: str = "train.device")
 
 
 def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> torch.device:
-    """Return the torch device of that name; raise UserError if this machine does not have it."""
+    """Return the torch device of that name for the process `local_rank` of this machine; raise
+    UserError if the machine does not have it."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -138,6 +139,11 @@ def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> 
     if device.type == "cuda":
         count = torch.cuda.device_count()
         index = local_rank if device.index is None else device.index
+        if device.index is None and 0 < count <= local_rank:
+            raise UserError(
+                f"{key}: each process needs a GPU of its own, and this machine has {count}; start "
+                f"at most {count} processes (--nproc_per_node={count}), or set {key}=cpu"
+            )
         if index >= count:
             raise UserError(f"{key}={name}: this machine has {count} CUDA GPUs; use {key}=auto")
         device = torch.device("cuda", index)

@@ -158,8 +158,8 @@ class RoundRecord:
 
 
 def append_round(path: Path, record: RoundRecord) -> None:
-    """Add a finished round to the journal, on the disk, or nothing. Raises UserError where it cannot
-    be written, as on a full disk."""
+    """Add a finished round to the journal, on the disk, or nothing. Raises UserError where that
+    cannot be done, as on a full disk."""
     line = _line(record).encode()
     try:
         with path.open("ab", buffering=0) as journal:
