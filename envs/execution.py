@@ -19,11 +19,11 @@ from envs.cell import Cell
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
 from envs.robot_kinematics import (
     HALF_TURN,
-    Trajectory,
     UnreachableError,
     choose_posture,
     forward_kinematics,
 )
+from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError, reaching_down
 from utils.config import Config
 from utils.errors import UserError

@@ -14,17 +14,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from envs.robot_kinematics import (
-    CARTESIAN_ACCELERATION,
-    Trajectory,
     UnreachableError,
     forward_kinematics,
     inverse_kinematics,
     rotation_vector,
-    time_path,
 )
+from envs.robot_motion import Limits, Trajectory, timed
 from envs.robot_safety import ArmGate, ArmStoppedError, contact_reason
 from utils.geometry import GripperGeometry
 
@@ -177,11 +176,7 @@ class Robot(ABC):
 
     def joint_move(self, start: np.ndarray, goal: np.ndarray, **scales: float) -> Trajectory:
         """The quickest synchronous motion between joint positions (7,) within all limits."""
-        waypoints = np.linspace(start, goal, 2)
-        return time_path(
-            waypoints, np.array([0.0, 1.0]), dt=self.dt,
-            max_speed=np.inf, max_acceleration=np.inf, **scales,
-        )  # fmt: skip
+        return timed(CubicSpline([0.0, 1.0], [start, goal]), self.dt, Limits(**scales))
 
     def straight_move(
         self, start: np.ndarray, goal: np.ndarray, speed: float, rest: np.ndarray, **scales: float
@@ -209,10 +204,8 @@ class Robot(ABC):
                     "singular posture of the arm; choose another approach"
                 )
             waypoints.append(q)
-        return time_path(
-            np.array(waypoints), np.linspace(0, length, count), dt=self.dt,
-            max_speed=speed, max_acceleration=CARTESIAN_ACCELERATION, **scales,
-        )  # fmt: skip
+        path = CubicSpline(np.linspace(0, 1, count), waypoints)
+        return timed(path, self.dt, Limits(**scales), fastest=speed / length)
 
     # --- Gripper ------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Kinematics of the Franka Panda in closed form, its limits, and motions that respect them.
+"""Kinematics of the Franka Panda in closed form, and its limits.
 
 At the end: `postures`, which of two joint configurations reaches a grasp. The fingers are alike, so
 a gripper pose and the same pose turned by half a turn about the approach (the wrist flip) are one
@@ -10,21 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg.lapack import dposv
 from scipy.spatial.transform import Rotation
 
 from utils.errors import UserError
 
-# Limits of the arm, from Franka Emika's interface specification (Panda).
+# Limits of the arm, from Franka's documentation of its control interface (FCI), Panda.
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # rad
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # rad
 JOINT_VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # rad/s
 JOINT_ACCELERATION = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])  # rad/s^2
+JOINT_JERK = np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0])  # rad/s^3
 JOINT_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # N m
+HAND_VELOCITY = (1.7, 2.5)  # m/s of E, rad/s of the hand
+HAND_ACCELERATION = (13.0, 25.0)  # m/s^2, rad/s^2
+HAND_JERK = (6500.0, 12500.0)  # m/s^3, rad/s^3
 CARTESIAN_ACCELERATION = 6.5  # m/s^2, half of the specified 13, which leaves room for tracking
 
 # Modified (Craig) Denavit-Hartenberg parameters, same specification: a_{i-1}, alpha_{i-1}, d_i.
@@ -111,6 +113,23 @@ def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def geometric_jacobian(q: np.ndarray) -> np.ndarray:
     """(6, 7) Jacobian of E in W: rows v then omega, for joint positions q (7,)."""
     return _chain(q)[1]
+
+
+def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    """(N, 6) velocities of E in W, v then omega, of joint positions and velocities, each (N, 7)."""
+    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
+    p, axes, origins = np.zeros((len(q), 3)), [], []
+    for (a, turn, d), angle in zip(_LINKS, q.T[:, :, None]):
+        p = p + a * x
+        if turn:  # by a right angle about x
+            y, z = turn * z, -turn * y
+        p = p + d * z
+        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+        axes.append(z)
+        origins.append(p)
+    turns = velocities.T[:, :, None] * np.array(axes)
+    arms = p + TOOL_LENGTH * z - np.array(origins)
+    return np.hstack([np.cross(turns, arms).sum(axis=0), turns.sum(axis=0)])
 
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
@@ -222,65 +241,6 @@ class ServoStep:
     def towards(self, target: np.ndarray) -> np.ndarray:
         step = _damped_step(self._jacobian, pose_error(self.reached, target), self.q, None)
         return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Joint references at the control rate: positions (N, 7) rad and velocities (N, 7) rad/s."""
-
-    positions: np.ndarray
-    velocities: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def __getitem__(self, part: slice) -> Trajectory:
-        return Trajectory(self.positions[part], self.velocities[part])
-
-
-def time_path(
-    waypoints: np.ndarray,
-    lengths: np.ndarray,
-    *,
-    dt: float,
-    max_speed: float,
-    max_acceleration: float,
-    velocity_scale: float = 1.0,
-    acceleration_scale: float = 1.0,
-) -> Trajectory:
-    """Run along joint waypoints (M, 7) with a smooth profile that respects every joint's limits.
-
-    lengths (M,) is the path coordinate of each waypoint (metres or any unit); max_speed and
-    max_acceleration bound its first two derivatives. The profile is the quintic
-    s(u) = 10u^3 - 15u^4 + 6u^5, whose peaks are 1.875 L/T and 5.7735 L/T^2; a cubic spline joins
-    the waypoints. The duration is then stretched until the sampled velocities and accelerations
-    are within the limits, curvature included.
-    """
-    total = lengths[-1] - lengths[0]
-    if total < 1e-9:
-        return Trajectory(waypoints[-1:].copy(), np.zeros((1, 7)))
-    share = (lengths - lengths[0]) / total
-    path = CubicSpline(share, waypoints) if len(waypoints) > 2 else None
-    fastest = JOINT_VELOCITY * velocity_scale
-    strongest = JOINT_ACCELERATION * acceleration_scale
-    duration = max(1.875 * total / max_speed, np.sqrt(5.7735 * total / max_acceleration), dt)
-    while True:
-        steps = int(np.ceil(duration / dt))
-        u = np.arange(steps + 1) / steps
-        s = u**3 * (10 - 15 * u + 6 * u**2)
-        if path is None:
-            positions = waypoints[0] + s[:, None] * (waypoints[1] - waypoints[0])
-        else:
-            positions = path(s)
-        velocities = np.diff(positions, axis=0) / dt
-        accelerations = np.diff(velocities, axis=0, prepend=np.zeros((1, 7))) / dt
-        excess = max(
-            float((abs(velocities) / fastest).max()),
-            float(np.sqrt((abs(accelerations) / strongest).max())),
-        )
-        if excess <= 1.0:
-            return Trajectory(positions[1:], velocities)
-        duration = max(duration * excess, (steps + 0.5) * dt)
 
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the wrist flip

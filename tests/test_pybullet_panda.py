@@ -19,6 +19,7 @@ from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from envs.robot_kinematics import (
     GRASP_DEPTH,
     JOINT_ACCELERATION,
+    JOINT_JERK,
     JOINT_LOWER,
     JOINT_TORQUE,
     JOINT_UPPER,
@@ -149,10 +150,17 @@ def test_straight_moves_respect_every_limit(robot):
         start = inverse_kinematics(top_down_pose([x, y, 0.2], rng.uniform(-np.pi, 0)), HOME, HOME)
         target = forward_kinematics(start)
         target[2, 3] = 0.02
-        path = robot.straight_move(start, target, 0.25, HOME)
-        acceleration = np.diff(path.velocities, axis=0, prepend=np.zeros((1, 7))) / robot.dt
-        assert (abs(path.velocities) <= JOINT_VELOCITY * 1.001).all()
-        assert (abs(acceleration) <= JOINT_ACCELERATION * 1.001).all()
+        for speed in (0.25, np.inf):
+            path = robot.straight_move(start, target, speed, HOME)
+            rest = np.zeros((1, 7))
+            acceleration = np.diff(path.velocities, axis=0, prepend=rest, append=rest) / robot.dt
+            jerk = np.diff(acceleration, axis=0, prepend=rest, append=rest) / robot.dt
+            assert (abs(path.velocities) <= JOINT_VELOCITY * 1.001).all()
+            assert (abs(acceleration) <= JOINT_ACCELERATION * 1.001).all()
+            assert (abs(jerk) <= JOINT_JERK * 1.001).all()
+            tips = np.array([forward_kinematics(q)[:3, 3] for q in path.positions])
+            fastest = np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / robot.dt
+            assert fastest <= min(speed, 1.7) * 1.001
 
 
 def _run(robot, trajectory):

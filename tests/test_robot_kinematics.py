@@ -1,4 +1,4 @@
-"""The Panda's kinematics, its limits and motions that respect them, without a simulator."""
+"""The Panda's kinematics and its limits, without a simulator."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from envs.robot_kinematics import (
-    JOINT_ACCELERATION,
     JOINT_LOWER,
     JOINT_UPPER,
-    JOINT_VELOCITY,
     ServoStep,
     UnreachableError,
     forward_kinematics,
@@ -18,7 +16,7 @@ from envs.robot_kinematics import (
     inverse_kinematics,
     pose_error,
     rotation_vector,
-    time_path,
+    tip_twists,
 )
 from utils.transforms import top_down_pose
 
@@ -78,31 +76,9 @@ def test_servo_step_converges_on_a_near_pose():
     assert abs(pose_error(forward_kinematics(q), target)).max() < 1e-4
 
 
-def test_time_path_respects_every_limit():
-    rng = np.random.default_rng(2)
-    dt = 1 / 1000
-    for _ in range(20):
-        ends = rng.uniform(JOINT_LOWER, JOINT_UPPER, (2, 7))
-        path = time_path(
-            ends, np.array([0.0, 1.0]), dt=dt, max_speed=np.inf, max_acceleration=np.inf
-        )
-        acceleration = np.diff(path.velocities, axis=0) / dt
-        assert (abs(path.velocities) <= JOINT_VELOCITY * 1.001).all()
-        assert (abs(acceleration) <= JOINT_ACCELERATION * 1.01).all()
-        np.testing.assert_allclose(path.positions[-1], ends[1])
-        # One limit is touched: the motion is no slower than it has to be.
-        used = max(
-            (abs(path.velocities) / JOINT_VELOCITY).max(),
-            (abs(acceleration) / JOINT_ACCELERATION).max(),
-        )
-        assert used > 0.97
-
-
-def test_velocity_scale_slows_down():
-    ends = np.vstack([HOME, HOME + 0.5])
-    fast, slow = (
-        time_path(ends, np.array([0.0, 1.0]), dt=0.001, max_speed=np.inf, max_acceleration=np.inf,
-                  velocity_scale=s, acceleration_scale=s)
-        for s in (1.0, 0.25)
-    )  # fmt: skip
-    assert len(slow) >= 2 * len(fast) - 1
+@given(joint_positions, joint_positions)
+@settings(max_examples=20, deadline=None)
+def test_twists_are_the_jacobian_times_velocities(q, velocity):
+    q, velocity = np.array(q), np.array(velocity)
+    expected = geometric_jacobian(q) @ velocity
+    np.testing.assert_allclose(tip_twists(q[None], velocity[None])[0], expected, atol=1e-12)
