@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,11 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from envs.cell import Cell
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
+from envs.panda_model import FINGER_FORCE
+from envs.robot import Robot
 from envs.robot_kinematics import (
     HALF_TURN,
     UnreachableError,
     choose_posture,
     forward_kinematics,
+    tip_position,
 )
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError, reaching_down
@@ -32,7 +36,11 @@ from utils.transforms import Grasp, top_down_pose
 
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
-_RELEASE_SECONDS = 0.35  # in which the fingers open and the object falls into the bin
+_LEAST_FRICTION = 0.4  # that a grip counts on
+_HOLD_MARGIN = 1.5  # times the force that this friction needs
+_RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
+_SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
+_CORNER = 0.04  # m of a vertical line's upper end that may be cut off
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
 
 
@@ -56,6 +64,27 @@ class InHandMotion:
         moved = self._pose_in_hand() @ np.linalg.inv(self._gripped)
         self.turned = max(self.turned, float(Rotation.from_matrix(moved[:3, :3]).magnitude()))
         self.slid = max(self.slid, float(np.linalg.norm(moved[[0, 2], 3])))
+
+
+class WeighingGrip:
+    """Presses as hard as the weight needs that the arm feels, and never less than
+    robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one."""
+
+    def __init__(self, robot: Robot):
+        self._robot, self._force = robot, robot.grip_force
+        self._felt: list[float] = []  # N, since the last look
+
+    def feel(self) -> None:
+        """Ask once after every physics step."""
+        self._felt.append(self._robot.external_force())
+
+    def press(self) -> None:
+        """Press as hard as what was felt since the last time needs, or harder."""
+        pull, self._felt = float(np.median(self._felt or [0.0])), []
+        force = min(_HOLD_MARGIN * pull / (2 * _LEAST_FRICTION), FINGER_FORCE)
+        if force > self._force:
+            self._force = force
+            self._robot.command_gripper(0.0, force)
 
 
 @dataclass(frozen=True)
@@ -116,12 +145,38 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     pregrasp[2, 3] += settings.pregrasp_height
     q_pregrasp = choose_posture(pregrasp, cell.home)
     target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
-    approach = _line(cell, q_pregrasp, target)  # planned before anything moves
+    start = cell.robot.q  # all is planned before anything moves
+    reach = cell.robot.joint_move(start, q_pregrasp, **_scales(cell))
+    down = _descent(cell, q_pregrasp, target)
+    corner = _higher_than(target[2, 3] + settings.pregrasp_height - _CORNER, down)
+    way = cell.robot.blended_moves(start, reach, down, corner, **_scales(cell))
 
     cell.robot.command_gripper(grasp.width)
-    _follow(cell, cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)))
-    _follow(cell, approach, stop_force=settings.contact_stop)
+    above = len(way) - len(down)
+    _follow(cell, way[:above])
+    _follow(cell, way[above:], partial(cell.robot.stop_on_contact, settings.contact_stop))
     return ApproachResult(cell.step, target)
+
+
+def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
+    """From joint positions q (7,) straight to `target` (4, 4): quickly, and slowly at the end."""
+    settings = cell.config.execution
+    if settings.pregrasp_height <= _SLOW_HEIGHT:
+        return _line(cell, q, target, settings.approach_speed)
+    near = target.copy()
+    near[2, 3] += _SLOW_HEIGHT
+    quick = _line(cell, q, near)
+    slow = _line(cell, quick.positions[-1], target, settings.approach_speed)
+    # Both are parts of one line, so that no corner is cut. The second one has half of its speed
+    # when the first one ends, so that both together are no faster than the approach.
+    heights = np.array([tip_position(q)[2] for q in slow.positions.tolist()])
+    speeding = int(np.argmax(-np.diff(heights) > settings.approach_speed * cell.dt / 2))
+    return cell.robot.blended_moves(q, quick, slow, speeding, **_scales(cell))
+
+
+def _higher_than(height: float, trajectory: Trajectory) -> int:
+    """The number of references at which E is more than `height` m above the table."""
+    return sum(tip_position(q)[2] > height for q in trajectory.positions.tolist())
 
 
 Approach = Callable[[Cell, Grasp], ApproachResult]
@@ -142,11 +197,11 @@ def check_bin(config: Config) -> None:
 
 
 def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
-    """Approach, close, lift, hold, carry to the bin, release, return home.
+    """Approach, close, lift, carry to the bin, release, return home.
 
     Success: both fingers grip one object, which is off the table with its centre of mass above
-    execution.lift_height for execution.hold_seconds and all the way to the bin (checked every
-    0.05 s). With execution.strict, it also must not turn or slide in the hand on the way (see
+    execution.lift_height all the way to the bin and for execution.hold_seconds at least (checked
+    every 0.05 s). With execution.strict, it also must not turn or slide in the hand on the way (see
     `utils.result_records.loose`). A picked object is retired. The arm is at home at the end of
     every attempt. Raises PhysicsError when the simulation blows up.
 
@@ -155,10 +210,10 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     cell.check_physics()
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
-        held, raised = _grip(cell, grasp, approach)
-        motion = InHandMotion(cell, held)
-        _lift(cell, held, raised, motion)
-        _carry_to_bin(cell, held, motion)
+        raised = _grip(cell, grasp, approach)
+        held = cell.held_object()
+        motion = None if held is None else InHandMotion(cell, held)
+        _carry_to_bin(cell, held, raised, motion)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -169,36 +224,26 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = float(cell.robot.tip_pose()[2, 3])
     detail = "; ".join(filter(None, [detail, _go_home(cell)]))
+    if reason == "success":
+        cell.retire(held)  # in the bin, into which it has fallen meanwhile
     cell.check_physics()
     cell.retire_lost_objects()
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
 
 
-def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> tuple[int, np.ndarray]:
-    """Approach and close: the number of the gripped object, and (4, 4) T_WE to which the arm lifts
-    it. Raises GraspFailure."""
+def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
+    """Approach and close: (4, 4) T_WE to which the arm lifts what it feels between the fingers.
+    Raises GraspFailure."""
     result = approach(cell, grasp)
     _close(cell, result.wait)
     cell.robot.hold()  # a closed loop sends nothing from here on
-    index = cell.held_object()
-    if index is None:
+    if not cell.robot.grips():
         raise GraspFailure("missed")
     lifted = (forward_kinematics(cell.robot.q) if result.pose is None else result.pose).copy()
     # A learned policy plans no grasp: the height at which its hand has closed counts.
     height = max(grasp.position[2], lifted[2, 3], 0.0)
     lifted[2, 3] = height + cell.config.execution.lift_height + 0.05
-    return index, lifted
-
-
-def _lift(cell: Cell, index: int, lifted: np.ndarray, motion: InHandMotion) -> None:
-    """Raise the hand to `lifted` (4, 4) and hold the object there. Raises GraspFailure."""
-    settings = cell.config.execution
-    _follow(cell, _line(cell, cell.robot.q, lifted))
-    if not cell.is_lifted(index, settings.lift_height):
-        raise GraspFailure("slipped")
-    for _ in range(round(settings.hold_seconds / _CHECK_SECONDS)):
-        cell.step(round(_CHECK_SECONDS / cell.dt))
-        _still_lifted(cell, index, motion)
+    return lifted
 
 
 def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
@@ -207,21 +252,37 @@ def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
     motion.look()
 
 
-def _carry_to_bin(cell: Cell, index: int, motion: InHandMotion) -> None:
-    """Carry an object over the bin and let it go. Raises GraspFailure; with execution.strict also
-    where the object has moved in the hand."""
+def _carry_to_bin(
+    cell: Cell, index: int | None, lifted: np.ndarray, motion: InHandMotion | None
+) -> None:
+    """Raise the hand to `lifted` (4, 4) and carry an object over the bin. Raises GraspFailure; with
+    execution.strict also where the object has moved in the hand. index: None where the hand only
+    believes that it holds one."""
+    settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
+    lift = _line(cell, start, lifted)
     posture = choose_posture(top_down_pose(OVER_BIN, -np.pi / 2), cell.home)
-    carry = cell.robot.joint_move(cell.robot.q, posture, **_scales(cell))
-    every = round(_CHECK_SECONDS / cell.dt)
-    for start in range(0, len(carry), every):
-        _follow(cell, carry[start : start + every])
+    carry = robot.joint_move(lift.positions[-1], posture, **_scales(cell))
+    corner = _higher_than(lifted[2, 3] - _CORNER, lift)
+    way = robot.blended_moves(start, lift, carry, corner, **_scales(cell))
+    grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
+    for first in range(0, len(lift), every):
+        _follow(cell, way[first : min(first + every, len(lift))], grip.feel)
+        grip.press()
+    if index is None or motion is None:
+        raise GraspFailure("missed")
+    if not cell.is_lifted(index, settings.lift_height):
+        raise GraspFailure("slipped")
+    end = cell.seconds + settings.hold_seconds
+    for first in range(len(lift), len(way), every):
+        _follow(cell, way[first : first + every], grip.feel)
+        grip.press()
+        _still_lifted(cell, index, motion)
+    while cell.seconds < end:
+        cell.step(every)
         _still_lifted(cell, index, motion)
     moved = loose(motion.turned, motion.slid)
-    if moved and cell.config.execution.strict:
+    if moved and settings.strict:
         raise GraspFailure(moved[0])
-    cell.robot.open_gripper()
-    cell.step(round(_RELEASE_SECONDS / cell.dt))
-    cell.retire(index)
 
 
 def _close(cell: Cell, wait: Callable[[int], None]) -> None:
@@ -239,21 +300,21 @@ def _close(cell: Cell, wait: Callable[[int], None]) -> None:
 def _go_home(cell: Cell) -> str:
     """Open, rise on a straight line if the hand is low, and return to the home posture. Returns a
     remark for the outcome's detail where the arm cannot do so by itself, else an empty text."""
-    robot = cell.robot
+    robot, speed = cell.robot, cell.config.execution.approach_speed
     robot.open_gripper()
-    cell.step(round(0.1 / cell.dt))
+    cell.step(round(_RELEASE_SECONDS / cell.dt))
     T = forward_kinematics(robot.q)
     if T[2, 3] < 0.2:
         up = T.copy()
         up[2, 3] = 0.2
         # Without the line, the joint motion below goes up as well, only less straight.
         with contextlib.suppress(UnreachableError, ArmStoppedError):
-            _follow(cell, _line(cell, robot.q, up))
+            _follow(cell, _line(cell, robot.q, up, speed))
     try:
         try:
             _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
         except ArmStoppedError:  # the joint motion leaves the workspace; a straight line does not
-            _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home)))
+            _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home), speed))
             _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
     except (UnreachableError, ArmStoppedError):
         # An arm stretched to the edge of the workspace can bend its elbow only by leaving it.
@@ -267,8 +328,7 @@ def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ HALF_TURN
 
 
-def _line(cell: Cell, q: np.ndarray, pose: np.ndarray) -> Trajectory:
-    speed = cell.config.execution.approach_speed
+def _line(cell: Cell, q: np.ndarray, pose: np.ndarray, speed: float = np.inf) -> Trajectory:
     return cell.robot.straight_move(q, pose, speed, cell.home, **_scales(cell))
 
 
@@ -280,11 +340,13 @@ def _scales(cell: Cell) -> dict[str, float]:
     }
 
 
-def _follow(cell: Cell, trajectory: Trajectory, stop_force: float | None = None) -> None:
-    """Run a trajectory. Holds the arm and raises ArmStoppedError at a contact above `stop_force` N
-    and where the gate refuses a command."""
+def _follow(
+    cell: Cell, trajectory: Trajectory, after_step: Callable[[], object] | None = None
+) -> None:
+    """Run a trajectory. Raises what `after_step` raises, and ArmStoppedError where the gate refuses
+    a command."""
     for q, velocity in zip(trajectory.positions, trajectory.velocities):
         cell.robot.command_arm(q, velocity)
         cell.step()
-        if stop_force is not None:
-            cell.robot.stop_on_contact(stop_force)
+        if after_step is not None:
+            after_step()

@@ -22,7 +22,7 @@ from envs.panda_model import (
     Link,
     panda_links,
 )
-from envs.robot import FINGER_SPEED, Contact, Robot
+from envs.robot import DRIVE_GAIN, FINGER_SPEED, Contact, Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -266,7 +266,7 @@ class MujocoPanda(Robot):
         if self._speed is None:
             return self._reference
         way = self._goal - self._reference
-        step = np.clip(way, -self._speed * self.dt, self._speed * self.dt)
+        step = np.clip(DRIVE_GAIN * way, -self._speed * self.dt, self._speed * self.dt)
         self._reference = self._reference + step
         target = self._reference + self.damping_time * step / self.dt
         # The servo asks for the velocity (target - q) / damping_time. An arm that is behind, while
@@ -275,6 +275,19 @@ class MujocoPanda(Robot):
         q, reach = self.q, self.damping_time * self._speed
         lower, upper = np.maximum(q - reach, JOINT_LOWER), np.minimum(q + reach, JOINT_UPPER)
         return np.minimum(np.maximum(target, lower), upper)
+
+    # --- What the robot feels -----------------------------------------------------------------
+
+    def external_torques(self) -> np.ndarray:
+        """(7,) N m, of MuJoCo's last step: M a + bias - passive - motors."""
+        data, inertial = self.data, np.zeros(self.model.nv)
+        self._mujoco.mj_mulM(self.model, data, inertial, data.qacc)
+        torques = inertial + data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator
+        return torques[self._speeds[:7]]
+
+    def finger_force(self) -> float:
+        """Newtons a finger with which the motor closes it."""
+        return -float(self.data.actuator_force[7])
 
     # --- Contacts -----------------------------------------------------------------------------
 

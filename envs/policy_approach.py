@@ -68,14 +68,14 @@ class PolicyApproach:
                 action = self.policy({**info, **observation})
                 observation, _, terminated, truncated, info = self.env.step(action)
                 ended = terminated or truncated
-                gripped = gripped + 1 if info["grasped"] else 0
+                gripped = gripped + 1 if cell.robot.grips() else 0
                 if gripped == 1:
                     self.closed_at = _grasp_of(cell)
         finally:
             self.env.hand_over()
         if info["reason"] == "physics":
             raise PhysicsError("the simulation blew up while a policy was acting")
-        if not info["grasped"]:
+        if not gripped:
             self.closed_at = None
             raise GraspFailure("stopped", detail=f"gripped nothing ({info['reason']})")
         return ApproachResult(cell.step, None)

@@ -14,7 +14,7 @@ import numpy as np
 import pybullet
 
 from envs.panda_model import FINGER_DRIVE_INERTIA
-from envs.robot import FINGER_SPEED, LEFT, Contact, Robot
+from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
 from utils.geometry import GripperGeometry
@@ -24,7 +24,7 @@ ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_INERTIA_FROM_FILE
-_POSITION_GAIN, _DRIVE_GAIN, _GRIPPER_GAIN = 0.3, 0.1, 0.2
+_POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
@@ -70,6 +70,7 @@ class PybulletPanda(Robot):
                 self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=client
             )
         self.limit_speed(JOINT_VELOCITY.max())
+        self._felt: tuple[int, tuple, tuple] | None = None  # the clock, positions and velocities
 
     # --- State --------------------------------------------------------------------------------
 
@@ -122,7 +123,7 @@ class PybulletPanda(Robot):
         )  # fmt: skip
 
     def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
-        self._send(self._drive, q.tolist(), speeds, self.position_gain * _DRIVE_GAIN)
+        self._send(self._drive, q.tolist(), speeds, self.position_gain * DRIVE_GAIN)
 
     def _drive(self, q: list[float], speeds: list[float], gain: float) -> None:
         for joint, position, torque, limit in zip(ARM, q, _TORQUES, speeds):
@@ -142,6 +143,28 @@ class PybulletPanda(Robot):
                 maxVelocity=FINGER_SPEED,
                 physicsClientId=self.client,
             )  # fmt: skip
+
+    # --- What the robot feels -----------------------------------------------------------------
+
+    def external_torques(self) -> np.ndarray:
+        """(7,) N m. Bullet integrates M(q) (v' - v) / dt = motors + external - bias(q, v), where q
+        and v are those before the step."""
+        states = pybullet.getJointStates(self.body, _STATE_JOINTS, physicsClientId=self.client)
+        q, velocities, _, motors = zip(*states)
+        before, self._felt = self._felt, (self._clock, q, velocities)
+        if before is None or before[0] != self._clock - 1:
+            return np.zeros(7)
+        accelerations = (np.array(velocities) - before[2]) / self.dt
+        expected = pybullet.calculateInverseDynamics(
+            self.body, list(before[1]), list(before[2]), accelerations.tolist(),
+            physicsClientId=self.client,
+        )  # fmt: skip
+        return np.array(expected[:7]) - motors[:7]
+
+    def finger_force(self) -> float:
+        """Newtons a finger with which the motors close it."""
+        states = pybullet.getJointStates(self.body, FINGERS, physicsClientId=self.client)
+        return -sum(state[3] for state in states) / 2
 
     # --- Contacts -----------------------------------------------------------------------------
 

@@ -20,14 +20,18 @@ from scipy.spatial.transform import Rotation
 from envs.robot_kinematics import (
     UnreachableError,
     forward_kinematics,
+    geometric_jacobian,
     inverse_kinematics,
     rotation_vector,
 )
-from envs.robot_motion import Limits, Trajectory, timed
+from envs.robot_motion import Limits, Trajectory, blended, timed
 from envs.robot_safety import ArmGate, ArmStoppedError, contact_reason
 from utils.geometry import GripperGeometry
 
 FINGER_SPEED = 0.05  # m/s a finger, from the Franka Hand's product manual
+DRIVE_GAIN = 0.1  # share of the way left that the arm covers in a period near the end of a drive
+GRIPPED_OPENING = 0.001  # m by which something between closed fingers has to part them
+GRIPPED_SHARE = 0.5  # of the commanded force with which the motor has to press on it
 GRIP_COSINE = np.cos(np.radians(70))  # of the steepest contact normal that counts as a grip
 LEFT, RIGHT = 0, 1  # fingers; the left one is on the side of E's +y axis
 
@@ -52,6 +56,7 @@ class Robot(ABC):
         self.dt, self.gripper, self.grip_force, self.gate = dt, gripper, grip_force, gate
         self.latency = 0
         self._clock = 0  # physics steps
+        self._told_force = grip_force  # N a finger, of the last command to the gripper
         self._underway: deque[tuple[int, Callable[[], object]]] = deque()  # by time of arrival
 
     # --- State --------------------------------------------------------------------------------
@@ -111,8 +116,8 @@ class Robot(ABC):
 
     def drive_arm_to(self, q: np.ndarray, speed: float = np.inf) -> None:
         """Motor targets for several periods: the motors go to q (7,) no faster than the limits,
-        nor than `speed` rad/s. Raises ArmStoppedError, and sends nothing, where the gate refuses
-        q."""
+        nor than `speed` rad/s, and ever slower near the end (DRIVE_GAIN). Raises ArmStoppedError,
+        and sends nothing, where the gate refuses q."""
         self.gate.admit(q)
         self._drive_arm(q, [min(limit, speed) for limit in self.gate.speeds])
 
@@ -122,7 +127,7 @@ class Robot(ABC):
 
     def stop_on_contact(self, limit: float) -> None:
         """Hold the arm and raise ArmStoppedError if more than `limit` newtons press against it."""
-        reason = contact_reason(self.contact_force(), limit)
+        reason = contact_reason(self.external_force(), limit)
         if reason is not None:
             self.hold()
             raise ArmStoppedError(reason, contact=True)
@@ -172,6 +177,37 @@ class Robot(ABC):
         self.command_gripper(opening)
         self.latency = latency
 
+    # --- What the robot feels -----------------------------------------------------------------
+
+    def external_force(self) -> float:
+        """Newtons with which things press on the hand, by the torques that the joints feel.
+
+        The force of the wrench at E that explains the external torques best, as libfranka's
+        O_F_ext_hat_K. Forces on the hand that cancel are not felt, nor are an object's weight and
+        what presses on the arm told apart. Ask after every physics step: the first time, and after
+        a pause, nothing is felt.
+        """
+        torques = self.external_torques()
+        if not torques.any():
+            return 0.0
+        wrench = np.linalg.lstsq(geometric_jacobian(self.q).T, torques, rcond=None)[0]
+        return float(np.linalg.norm(wrench[:3]))
+
+    @abstractmethod
+    def external_torques(self) -> np.ndarray:
+        """(7,) N m on the arm's joints in the last physics step that neither the motors nor the
+        motion of the nominal robot explain; zero where there is no step to compare with."""
+
+    def grips(self) -> bool:
+        """Whether the fingers feel something between them: they are apart, and their motor presses
+        with half of what it was told at least. True contacts are not asked."""
+        pressing = self.finger_force() >= GRIPPED_SHARE * self._told_force
+        return pressing and self.opening > GRIPPED_OPENING
+
+    @abstractmethod
+    def finger_force(self) -> float:
+        """Newtons a finger with which the hand's motor closes it; negative where it opens it."""
+
     # --- Motions ------------------------------------------------------------------------------
 
     def joint_move(self, start: np.ndarray, goal: np.ndarray, **scales: float) -> Trajectory:
@@ -207,12 +243,20 @@ class Robot(ABC):
         path = CubicSpline(np.linspace(0, 1, count), waypoints)
         return timed(path, self.dt, Limits(**scales), fastest=speed / length)
 
+    def blended_moves(
+        self, start: np.ndarray, first: Trajectory, second: Trajectory, most: int, **scales: float
+    ) -> Trajectory:
+        """Two moves, the corner between them cut by up to `most` control periods, see
+        `envs.robot_motion.blended`."""
+        return blended(start, first, second, self.dt, Limits(**scales), most)
+
     # --- Gripper ------------------------------------------------------------------------------
 
     def command_gripper(self, opening: float, force: float | None = None) -> None:
         """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
         opening = min(max(float(opening), 0.0), self.max_opening)
-        self._send_gripper(opening, self.grip_force if force is None else force)
+        self._told_force = self.grip_force if force is None else force
+        self._send_gripper(opening, self._told_force)
 
     def open_gripper(self) -> None:
         """Drive both fingers apart as far as they get."""
@@ -256,7 +300,7 @@ class Robot(ABC):
 
     @abstractmethod
     def contact_force(self) -> float:
-        """Sum of the normal forces in newtons on the whole robot."""
+        """Sum of the normal forces in newtons on the whole robot, by the true contacts."""
 
     @abstractmethod
     def touches(self) -> bool:

@@ -22,6 +22,8 @@ from envs.robot_kinematics import (
     HAND_VELOCITY,
     JOINT_ACCELERATION,
     JOINT_JERK,
+    JOINT_LOWER,
+    JOINT_UPPER,
     JOINT_VELOCITY,
     tip_twists,
 )
@@ -159,6 +161,26 @@ def timed(
         if excess <= _ROUNDING:
             return _trajectory(start, positions, dt)
         periods = max(math.ceil(periods * excess), periods + 1)
+
+
+def blended(
+    start: np.ndarray, first: Trajectory, second: Trajectory, dt: float, limits: Limits, most: int
+) -> Trajectory:
+    """Two motions, the second one starting up to `most` periods before the first has ended, as
+    early as the limits allow.
+
+    start: (7,) rad, where the first motion starts at rest. The second one starts where the first
+    ends. Where both are under way their changes add up, so that the corner between them is cut.
+    """
+    change = second.positions - first.positions[-1]
+    waiting = np.broadcast_to(first.positions[-1], change.shape)
+    for early in range(min(most, len(first), len(second)), -1, -1):
+        positions = np.vstack([first.positions, waiting[early:]])
+        positions[len(first) - early :] += change
+        within = (positions >= JOINT_LOWER).all() and (positions <= JOINT_UPPER).all()
+        if within and limits.excess(start, positions, dt) <= _ROUNDING:
+            break
+    return _trajectory(start, positions, dt)
 
 
 def _trajectory(start: np.ndarray, positions: np.ndarray, dt: float) -> Trajectory:

@@ -40,7 +40,7 @@ class ServoArm:
         """
         q = self.robot.q
         verdict = self.gate.check(
-            desired, q, self.robot.contact_force(), perception_age, self._velocity
+            desired, q, self.robot.external_force(), perception_age, self._velocity
         )
         if verdict.reason is not None:
             self._hold()

@@ -84,6 +84,19 @@ def test_a_bar_that_turns_in_the_hand_is_reported(config, box_set):
     assert centred.motion.slid < 0.005
 
 
+@pytest.mark.parametrize("mass", [0.1, 1.2])
+def test_the_grip_follows_the_weight(config, box_set, mass, cell):
+    """10 N a finger hold 1.02 kg by a friction of 0.5, and less while it is lifted."""
+    model = solid(box_set[0], NativeShape("box", (0.06, 0.05, 0.05)), mass, 0.5)
+    cell.load(Scene("isolated", 0, (Placement(model, np.array([0.5, 0.0, 0.025]), np.eye(4)[3]),)))
+    forces, send = [], cell.robot._send_gripper
+    cell.robot._send_gripper = lambda opening, force: (forces.append(force), send(opening, force))
+    outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.025]), np.pi / 2, 0.07, 1.0))
+    assert outcome.reason == "success" and outcome.motion.slid < 0.01
+    needed = mass * G / (2 * 0.5)
+    assert max(forces) == 10.0 if mass < 0.5 else needed < max(forces) < 4 * needed
+
+
 @pytest.mark.parametrize(
     ("kind", "force", "off", "holds"),
     [("box", 10.0, 0.02, True), ("box", 30.0, 0.045, True), ("box", 10.0, 0.07, False),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, geometric_jacobian
-from envs.robot_motion import Limits, SCurve, timed
+from envs.robot_motion import Limits, SCurve, blended, timed
 
 HOME = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 DT = 1 / 240
@@ -91,6 +91,39 @@ def test_joint_moves_are_no_slower_than_they_have_to_be(goal):
     trajectory = move(HOME, np.array(goal))
     if len(trajectory) > 50:
         assert shares_of_limits(HOME, trajectory).max() > 0.93
+
+
+@given(joint_positions, joint_positions, joint_positions, st.integers(0, 60))
+@settings(max_examples=25, deadline=None)
+def test_blended_moves_respect_every_limit(start, corner, goal, most):
+    start, corner, goal = map(np.array, (start, corner, goal))
+    first, second = move(start, corner), move(corner, goal)
+    way = blended(start, first, second, DT, Limits(), most)
+    saved = len(first) + len(second) - len(way)
+    assert 0 <= saved <= most
+    np.testing.assert_array_equal(
+        way.positions[: len(first) - saved], first.positions[: len(first) - saved]
+    )
+    np.testing.assert_allclose(way.positions[-1], goal, atol=1e-9)
+    assert (way.positions >= JOINT_LOWER).all() and (way.positions <= JOINT_UPPER).all()
+    assert (shares_of_limits(start, way) <= 1.0001).all()
+
+
+def test_moves_of_different_joints_are_blended_all_the_way():
+    """Each may take a tenth of the limits, and both together two tenths."""
+    slow = {"velocity_scale": 0.1, "acceleration_scale": 0.1}
+    corner = HOME + np.array([0, 0, 0, 0, 0, 0, 0.5])
+    goal = corner + np.array([0.1, 0, 0, 0, 0, 0, 0])
+    first, second = move(HOME, corner, **slow), move(corner, goal, **slow)
+    most = len(second) // 2
+    way = blended(HOME, first, second, DT, Limits(velocity_scale=0.2, acceleration_scale=0.2), most)
+    assert len(way) == len(first) + len(second) - most
+
+
+def test_moves_that_may_not_be_blended_stop_at_the_corner():
+    first, second = move(HOME, HOME + 0.3), move(HOME + 0.3, HOME)
+    way = blended(HOME, first, second, DT, Limits(), most=0)
+    np.testing.assert_allclose(way.positions, np.vstack([first.positions, second.positions]))
 
 
 def test_a_joint_alone_takes_the_time_of_the_closed_form():
