@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 
 import pytest
 import torch
 
-from utils.distributed import ALONE, Team, choose_device, stop_on_interrupt, team
+from utils import distributed
+from utils.distributed import ALONE, Team, choose_device, new_prefix, stop_on_interrupt, team
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 
 
 @pytest.mark.parametrize("name", ["gpu", "cpu0x", "meta", "mps", ""])
@@ -56,21 +63,84 @@ def test_a_process_takes_its_gpu_before_it_talks_to_the_others(monkeypatch):
 
     def init(backend, store, rank, world_size):
         calls.append(backend)
-        store.set("address", "of this attempt")
+        store.set("address", "of this start")
         assert (rank, world_size) == (1, 2)
 
     kept = torch.distributed.HashStore()
     met = iter([(kept, 1, 2)])
     monkeypatch.setattr(torch.distributed, "rendezvous", lambda url: met)
+    monkeypatch.setattr(distributed, "new_prefix", lambda store, rank, ranks: "third start")
     monkeypatch.setattr(torch.distributed, "init_process_group", init)
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
     monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: None)
-    started_again = {"WORLD_SIZE": "2", "LOCAL_RANK": "1", "TORCHELASTIC_RESTART_COUNT": "3"}
-    with team("cuda", started_again) as us:
+    with team("cuda", {"WORLD_SIZE": "2", "LOCAL_RANK": "1"}) as us:
         assert us == Team(1, 2, torch.device("cuda", 1))
     assert calls == [torch.device("cuda", 1), "nccl"]
-    # torchrun keeps the store: what one attempt writes there, the next one must not read.
-    assert not kept.check(["address"]) and kept.get("attempt 3/address") == b"of this attempt"
+    # torchrun keeps the store: what one start writes there, the next one must not read.
+    assert not kept.check(["address"]) and kept.get("third start/address") == b"of this start"
+
+
+def test_the_processes_of_each_start_agree_on_a_new_prefix():
+    """In the one store, with fewer or more of them, in any order, and after a start that failed."""
+    store = torch.distributed.HashStore()
+    seen = set()
+    for ranks in (3, 2, 4):
+        store.set("hello 1", "of a process that was lost")
+        with ThreadPoolExecutor(ranks) as threads:
+            calls = [threads.submit(new_prefix, store, rank, ranks) for rank in range(ranks)]
+            (prefix,) = {call.result(timeout=30) for call in calls[::-1]}
+        assert prefix not in seen
+        seen.add(prefix)
+
+
+def test_a_process_that_does_not_come_is_an_error():
+    store = torch.distributed.HashStore()
+    store.set_timeout(timedelta(seconds=0.1))
+    with pytest.raises(torch.distributed.DistStoreError, match="not all of 2 processes"):
+        new_prefix(store, 0, 2)
+
+
+TRAINING = """
+import os, signal, sys, time
+from pathlib import Path
+from utils.distributed import team
+
+print("start", flush=True)
+with team("cpu", os.environ) as us:
+    mark = Path(sys.argv[1])
+    first = not mark.exists()
+    us.wait()
+    if first:
+        if us.rank == 1:
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(60)  # as NCCL waits for a process that is lost
+    print("sum", us.concatenate([us.rank]), flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+def test_two_nodes_meet_again_after_one_has_lost_a_process(tmp_path):
+    """torchrun counts that as a restart on the one node and not on the other."""
+    (tmp_path / "training.py").write_text(TRAINING)
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--max-restarts=1",
+        "--rdzv-backend=c10d", f"--rdzv-endpoint={tmp_path}/store", "--rdzv-conf=store_type=file",
+        "--local-addr=127.0.0.1", "training.py", "mark",
+    ]  # fmt: skip
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)}
+    nodes = [
+        subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    try:
+        for printed in [node.communicate(timeout=120)[0] for node in nodes]:
+            assert printed.split("\n") == ["start", "start", "sum [0, 1]", ""]
+    finally:
+        for node in nodes:
+            node.terminate()  # and its processes with it
+            node.wait(30)
 
 
 def test_errors_name_the_key_of_the_script():

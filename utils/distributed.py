@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +25,8 @@ from torch import nn
 from utils.config import Config
 from utils.errors import UserError
 from utils.runs import new_run_folder, run_of_job
+
+MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
 
 
 class Team(NamedTuple):
@@ -114,15 +118,39 @@ def team(device: str, environment: Mapping[str, str], key: str = "train.device")
     # torchrun keeps its store when it starts the processes again: without a prefix they would find
     # the addresses of those that are gone, and fail or wait for ever.
     store, rank, _ = next(dist.rendezvous("env://"))
-    attempt = environment.get("TORCHELASTIC_RESTART_COUNT", "0")
     dist.init_process_group(
         "nccl" if chosen.type == "cuda" else "gloo",
-        store=dist.PrefixStore(f"attempt {attempt}", store), rank=rank, world_size=ranks,
+        store=dist.PrefixStore(new_prefix(store, rank, ranks), store), rank=rank, world_size=ranks,
     )  # fmt: skip
     try:
         yield Team(dist.get_rank(), ranks, chosen)
     finally:
         dist.destroy_process_group()
+
+
+def new_prefix(store: dist.Store, rank: int, ranks: int) -> str:
+    """A prefix for keys that all processes of this start agree on, and none of an earlier start.
+
+    torchrun gives them none: each machine counts its own restarts. So every process leaves a random
+    name in the store, and the main process answers each name that it reads with its own, which is
+    the prefix, until all have come. Names that earlier processes left are answered too, but nobody
+    reads that. Raises DistStoreError if a process does not come within the store's timeout.
+    """
+    own = uuid.uuid4().hex
+    if rank > 0:
+        store.set(f"hello {rank}", own)
+        prefix = store.get(f"answer to {own}").decode()
+        store.add(f"arrived at {prefix}", 1)
+        return prefix
+    deadline = time.monotonic() + store.timeout.total_seconds()
+    while store.add(f"arrived at {own}", 0) < ranks - 1:
+        if time.monotonic() > deadline:
+            raise dist.DistStoreError(f"not all of {ranks} processes have started")
+        for other in range(1, ranks):
+            if store.check([f"hello {other}"]):
+                store.set(f"answer to {store.get(f'hello {other}').decode()}", own)
+        time.sleep(MEETING_SECONDS)
+    return own
 
 
 def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> torch.device:
