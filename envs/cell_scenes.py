@@ -32,9 +32,10 @@ DENSE_COUNT = 15
 _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the table
 _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
 _PILE_WALLS = {"half_size": 0.12, "height": 0.30, "thickness": 0.02}  # m
-# m, around the default workspace: the overhead camera, 0.8 m up, sees their outer edges at
-# 0.16 x 0.8 / 0.7 = 0.183 m from the middle, and the image ends at 0.2 m.
-_WALL_HEIGHT, _WALL_THICKNESS = 0.10, 0.01
+# m, of the layout bin. Around the default workspace the overhead camera, 0.8 m up, sees the inner
+# edges of the walls' tops at 0.17 x 0.8 / 0.7 = 0.194 m from the middle; the image ends at 0.2 m.
+# In a narrower bin more objects lie in corners, for which the hand, 0.21 m long, is too wide.
+_WALL_HEIGHT, _WALL_THICKNESS, _WALL_GAP = 0.10, 0.01, 0.02
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
 _PACKED_GAP = 0.004  # m, least distance between neighbours
 _TRIES = 50
@@ -94,8 +95,8 @@ def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:
 
 
 def _walls_around(config: Config) -> Iterator[Box]:
-    """Walls on the edges of the workspace."""
-    centre, half_size = np.array(config.workspace.center), config.workspace.size / 2
+    """Walls around the workspace, _WALL_GAP from its edges."""
+    centre, half_size = np.array(config.workspace.center), config.workspace.size / 2 + _WALL_GAP
     return square_walls(centre, half_size, _WALL_HEIGHT, _WALL_THICKNESS)
 
 

@@ -154,7 +154,7 @@ def dense_candidates(
             slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
         )
         inside = heights.label[heights.index(at_inside)]
-        arm = np.abs((heights.centres[inside, :2] - xy) @ across)
+        arm = np.abs((heights.centres[np.maximum(inside, -1), :2] - xy) @ across)
         rise = turned[row, first] - tip
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
         score *= (

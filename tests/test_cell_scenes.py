@@ -79,7 +79,7 @@ def test_packed_objects_stand_apart(primitives, laid_out):
 
 
 def test_the_walls_of_a_bin_hold_what_is_in_it(primitives, laid_out):
-    """All of every object is between the walls, which stand on the edges of the workspace."""
+    """All of every object is between the walls, which stand 2 cm outside the workspace."""
     workspace = laid_out.workspace
     for seed in (3, 4):
         scene = make_scene("bin", primitives, seed, laid_out)
@@ -88,13 +88,13 @@ def test_the_walls_of_a_bin_hold_what_is_in_it(primitives, laid_out):
                 (w.position + s * w.half_size)[axis] for w in scene.walls for s in (-1, 1)
             )
             assert np.subtract(edges, workspace.center[axis])[[0, 1, -2, -1]] == pytest.approx(
-                [-0.16, -0.16, 0.16, 0.16]
+                [-0.18, -0.18, 0.18, 0.18]
             )
         assert [wall.position[2] + wall.half_size[2] for wall in scene.walls] == [0.1] * 4
         for placed in scene.placements:
             turn = Rotation.from_quat(placed.quaternion)
             corners = placed.position + turn.apply(np.concatenate(placed.model.parts))
-            assert np.abs(corners[:, :2] - workspace.center).max() < workspace.size / 2 + 1e-3
+            assert np.abs(corners[:, :2] - workspace.center).max() < workspace.size / 2 + 0.021
 
 
 def test_a_cube_on_a_table(box_set, laid_out):
