@@ -103,7 +103,7 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     make = partial(_make_shard, config, folder.absolute())
     try:
         with (
-            open_executor(config.compute, config.data.workers, ranks) as workers,
+            open_executor(config.compute, config.data.workers) as workers,
             tqdm(
                 total=len(missing) * SCENES_PER_SHARD * FRAMES_PER_SCENE, unit="frame", desc="data"
             ) as progress,

@@ -8,7 +8,6 @@ workers. This module does not know how the images are made.
 from __future__ import annotations
 
 import math
-import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -36,6 +35,7 @@ from utils.distributed import Team
 from utils.errors import UserError
 from utils.grasp_data import SimulatedDataset
 from utils.grasp_labels import ANGLE_BINS
+from utils.runs import usable_cpus
 
 CROP = 160  # pixels, side of a training example: all context that the network uses, half the work
 
@@ -168,7 +168,7 @@ def epoch_loader(
         len(data.train), config.train.batch_size, config.seed, epoch, skip, team.rank, team.ranks
     )
     workers = config.train.workers
-    workers = max(1, (os.cpu_count() or 1) // team.ranks) if workers is None else workers
+    workers = usable_cpus() if workers is None else workers
     return DataLoader(
         data.train,
         batch_sampler=sampler,

@@ -26,6 +26,7 @@ from utils.runs import (
     run_of_job,
     run_script,
     save_results,
+    usable_cpus,
     write_atomic,
     write_json_atomic,
 )
@@ -85,6 +86,20 @@ def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, mo
     monkeypatch.setattr(os, "fsync", fsync)
     write_atomic(path, b"afterwards")
     assert on_disk == [(path.stat().st_ino, 10, b"before")]
+
+
+def test_cpus_are_those_of_this_job_shared_by_the_processes_of_this_machine(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(16)), raising=False)
+    monkeypatch.setenv("WORLD_SIZE", "64")
+    assert usable_cpus() == 16
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "8")
+    assert usable_cpus() == 2
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "32")
+    assert usable_cpus() == 1
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "8")
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert usable_cpus() == 16
 
 
 def test_json_refuses_nan(tmp_path):

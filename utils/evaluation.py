@@ -7,7 +7,6 @@ is an argument: this module knows neither cells nor planners.
 
 from __future__ import annotations
 
-import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -30,7 +29,7 @@ from utils.result_records import (
     policy_name,
     read_rounds,
 )
-from utils.runs import write_atomic
+from utils.runs import usable_cpus, write_atomic
 
 # Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
 FREE_TO_CHANGE = (
@@ -184,7 +183,7 @@ def describe_workers(config: Config) -> str:
     """Where the rounds are played, such as 'x86_64 CPU, 8 workers'."""
     scheduler, count = config.compute.scheduler, config.evaluate.workers
     if scheduler is None:
-        return f"{platform.machine()} CPU, {count or os.cpu_count() or 1} workers"
+        return f"{platform.machine()} CPU, {count or usable_cpus()} workers"
     return f"the cluster of {scheduler}, {count or 'all'} workers"
 
 

@@ -40,6 +40,7 @@ from typing import Any, TypeVar
 from utils.config_schema import ComputeConfig
 from utils.errors import UserError
 from utils.plugins import loaded_modules
+from utils.runs import usable_cpus
 from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_environment
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
@@ -77,21 +78,18 @@ class Workers(Executor):
 
 
 @contextmanager
-def open_executor(
-    compute: ComputeConfig, workers: int | None = None, ranks: int = 1
-) -> Iterator[Workers]:
+def open_executor(compute: ComputeConfig, workers: int | None = None) -> Iterator[Workers]:
     """Give an executor: the scheduler's cluster, or local processes where no scheduler is named.
 
-    workers: calls under way at a time; None for all workers of the cluster, or one for each CPU.
-    ranks: main processes, of which this is one, that share the CPUs.
+    workers: calls under way at a time; None for all workers of the cluster, or one for each CPU
+    that this process may use.
     At the end of the context local processes finish the calls under way; a cluster forgets them.
     Raises UserError for a scheduler that cannot be reached or is lost, and for a worker that would
     not compute what this process computes; LostWorkerError for a call that ends every worker.
     """
     job = Job(uuid.uuid4().hex, compute.timeout)
     if compute.scheduler is None:
-        count = workers or max(1, (os.cpu_count() or 1) // ranks)
-        with worker_environment(), _Processes(count, job) as processes:
+        with worker_environment(), _Processes(workers or usable_cpus(), job) as processes:
             yield processes
     else:
         with _cluster(compute.scheduler, workers, job) as cluster:

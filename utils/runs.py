@@ -306,6 +306,15 @@ def environment() -> dict[str, Any]:
     }
 
 
+def usable_cpus() -> int:
+    """The CPUs for the workers of this process: those that the system lets it use, as a scheduler's
+    job or `taskset` may limit them, shared with the other processes of `torchrun` on this machine;
+    at least 1."""
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux alone has it
+    count = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    return max(1, count // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+
+
 def git_state(folder: Path = REPOSITORY) -> GitState:
     """The commit of the repository that holds `folder`; never raises."""
     commit = _git(folder, "rev-parse", "--verify", "HEAD")
