@@ -1,10 +1,12 @@
 """What a worker process keeps, and what it must have in common with the main process."""
 
+from importlib.metadata import version
+
 import pytest
 
 from utils import worker_process
 from utils.errors import UserError
-from utils.worker_process import Job, facts_of, kept, work
+from utils.worker_process import Job, check, facts_of, kept, work
 
 
 class Cell:
@@ -34,6 +36,19 @@ def test_what_is_kept_is_made_once_for_a_job_and_closed_after_it():
     assert other.name == "y" and Cell.open == 2
     assert work(Job("b", 60.0), lambda: cell_of("x")) is not cells[0]
     assert Cell.open == 1
+
+
+def test_packages_that_make_the_bits_are_compared():
+    """Images, meshes and shards; the names are those of requirements.txt."""
+    makers = {"opencv-python-headless", "pillow", "trimesh", "coacd", "manifold3d", "h5py"}
+    facts = facts_of([])
+    assert makers <= set(facts)
+    assert all(facts[name] == version(name) for name in makers)
+
+
+def test_a_worker_that_does_not_know_a_fact_is_refused():
+    with pytest.raises(UserError, match="a package of tomorrow is missing there and 1.0 here"):
+        check({"a package of tomorrow": "1.0"})
 
 
 def test_a_plug_in_is_known_by_the_content_of_its_module(tmp_path, monkeypatch):

@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PACKAGES = (
+PACKAGES = (  # whose versions may change a result
     "numpy", "scipy", "torch", "torchvision", "pybullet", "mujoco", "gymnasium", "pydantic",
+    "opencv-python-headless", "pillow", "trimesh", "coacd", "manifold3d", "pycollada", "yourdfpy",
+    "h5py",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
