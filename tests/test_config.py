@@ -298,7 +298,9 @@ def test_a_hostile_file_is_one_sentence(tmp_path, text):
         {"evaluate": {"policies": ["heuristic", "antigravity:plan"]}},
         {"evaluate": {"object_sets": ["antigravity:objects"]}},
         {"evaluate": {"policies": ["sb3:antigravity.zip"]}},
+        {"evaluate": {"object_sets": {"antigravity:objects"}}},
         {"transfer": {"policies": [["x", "no", "antigravity:plan", None, None]]}},
+        {"transfer": {"policies": [["x", "no", "y.pt", ["pile", "antigravity:objects"], None]]}},
     ],
 )
 def test_a_file_of_data_names_no_code(stored):
@@ -307,10 +309,26 @@ def test_a_file_of_data_names_no_code(stored):
         ConfigError, match="FILE: names code to run, .*antigravity.*name it yourself"
     ):
         load_foreign(stored, "FILE")
-    key, name = next(code_named_in(stored))
+    key, name = next(code_named_in(stored), ("", ""))
     if key in ("rl.env_id", "env.objects", "camera.depth_noise"):
         assert load_foreign(stored, "FILE", [f"{key}={name}"])
     assert "antigravity" not in sys.modules
+
+
+def test_ppo_is_a_checkpoint_among_the_policies_and_a_module_elsewhere():
+    def row(planner, objects):
+        return [["x", "no", planner, ["pile", objects], None]]
+
+    load_foreign({"evaluate": {"policies": ["ppo:mine.pt"]}}, "FILE")
+    load_foreign({"transfer": {"policies": row("ppo:mine.pt", "primitives")}}, "FILE")
+    for stored in (
+        {"camera": {"depth_noise": "ppo:Noise"}},
+        {"env": {"objects": "ppo:objects"}},
+        {"evaluate": {"object_sets": ["ppo:objects"]}},
+        {"transfer": {"policies": row("heuristic", "ppo:objects")}},
+    ):
+        with pytest.raises(ConfigError, match="FILE: names code to run, .*'ppo:"):
+            load_foreign(stored, "FILE")
 
 
 def test_a_file_of_data_does_not_say_where_to_compute_and_to_write():

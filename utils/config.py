@@ -145,18 +145,20 @@ def load_foreign(stored: Mapping[str, Any], source: str, overrides: Sequence[str
     """
     given = values_of(overrides)
     kept = _without(stored, FOREIGN_KEYS)
+    layers = [Layer(str(DEFAULTS), _defaults()), Layer(source, kept), Layer("command line", given)]
+    try:
+        config = Config.model_validate(_merged(layer.values for layer in layers))
+    except ValidationError as error:
+        raise ConfigError(explain(error, layers)) from error
     named = {name for _, name in code_named_in(given)}
-    for key, name in code_named_in(_merge(kept, given)):
+    # Of the config, not of the data: a set in these becomes a list there.
+    for key, name in code_named_in(config.model_dump()):
         if name not in named:
             raise ConfigError(
                 f"{source}: names code to run, {key}: {name!r}, which no file of data may do; if "
-                f"you trust it, name it yourself: {key}={name}"
+                f"you trust it, name it yourself: {key.partition('[')[0]}={name}"
             )
-    layers = [Layer(str(DEFAULTS), _defaults()), Layer(source, kept), Layer("command line", given)]
-    try:
-        return Config.model_validate(_merged(layer.values for layer in layers))
-    except ValidationError as error:
-        raise ConfigError(explain(error, layers)) from error
+    return config
 
 
 def with_settings(config: Config, section: str, settings: Mapping[str, Any]) -> Config:

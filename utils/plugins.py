@@ -19,7 +19,8 @@ from typing import Any
 from utils.errors import UserError, did_you_mean, one_line
 
 IMPORT_PATH = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$"
-
+# A list of policies, and the planners in a table of them: here `ppo:FILE.pt` is a checkpoint.
+POLICY_KEYS = ("evaluate.policies", "transfer.policies[2]")
 
 _loaded: set[str] = set()
 
@@ -39,12 +40,14 @@ def names_code(key: str, name: str) -> bool:
     (a Gymnasium id `MODULE:ID` is one), or a policy that is unpickled."""
     if key == "rl.env_id":
         return ":" in name
-    return name.startswith("sb3:") or is_import_path(name) and not name.startswith("ppo:")
+    if key in POLICY_KEYS and name.startswith("ppo:"):
+        return False
+    return name.startswith("sb3:") or is_import_path(name)
 
 
 def code_named_in(values: Any, key: str = "") -> Iterator[tuple[str, str]]:
     """Dotted key and text of all that would run code in the plain data of a config; the terms of a
-    reward are keys of a mapping."""
+    reward are keys of a mapping. In a list of lists, such as a table, [COLUMN] ends the key."""
     if isinstance(values, dict):
         for name, value in values.items():
             if isinstance(name, str) and names_code(key, name):
@@ -52,7 +55,11 @@ def code_named_in(values: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from code_named_in(value, f"{key}.{name}" if key else str(name))
     elif isinstance(values, list | tuple):
         for value in values:
-            yield from code_named_in(value, key)
+            if isinstance(value, list | tuple):
+                for column, entry in enumerate(value):
+                    yield from code_named_in(entry, f"{key}[{column}]")
+            else:
+                yield from code_named_in(value, key)
     elif isinstance(values, str) and names_code(key, values):
         yield key, values
 
