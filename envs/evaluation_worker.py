@@ -6,7 +6,7 @@ which is reset for every round.
 
 from __future__ import annotations
 
-import os
+import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -116,11 +116,15 @@ def work(config: Config, task: Task) -> TaskResult:
             )
         )  # fmt: skip
         if film is not None:
-            who = policy.replace(os.sep, "_")  # a checkpoint's path
-            name = f"{task.scenario}-{Path(task.objects).name}-{who}-{task.seed}"
-            name = f"{name}.{config.evaluate.film_format}"
+            name = film_name(task, policy, config.evaluate.film_format)
             with TemporaryDirectory() as folder:  # the run's folder may be on another machine
                 film.write(Path(folder) / name)
                 content = (Path(folder) / name).read_bytes()
             result.films.append(FilmFile(name, content, f"{policy} on {task.scenario}"))
     return result
+
+
+def film_name(task: Task, policy: str, suffix: str) -> str:
+    """A file's name on every system: policies and object sets may be paths or MODULE:NAME."""
+    stem = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}"
+    return re.sub(r"[^\w.+-]", "_", stem) + f".{suffix}"
