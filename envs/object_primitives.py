@@ -1,5 +1,5 @@
-"""Procedural solids: eleven families and four that no training sees, each object determined by its
-index alone.
+"""Procedural solids: eleven families, four that no training sees, and four of thin and dark things,
+each object determined by its index alone.
 
 A hand that opens 0.08 m can grasp every one of them in every resting pose: across the whole, across
 a bar, or across a wall with one finger inside. This module knows no simulator.
@@ -17,9 +17,13 @@ FAMILIES = (
     "box", "cylinder", "sphere", "capsule", "L", "T", "U", "cross", "ring", "bowl", "mug",
 )  # fmt: skip
 UNSEEN_FAMILIES = ("frustum", "wedge", "Z", "dumbbell")
+# What a depth camera sees worst, and photographs of household things are full of.
+THIN_FAMILIES = ("strap", "cable", "loop", "goggles")
+_STREAMS = {FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,)}  # of random numbers
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _MASS_RANGE = (0.03, 0.3)
+_DARK_SHARE, _DARKENED = 0.6, 0.12  # of the thin things, and their colours
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,12 @@ class Primitive:
     color: tuple[float, float, float, float]
 
 
-def make_primitive(index: int, scale: float = 1.0, unseen: bool = False) -> Primitive:
-    """The object of this index; families take turns, so any run of indices is balanced. unseen:
-    of UNSEEN_FAMILIES, which count by themselves."""
-    families = UNSEEN_FAMILIES if unseen else FAMILIES
-    rng = np.random.default_rng([_SEED, index, 1] if unseen else [_SEED, index])
+def make_primitive(
+    index: int, scale: float = 1.0, families: tuple[str, ...] = FAMILIES
+) -> Primitive:
+    """The object of this index; families take turns, so any run of indices is balanced. families:
+    FAMILIES, UNSEEN_FAMILIES or THIN_FAMILIES, which count each by themselves."""
+    rng = np.random.default_rng([_SEED, index, *_STREAMS[families]])
     family = families[index % len(families)]
     shape = _SHAPES[family](rng)
     native = None
@@ -80,7 +85,10 @@ def make_primitive(index: int, scale: float = 1.0, unseen: bool = False) -> Prim
         volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)
     density = float(np.clip(rng.uniform(300, 1500), *(m / volume for m in _MASS_RANGE)))
     friction = float(rng.uniform(0.4, 1.0))
-    return Primitive(f"{family}_{index:04d}", native, parts, density, friction, random_color(rng))
+    color = random_color(rng)
+    if families == THIN_FAMILIES and rng.random() < _DARK_SHARE:
+        color = (*(_DARKENED * channel for channel in color[:3]), 1.0)
+    return Primitive(f"{family}_{index:04d}", native, parts, density, friction, color)
 
 
 def random_color(rng: np.random.Generator) -> tuple[float, float, float, float]:
@@ -230,6 +238,85 @@ def _mug(rng) -> list[np.ndarray]:
     ]
 
 
+def _ribbon(points: np.ndarray, width: float, heights, closed: bool = False) -> list[np.ndarray]:
+    """A band of `width` along a planar polyline (N, 2), cut at half the angle where it bends, as
+    convex segments; its volume is width x length of the line x height. Metres."""
+    ends = np.vstack([points[-1:], points, points[:1]]) if closed else points
+    along = np.diff(ends, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    if not closed:
+        along = np.vstack([along[:1], along, along[-1:]])
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    cut = across[:-1] + across[1:]  # at each point; as long as needed for the width on both sides
+    cut *= (width / 2) / np.einsum("ij,ij->i", cut, across[1:])[:, None]
+    sides = np.stack([points - cut, points + cut], axis=1)  # (N, 2, 2)
+    starts = range(len(points) if closed else len(points) - 1)
+    return [
+        np.array([
+            (*sides[k % len(points), side], z)
+            for k in (start, start + 1) for side in (0, 1) for z in heights
+        ])
+        for start in starts
+    ]  # fmt: skip
+
+
+def _arc(length: float, turn: float, count: int) -> np.ndarray:
+    """(count + 1, 2) points of a line of `length` that turns evenly by `turn` rad."""
+    headings = turn * (np.arange(count) + 0.5) / count
+    steps = length / count * np.column_stack([np.cos(headings), np.sin(headings)])
+    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+
+def _ellipse(a: float, b: float, count: int, share: float = 1.0) -> np.ndarray:
+    """(count, 2) points of an ellipse, or of the first `share` of its way round."""
+    angles = 2 * np.pi * share * np.arange(count) / (count if share == 1.0 else count - 1)
+    return np.column_stack([a * np.cos(angles), b * np.sin(angles)])
+
+
+def _strap(rng) -> list[np.ndarray]:
+    """A band that lies flat, or stands on its edge and is bent more."""
+    length, side, thick = rng.uniform((0.09, 0.014, 0.005), (0.17, 0.03, 0.008))
+    if rng.random() < 0.5:
+        return _ribbon(_arc(length, rng.uniform(0, 1.5), 8), side, (0, thick))
+    return _ribbon(_arc(length, rng.uniform(0.6, 3.5), 10), thick, (0, side))
+
+
+def _cable(rng) -> list[np.ndarray]:
+    """Two bends, one to either side or both to the same."""
+    side, *lengths = rng.uniform((0.008, 0.05, 0.05), (0.012, 0.09, 0.09))
+    first, second = rng.uniform((0.3, -2.0), (2.0, 2.0))
+    start, end = _arc(lengths[0], first, 6), _arc(lengths[1], second, 6)
+    turned = np.array([[np.cos(first), np.sin(first)], [-np.sin(first), np.cos(first)]])
+    return _ribbon(np.vstack([start, start[-1] + end[1:] @ turned]), side, (0, side))
+
+
+def _loop(rng) -> list[np.ndarray]:
+    a, b, thick, height = rng.uniform((0.032, 0.022, 0.004, 0.015), (0.065, 0.032, 0.007, 0.04))
+    return _ribbon(_ellipse(a, b, 16), thick, (0, height), closed=True)
+
+
+def _goggles(rng) -> list[np.ndarray]:
+    """Two frames, the bridge between them, and a strap behind."""
+    radius, wall, depth, bridge, strap = rng.uniform(
+        (0.022, 0.004, 0.015, 0.008, 0.004), (0.027, 0.006, 0.025, 0.014, 0.006)
+    )
+    middle = bridge / 2 + radius + wall / 2  # of a frame
+    frame = _ellipse(radius, radius, 12) @ np.array([[0, 1], [-1, 0]])
+    # The polygon's outer side, where the bridge and the strap begin.
+    edge = radius * np.cos(np.pi / 12) + wall / 2
+    frame = frame @ np.array([
+        [np.cos(np.pi / 12), np.sin(np.pi / 12)], [-np.sin(np.pi / 12), np.cos(np.pi / 12)]
+    ])  # fmt: skip
+    gap, outer = middle - edge, middle + edge + strap / 2
+    behind = _ellipse(outer, rng.uniform(0.05, 0.08), 10, share=0.5)
+    return [
+        *_ribbon(frame - [middle, 0], wall, (0, depth), closed=True),
+        *_ribbon(frame + [middle, 0], wall, (0, depth), closed=True),
+        _box((-gap, -wall / 2, 0), (gap, wall / 2, depth)),
+        *_ribbon(behind, strap, (0, depth)),
+    ]
+
+
 # Bounds in metres. Of a convex solid the two smaller sides stay below 0.06: one of them is
 # always across when it lies on a face.
 _SHAPES = {
@@ -254,4 +341,8 @@ _SHAPES = {
     "wedge": _wedge,
     "Z": _z_shape,
     "dumbbell": _dumbbell,
+    "strap": _strap,
+    "cable": _cable,
+    "loop": _loop,
+    "goggles": _goggles,
 }

@@ -28,7 +28,14 @@ from envs.object_meshes import (
     mass_properties,
     write_parts_obj,
 )
-from envs.object_primitives import NativeShape, make_primitive, random_color
+from envs.object_primitives import (
+    FAMILIES,
+    THIN_FAMILIES,
+    UNSEEN_FAMILIES,
+    NativeShape,
+    make_primitive,
+    random_color,
+)
 from envs.pybullet_files import data_folder
 from models.graspable import is_graspable
 from utils.errors import UserError, did_you_mean, one_line
@@ -37,6 +44,7 @@ from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
 PRIMITIVES_TRAIN, PRIMITIVES_TOTAL, PRIMITIVES_UNSEEN = 900, 1000, 100
+THIN_TRAIN, THIN_TOTAL = 200, 250
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
 
@@ -263,24 +271,33 @@ class BoxSet(ObjectSet):
 
 class PrimitiveSet(ObjectSet):
     """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
-    for tests, and 100 of the families that no training sees."""
+    for tests, and 100 of the families that no training sees. thin: of the families of thin and
+    dark things instead, 200 for training and 50 for tests."""
 
-    def __init__(self, settings: SetSettings) -> None:
-        _refuse_fit("primitives", settings)
-        super().__init__("primitives")
+    def __init__(self, settings: SetSettings, thin: bool = False) -> None:
+        name = "thin" if thin else "primitives"
+        _refuse_fit(name, settings)
+        super().__init__(name)
+        unseen = settings.split == "unseen_families"
+        if thin and unseen:
+            raise ObjectError(
+                "objects.split=unseen_families: training may see all families of thin; use "
+                "primitives, or objects.split=test"
+            )
+        train, total = (THIN_TRAIN, THIN_TOTAL) if thin else (PRIMITIVES_TRAIN, PRIMITIVES_TOTAL)
         self.indices = {
-            "train": range(PRIMITIVES_TRAIN),
-            "test": range(PRIMITIVES_TRAIN, PRIMITIVES_TOTAL),
+            "train": range(train),
+            "test": range(train, total),
             "unseen_families": range(PRIMITIVES_UNSEEN),
         }[settings.split]
-        self.unseen = settings.split == "unseen_families"
+        self.families = THIN_FAMILIES if thin else UNSEEN_FAMILIES if unseen else FAMILIES
         self.scale, self.cache_dir = settings.scale or 1.0, settings.cache_dir
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def _build(self, index: int) -> ObjectModel:
-        shape = make_primitive(self.indices[index], self.scale, self.unseen)
+        shape = make_primitive(self.indices[index], self.scale, self.families)
         if shape.native is not None:
             return _native_model(
                 shape.name, shape.native, shape.density, shape.friction, shape.color
@@ -378,6 +395,7 @@ OBJECT_SETS: dict[str, Callable[[SetSettings], ObjectSet]] = {
     "box": BoxSet,
     "primitives": PrimitiveSet,
     "random_urdfs": _random_urdfs,
+    "thin": partial(PrimitiveSet, thin=True),
 }
 
 

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from envs.object_primitives import FAMILIES, UNSEEN_FAMILIES, make_primitive
+from envs.object_primitives import (
+    FAMILIES,
+    THIN_FAMILIES,
+    UNSEEN_FAMILIES,
+    make_primitive,
+)
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object, load_object_set, prepare
 from envs.pybullet_files import data_folder
 from tests.helpers.simulators import needs_pybullet, pybullet
@@ -282,7 +287,7 @@ def test_unseen_families_have_the_closed_form_volume_and_fit_the_hand():
         return 8 * np.sin(np.pi / 8) * height / 3 * (r0**2 + r0 * r1 + r1**2)
 
     for index in range(40):
-        shape = make_primitive(index, unseen=True)
+        shape = make_primitive(index, families=UNSEEN_FAMILIES)
         family, part = UNSEEN_FAMILIES[index % 4], shape.parts[0]
         assert shape.name == f"{family}_{index:04d}"
         volumes = [trimesh.convex.convex_hull(part).volume for part in shape.parts]
@@ -315,6 +320,45 @@ def test_unseen_families_are_in_no_other_split(tmp_path):
     assert [unseen[index].name.split("_")[0] for index in range(4)] == list(UNSEEN_FAMILIES)
     with pytest.raises(ObjectError, match="random_urdfs has no families"):
         load_object_set("random_urdfs", split="unseen_families", cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize("index", range(12))
+def test_thin_things_are_one_body_that_the_hand_can_span(tmp_path, index):
+    shape = make_primitive(index, families=THIN_FAMILIES)
+    hulls = [trimesh.convex.convex_hull(part) for part in shape.parts]
+    volume, union = sum(hull.volume for hull in hulls), trimesh.boolean.union(hulls, "manifold")
+    assert 0.985 * volume < union.volume < 1.001 * volume
+    assert max(piece.volume for piece in union.split()) > 0.99 * union.volume
+    assert min(np.ptp(part, axis=0).min() for part in shape.parts) <= 0.031
+    assert np.ptp(np.concatenate(shape.parts), axis=0).max() < 0.2
+    model = load_object_set("thin", split="train", cache_dir=tmp_path)[index]
+    assert model.mass == pytest.approx(shape.density * volume)
+    assert 0.03 - 1e-6 <= model.mass <= 0.3 + 1e-6
+
+
+def test_a_band_has_the_volume_of_its_line():
+    """Cut at half the angle, a bend adds outside what it takes inside."""
+    ring = make_primitive(THIN_FAMILIES.index("loop"), families=THIN_FAMILIES).parts
+    corners = np.array([(part[:4, :2].mean(axis=0)) for part in ring])
+    length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).sum()
+    width = np.linalg.norm(ring[0][0, :2] - ring[0][2, :2])  # along the cut at a corner
+    outline = np.roll(corners, -1, axis=0) - corners
+    turns = outline[-1, 0] * outline[0, 1] - outline[-1, 1] * outline[0, 0]
+    sides = np.linalg.norm(outline[-1]) * np.linalg.norm(outline[0])
+    width *= np.cos(np.arcsin(turns / sides) / 2)
+    height = np.ptp(ring[0][:, 2])
+    volume = sum(trimesh.convex.convex_hull(part).volume for part in ring)
+    assert volume == pytest.approx(width * length * height, rel=1e-6)
+
+
+def test_thin_things_for_tests_are_others_than_those_for_training(tmp_path):
+    train = load_object_set("thin", split="train", cache_dir=tmp_path)
+    test = load_object_set("thin", split="test", cache_dir=tmp_path)
+    assert (len(train), len(test)) == (200, 50) and not set(train.indices) & set(test.indices)
+    dark = [max(train[index].color[:3]) < 0.2 for index in range(40)]
+    assert 0.3 < np.mean(dark) < 0.9
+    with pytest.raises(ObjectError, match="training may see all families of thin"):
+        load_object_set("thin", split="unseen_families", cache_dir=tmp_path)
 
 
 def test_a_primitive_depends_on_its_index_alone():
