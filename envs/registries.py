@@ -2,10 +2,9 @@
 
 Each registry stands beside the code that it lists. A new entry there is all that a config needs to
 name it: `utils.config_schema` takes any text for these keys, because `utils` imports neither `envs`
-nor `models`, and each script calls `check_names` before it does any work. Two kinds of names are
-checked elsewhere: planners and learned policies (`evaluate.policies`), which may also be files, by
-`models.planners` and `envs.policy_approach`, and depth noises (`camera.depth_noise`) by
-`utils.config_schema`, because their registry stands in `utils.depth`.
+nor `models`, and each script calls `check_names` before it does any work. Planners and learned
+policies (`evaluate.policies`), which may also be files, are checked elsewhere, by `models.planners`
+and `envs.policy_approach`. The registry of depth noises stands in `utils.depth`.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from envs.transfer_plan import COLUMNS
 from models.grasp_policy import ACTIVATIONS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config
+from utils.depth import make_depth_noise
 from utils.errors import unknown_choice
 from utils.real_data import FORMATS
 
@@ -54,6 +54,8 @@ def check_names(config: Config) -> None:
             check_object_set(name, key)
     make_reward(config.env.reward)
     config.camera.make_noise(float(config.camera.height))
+    for name in config.train.depth_noises:
+        make_depth_noise(name, float(config.camera.height), key="train.depth_noises")
     for row in config.transfer.policies or ():
         if row.scenes is not None:
             scenario, objects = row.scenes

@@ -30,7 +30,7 @@ from utils.augmentation import (
     apply_similarity,
 )
 from utils.config import Config
-from utils.depth import DepthNoise, KinectNoise, measure
+from utils.depth import DepthNoise, make_depth_noise, measure
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.grasp_data import SimulatedDataset
@@ -233,14 +233,16 @@ def simulated_data(config: Config, folder: Path, focal: float) -> TrainingData:
             ("validation", config.data.validation_frames),
         )
     )
-    # Training meets noise even where the cell's own cameras have none.
-    noise = config.camera.make_noise(focal) or KinectNoise(image_focal=focal)
+    noises = [
+        make_depth_noise(name, focal, key="train.depth_noises")
+        for name in config.train.depth_noises
+    ]
     augmentation = Augmentation(
         turn_step=np.pi / ANGLE_BINS,  # whole bins are quick; the cameras' own turns fill the gaps
         colour=ColourJitter(hue=0.0),  # the scenes have every hue
         max_shift=0.0,  # the crop shifts
         scale=(0.97, 1.03),
-        depth_noise=NoisyShare(config.train.depth_noise_share, noise),
+        depth_noise=NoisyShare(config.train.depth_noise_share, tuple(filter(None, noises))),
     )
     settings = config.train
     return TrainingData(
@@ -263,15 +265,16 @@ def score_simulated(model: GraspNet, validation: LabelledImages) -> dict[str, fl
 
 @dataclass(frozen=True)
 class NoisyShare:
-    """A camera's depth noise on a share of the images."""
+    """Depth cameras' noises on a share of the images, one of them on each."""
 
     share: float
-    noise: DepthNoise
+    noises: tuple[DepthNoise, ...]
 
     def __call__(
         self, depth: torch.Tensor, rng: np.random.Generator, rgb: torch.Tensor
     ) -> torch.Tensor:
-        if rng.random() >= self.share:
+        if not self.noises or rng.random() >= self.share:
             return depth
+        noise = self.noises[rng.integers(len(self.noises))]
         colours = rgb.permute(1, 2, 0).cpu().numpy()
-        return depth.new_tensor(measure(self.noise, depth.cpu().numpy(), rng, colours))
+        return depth.new_tensor(measure(noise, depth.cpu().numpy(), rng, colours))

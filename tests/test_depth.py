@@ -171,12 +171,17 @@ def test_a_share_of_the_training_images_is_measured():
     noise, depth = KinectNoise(), torch.from_numpy(steps_and_slopes(64))
     rng = np.random.default_rng(0)
     rgb = torch.zeros(3, 64, 64, dtype=torch.uint8)
-    measured = NoisyShare(1.0, noise)(depth, rng, rgb)
+    measured = NoisyShare(1.0, (noise,))(depth, rng, rgb)
     rng = np.random.default_rng(0)
-    rng.random()  # whether this image is one of the share
+    rng.random(), rng.integers(1)  # whether this image is one of the share, and its noise
     np.testing.assert_array_equal(measured.numpy(), noise(depth.numpy(), rng))
     assert measured.dtype == torch.float32 and (depth == 0).any()
-    assert NoisyShare(0.0, noise)(depth, rng, rgb) is depth
+    assert NoisyShare(0.0, (noise,))(depth, rng, rgb) is depth
+    assert NoisyShare(1.0, ())(depth, rng, rgb) is depth
+    both, found = NoisyShare(1.0, (lambda d, r: d + 1, lambda d, r: d + 2)), set()
+    for _ in range(20):
+        found.add(float((both(depth, rng, rgb) - depth).median()))
+    assert sorted(found) == pytest.approx([1.0, 2.0])
 
 
 # --- Active stereo and Dex-Net's noise --------------------------------------------------------
@@ -303,7 +308,7 @@ def test_training_shows_colours_to_the_noise():
     rgb = torch.full((3, 64, 64), 128, dtype=torch.uint8)
     rgb[:, :32] = 0
     depth = torch.full((64, 64), 0.8)
-    measured = NoisyShare(1.0, RealSenseNoise())(depth, np.random.default_rng(0), rgb)
+    measured = NoisyShare(1.0, (RealSenseNoise(),))(depth, np.random.default_rng(0), rgb)
     assert not measured[:32].any() and (measured[32:] > 0).all()
 
 

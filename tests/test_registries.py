@@ -51,6 +51,7 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("env.control=eee", "env.control: got 'eee', expected one of ee, ee_planar, joint"),
         ("rl.activation=gelu", "rl.activation: got 'gelu', .*elu"),
         ("camera.depth_noise=kinec", "camera.depth_noise: got 'kinec', .* did you mean kinect?"),
+        ("train.depth_noises=[kinec]", "train.depth_noises: got 'kinec', .* did you mean kinect?"),
         ("env.objects=bx", "env.objects: got 'bx', expected one of box, .* did you mean box?"),
         ("data.object_sets=no_module:sets", "data.object_sets: .* there is no module 'no_module'"),
         ("transfer.columns=mujcoo", "transfer.columns: got 'mujcoo', .* did you mean mujoco?"),

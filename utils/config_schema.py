@@ -266,6 +266,7 @@ class TrainConfig(Section):
     centre_weight: Annotated[float, Field(ge=0)]
     graspable_from: Share
     depth_noise_share: Annotated[float, Field(ge=0, le=1)]
+    depth_noises: Names
     precision: Literal["auto", "float32", "bfloat16", "float16"]
     device: Name
     workers: Annotated[int, Field(ge=0)] | None

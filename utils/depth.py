@@ -382,29 +382,32 @@ DEPTH_NOISES: dict[str, Callable[..., DepthNoise]] = {
 
 
 def make_depth_noise(
-    name: str, image_focal: float, arguments: Mapping[str, Any] | None = None
+    name: str,
+    image_focal: float,
+    arguments: Mapping[str, Any] | None = None,
+    key: str = "camera.depth_noise",
 ) -> DepthNoise | None:
     """The depth noise of that name, or of the import path `module:name`; None for "none".
 
     image_focal: focal length, pixels, of the images that the noise is applied to. arguments: the
-    noise's own parameters (`camera.depth_noise_args`); "none" ignores them. Raises UserError for
-    an unknown name and for parameters that the noise refuses.
+    noise's own parameters (`camera.depth_noise_args`); "none" ignores them. key: the config's, for
+    messages. Raises UserError for an unknown name and for parameters that the noise refuses.
     """
     if name == "none":
         return None
     if name in DEPTH_NOISES:
         make = DEPTH_NOISES[name]
     elif is_import_path(name):
-        make = load_plugin(name, "camera.depth_noise")
+        make = load_plugin(name, key)
     else:
-        raise unknown_choice("camera.depth_noise", name, ["none", *DEPTH_NOISES, "module:name"])
+        raise unknown_choice(key, name, ["none", *DEPTH_NOISES, "module:name"])
     try:
         noise = make(image_focal=image_focal, **(arguments or {}))
     except (TypeError, ValueError) as error:
-        raise UserError(f"camera.depth_noise_args: {name!r} does not take them: {error}") from error
+        raise UserError(f"{key}_args: {name!r} does not take them: {error}") from error
     if not callable(noise):
         raise UserError(
-            f"camera.depth_noise: {name!r} returned a {type(noise).__name__}, expected a callable "
+            f"{key}: {name!r} returned a {type(noise).__name__}, expected a callable "
             "noise(depth, rng)"
         )
     return noise
