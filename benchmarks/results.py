@@ -15,7 +15,8 @@ A finished part leaves its figures in docs/results/<part>.json and the first rou
 docs/results/<part>-<command>.jsonl; the tables are written from these files alone and say how many
 rounds each row has. Each part has a file of its own, so that parts may have different scales.
 
-The seed is one that no choice was made on; docs/results.md lists those of the development.
+Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/results.md lists
+the seeds of the development.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ from utils.result_records import read_rounds, write_sample
 from utils.results import compare
 from utils.runs import environment, run_script, write_json_atomic
 
-SEED = 2027
 REPOSITORY = Path(__file__).resolve().parent.parent
+SEALED = REPOSITORY / "configs" / "sealed.yaml"  # scenes and objects that nothing else plays
+SEED = load_config(SEALED).seed
+SPLIT = load_config(SEALED).objects.split
 FIGURES = Path("docs/results")  # what the tables are written from
 RUNS = Path("runs/results")
 # Files on which a figure depends: a commit that touches none of them changes no table.
@@ -73,7 +76,7 @@ class Command:
         start = self.program if self.program.endswith(".py") else f"-m benchmarks.{self.program}"
         parts = [f"python {start}"]
         if self.program.endswith(".py"):
-            parts.append(f"seed={SEED}")
+            parts += [f"seed={SEED}", f"objects.split={SPLIT}"]
         parts += [self.arguments] if self.arguments else []
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")

@@ -43,8 +43,10 @@ from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
-PRIMITIVES_TRAIN, PRIMITIVES_TOTAL, PRIMITIVES_UNSEEN = 900, 1000, 100
-THIN_TRAIN, THIN_TOTAL = 200, 250
+# Numbers of the first object of each kind of `primitives` and of `thin`, and the end.
+PRIMITIVES = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
+THIN = {"train": 0, "test": 200, "sealed": 250, "end": 300}
+PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
 
@@ -61,7 +63,7 @@ SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 1e3  # m
 ROLLING_FRICTION = 0.0005
 
 
-Split = Literal["train", "test", "unseen_families"]
+Split = Literal["train", "test", "sealed", "unseen_families"]
 
 
 class ObjectSet(ABC, Sequence[ObjectModel]):
@@ -134,6 +136,7 @@ def load_object_set(
     name_or_path: a name, a folder, or an import path `module:name` of an `ObjectSet`, of a folder's
         path, or of a function that takes `SetSettings` and returns one of the two.
     split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in each.
+        sealed: others, for the published tables alone; of `random_urdfs` the test objects.
         unseen_families: 100 objects of `primitives` of four families that the others do not have.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
     fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
@@ -271,8 +274,8 @@ class BoxSet(ObjectSet):
 
 class PrimitiveSet(ObjectSet):
     """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
-    for tests, and 100 of the families that no training sees. thin: of the families of thin and
-    dark things instead, 200 for training and 50 for tests."""
+    for tests, 100 for the published tables alone, and 100 of the families that no training sees.
+    thin: of the families of thin and dark things instead, 200, 50 and 50."""
 
     def __init__(self, settings: SetSettings, thin: bool = False) -> None:
         name = "thin" if thin else "primitives"
@@ -284,10 +287,11 @@ class PrimitiveSet(ObjectSet):
                 "objects.split=unseen_families: training may see all families of thin; use "
                 "primitives, or objects.split=test"
             )
-        train, total = (THIN_TRAIN, THIN_TOTAL) if thin else (PRIMITIVES_TRAIN, PRIMITIVES_TOTAL)
+        first = THIN if thin else PRIMITIVES
         self.indices = {
-            "train": range(train),
-            "test": range(train, total),
+            "train": range(first["train"], first["test"]),
+            "test": range(first["test"], first["sealed"]),
+            "sealed": range(first["sealed"], first["end"]),
             "unseen_families": range(PRIMITIVES_UNSEEN),
         }[settings.split]
         self.families = THIN_FAMILIES if thin else UNSEEN_FAMILIES if unseen else FAMILIES
@@ -370,7 +374,7 @@ def _random_urdfs(settings: SetSettings) -> ObjectSet:
 
 
 def _random_urdf_files(split: str) -> list[Path]:
-    """Test is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
+    """Test, and sealed, is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
     data = data_folder()
     if data is None:
         raise ObjectError(
@@ -378,7 +382,7 @@ def _random_urdf_files(split: str) -> list[Path]:
             "box or a folder of meshes"
         )
     folder = data / "random_urdfs"
-    numbers = [n for n in range(1000) if (n % 10 == 0) == (split == "test")]
+    numbers = [n for n in range(1000) if (n % 10 == 0) == (split != "train")]
     return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
 
 

@@ -270,7 +270,10 @@ def test_parts_of_primitives_touch_but_do_not_overlap():
 def test_sizes_and_disjoint_splits(tmp_path, name, train_size, key):
     train = load_object_set(name, split="train", cache_dir=tmp_path)
     test = load_object_set(name, split="test", cache_dir=tmp_path)
-    assert (len(train), len(test)) == (train_size, 100)
+    sealed = load_object_set(name, split="sealed", cache_dir=tmp_path)
+    assert (len(train), len(test), len(sealed)) == (train_size, 100, 100)
+    used = {*getattr(train, key), *getattr(test, key)}
+    assert bool(used & set(getattr(sealed, key))) == (name == "random_urdfs")  # there are no more
     assert not set(getattr(train, key)) & set(getattr(test, key))
 
 
@@ -597,7 +600,10 @@ def test_a_plug_in_without_objects_is_named(plug_in, tmp_path, path, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"split": "val"}, "objects.split is 'val'; allowed are train, test, unseen_families"),
+        (
+            {"split": "val"},
+            "objects.split is 'val'; allowed are train, test, sealed, unseen_families",
+        ),
         ({"scale": -1.0}, "objects.scale is -1.0"),
         ({"density": float("nan")}, "objects.density is nan"),
         ({"fit": 0.06}, "objects.fit does not apply"),

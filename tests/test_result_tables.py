@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -94,15 +95,25 @@ def test_parts_are_chosen_by_name():
 
 def test_commands_are_valid_and_take_fresh_seeds(capsys):
     """Seeds used while developing stand in docs/results.md; the tables' is none of them."""
-    assert results.SEED == 2027
+    sealed = load_config(results.SEALED)
     for part in PARTS:
         for command in part.commands:
             words = command.line(command.scaled(0.001)).split()
             if words[1].endswith(".py"):
                 overrides = [w for w in words[2:] if "=" in w and "path/to" not in w]
-                assert load_config(None, overrides).seed == 2027
+                config = load_config(None, overrides)
+                assert (config.seed, config.objects.split) == (sealed.seed, "sealed")
     assert main(["--list", "--scale", "0.1"]) == 0
-    assert "seed=2027" in capsys.readouterr().out
+    assert f"seed={sealed.seed} objects.split=sealed" in capsys.readouterr().out
+
+
+def test_sealed_scenes_are_named_by_the_tables_alone():
+    """In code, configs and tests, neither the seed nor the objects appear anywhere else."""
+    seed, named = str(load_config(results.SEALED).seed), []
+    for folder in ("envs", "models", "utils", "benchmarks", "configs", "tests", "."):
+        files = [*Path(folder).glob("*.py"), *Path(folder).glob("*.yaml")]
+        named += [file.name for file in files if seed in file.read_text()]
+    assert named == ["sealed.yaml"]
 
 
 def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
@@ -124,7 +135,7 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     assert not results.FIGURES.exists(), "measuring alone writes no docs"
     results.publish(part, "c0ffee", 0.1)
     content = json.loads((results.FIGURES / "ppo.json").read_text())
-    assert (content["commit"], content["seed"]) == ("c0ffee", 2027)
+    assert (content["commit"], content["seed"]) == ("c0ffee", results.SEED)
     assert list(content["commands"]) == ["box", "random_urdfs", "primitives"]
     assert results.is_finished(part, "c0ffee", 0.1) and not results.is_finished(part, "dead", 0.1)
 

@@ -114,7 +114,7 @@ class WorkspaceConfig(Section):
 
 
 class ObjectsConfig(Section):
-    split: Literal["test", "train", "unseen_families"]
+    split: Literal["test", "train", "sealed", "unseen_families"]
     scale: Positive | None
     fit: Positive | None
     density: Positive
