@@ -1,7 +1,9 @@
 """What a script says where it cannot run, and that it imports nothing else before."""
 
+import re
 import subprocess
 import sys
+from importlib.metadata import files
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,18 @@ def test_an_old_python_and_a_missing_package_are_named():
     assert " lacks no_such_package; install with `make run`" in problem(
         packages=("numpy", "no_such_package")
     )
+
+
+def test_every_requirement_is_looked_for():
+    """But PyBullet, without which MuJoCo suffices."""
+    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    required = {re.match(r"[\w-]+", line)[0] for line in lines if line and line[0] != "#"}
+    unknown = set(PACKAGES)
+    for requirement in required - {"pybullet"} | {"imageio-ffmpeg"}:
+        modules = {file.parts[0].partition(".")[0] for file in files(requirement)}
+        assert modules & set(PACKAGES), requirement
+        unknown -= modules
+    assert not unknown
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -6,8 +6,14 @@ It is written for every Python 3, and imports nothing that has to be installed.
 import importlib.util
 import sys
 
-# Packages of requirements.txt that the first imports of the scripts need.
-PACKAGES = ("gymnasium", "mujoco", "numpy", "pydantic", "torch", "tqdm")
+# The packages of requirements.txt, under the names by which they are imported. PyBullet is not
+# among them: where it is missing, MuJoCo does its work.
+PACKAGES = (
+    "PIL", "coacd", "collada", "cv2", "gymnasium", "h5py", "imageio", "imageio_ffmpeg", "jinja2",
+    "manifold3d", "matplotlib", "mujoco", "numpy", "onnx", "onnxscript", "pydantic", "scipy",
+    "tensorboard", "torch", "torchvision", "tqdm", "trimesh", "typing_extensions", "yaml",
+    "yourdfpy",
+)  # fmt: skip
 
 
 def problem(version=sys.version_info, packages=PACKAGES):
