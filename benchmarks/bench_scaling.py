@@ -42,7 +42,7 @@ SHORT = ("evaluate.scenarios=isolated",)  # of the evaluations in which workers 
 QUICK = ("evaluate.scenarios=isolated", "evaluate.object_sets=box")
 SIZES = (8, 64, 512)  # workers of the model
 FULL = 0.8  # share of a core from which a scheduler or a main process is late with its answers
-EACH = 3  # scenes between two kills, so that a scene is not killed as often as an executor allows
+EACH = 7  # scenes for each kill: most results find the oldest worker idle or beginning
 BUSY, LOOK = 25, 0.2  # % of a core that a process takes in the middle of a scene, s to measure it
 DASK = {"DASK_LOGGING__DISTRIBUTED": "error", "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 BRIDGE, NETWORK = "robotgrasp", "10.77.0"  # of the two namespaces
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         scenes, kills, calls, repeats = 2, 1, 100, 1
     quick = QUICK if options.quick else ()
     metrics = rates(*plan_of(scenes, [*quick, *options.overrides]), calls, repeats)
-    rounds = (EACH + 2) * kills + 4  # a worker may have to be spared because it is idle
+    rounds = EACH * kills
     metrics += killed(*plan_of(rounds, [*SHORT, *quick, *options.overrides]), kills)
     report(metrics, options.json)
 
@@ -223,15 +223,15 @@ def _survived(
     kills: int,
     expected: Sequence[RoundRecord],
 ) -> list[Metric]:
-    dead: list[int] = []  # how many scenes were finished at each kill
+    dead: list[int] = []
 
     def kill(finished: int) -> None:
-        if len(dead) == kills or finished < (dead[-1] if dead else 0) + EACH:
-            return
-        oldest = worker_processes()[0]  # so that they die in turn
-        if is_busy(oldest):
+        # Where the oldest one is busy, a younger one has ended a scene: they die in turn, and no
+        # scene is killed as often as an executor allows.
+        oldest = worker_processes()[0]
+        if len(dead) < kills and is_busy(oldest):
             oldest.kill()
-            dead.append(finished)
+            dead.append(oldest.pid)
 
     got = rounds(workers, config, plan, kill)
     different = len(differing_rounds(expected, got)) + abs(len(expected) - len(got))

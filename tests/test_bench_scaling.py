@@ -2,16 +2,16 @@
 
 import subprocess
 import sys
+from functools import partial
 from types import SimpleNamespace
 
-import numpy as np
 import psutil
 import pytest
 
 pytest.importorskip("distributed", reason="pip install distributed")
 
 from benchmarks import bench_scaling
-from benchmarks.bench_scaling import EACH, is_busy
+from benchmarks.bench_scaling import is_busy
 
 
 def started(code):
@@ -31,22 +31,24 @@ def test_a_process_that_computes_is_busy(code, busy):
             process.kill()
 
 
-def test_only_busy_workers_are_killed_some_scenes_apart(monkeypatch):
+def test_only_the_oldest_worker_is_killed_and_only_while_it_is_busy(monkeypatch):
     finished, kills = 0, []
 
     def worker_processes():
-        return [SimpleNamespace(kill=lambda: kills.append(finished))]
+        names = ["oldest", "younger"]
+        return [SimpleNamespace(pid=name, kill=partial(kills.append, finished)) for name in names]
 
     def rounds(workers, config, plan, after):
         nonlocal finished
-        for finished in range(1, 5 * EACH):
+        for finished in range(10):
             after(finished)
         return []
 
     monkeypatch.setattr(bench_scaling, "worker_processes", worker_processes)
-    monkeypatch.setattr(bench_scaling, "is_busy", lambda process: finished % 2 == 0)
+    busy = {3, 4, 7, 8}
+    monkeypatch.setattr(
+        bench_scaling, "is_busy", lambda one: one.pid == "oldest" and finished in busy
+    )
     monkeypatch.setattr(bench_scaling, "rounds", rounds)
-    metrics = bench_scaling._survived("local", None, None, [], 3, [])
-    assert metrics[0].value == len(kills) == 3
-    assert all(moment % 2 == 0 for moment in kills)
-    assert kills[0] >= EACH and np.diff(kills).min() >= EACH
+    (killed, *_) = bench_scaling._survived("local", None, None, [], 3, [])
+    assert killed.value == 3 and kills == [3, 4, 7]
