@@ -30,7 +30,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from utils.config import YAML_ERRORS, Config, load_yaml
 from utils.errors import UserError, one_line
 from utils.runs import REPOSITORY
-from utils.worker_process import worker_environment
+from utils.worker_process import leave_signals, worker_environment
 
 RANDOMIZED = "RandomizedGrasping-v0"
 OWN_ENVS = "RobotGrasping-v0", RANDOMIZED  # take the whole config as an argument
@@ -308,6 +308,7 @@ class CheckedEnv(gymnasium.Wrapper):
     def go_on(self, task: bytes | None, seconds: float) -> bytes | None:
         """Begin a task of `TrainingEnvs.each`, or (None) go on with the one begun, for so many
         seconds; returns its result, or None where it has not ended. Worker processes call this."""
+        leave_signals()  # not before: AsyncVectorEnv ends by SIGTERM those that it cannot start
         if task is not None:
             self._task = pickle.loads(task)(self, self._index)
         until = time.monotonic() + seconds

@@ -8,7 +8,6 @@ workers. This module does not know how the images are made.
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ from utils.errors import UserError
 from utils.grasp_data import SimulatedDataset
 from utils.grasp_labels import ANGLE_BINS
 from utils.runs import usable_cpus
+from utils.worker_process import leave_signals
 
 CROP = 160  # pixels, side of a training example: all context that the network uses, half the work
 
@@ -173,14 +173,9 @@ def epoch_loader(
         data.train,
         batch_sampler=sampler,
         num_workers=workers,
-        worker_init_fn=_ignore_interrupt,
+        worker_init_fn=leave_signals,
         pin_memory=team.device.type == "cuda",
     )
-
-
-def _ignore_interrupt(worker: int) -> None:
-    """Leave Ctrl-C to the process that started the workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,19 @@ def test_calls_of_workers_that_die_are_repeated(compute, tmp_path):
         assert sorted(completed(workers, function, range(3))) == [0, 1, 4]
 
 
+def sent(number):
+    os.kill(os.getpid(), number)
+    return number
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to ignore")
+def test_processes_leave_signals_to_the_main_process():
+    """Batch systems send SIGTERM to all processes of a job."""
+    with open_executor(load_config().compute, 1) as workers:
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        assert list(completed(workers, sent, numbers)) == numbers
+
+
 def test_a_call_that_hangs_is_repeated(compute, tmp_path):
     hurried = compute.model_copy(update={"timeout": 1.0})
     with open_executor(hurried, 2) as workers:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from models.graspnet_data import AtPixelSize, EpochBatches, GraspExamples
+from models.graspnet_data import AtPixelSize, EpochBatches, GraspExamples, epoch_loader
 from tests.helpers.compare import same
 from utils.augmentation import Augmentation, LabelledImage
+from utils.config import load_config
+from utils.distributed import ALONE
 
 BINS = 18
 
@@ -36,6 +42,23 @@ def test_epochs_are_shuffled_anew_and_can_be_entered_midway():
     ]
     assert all(sorted(order) == list(range(40)) != order for order in orders)
     assert orders[0] != orders[1] != orders[2] != orders[0]
+
+
+class SentSigterm(list):
+    """Numbers, each of which sends SIGTERM to the process that reads it."""
+
+    def __getitem__(self, place):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return super().__getitem__(place[1])
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to ignore")
+def test_processes_that_load_leave_sigterm_to_the_main_process():
+    """Batch systems send it to all processes of a job."""
+    config = load_config(None, ["train.batch_size=2", "train.workers=1"])
+    data = SimpleNamespace(train=SentSigterm(range(6)))
+    batches = list(epoch_loader(config, data, ALONE, 0, 0))
+    assert sorted(torch.cat(batches).tolist()) == list(range(6))
 
 
 def blocks(seed: int, side: int = 64) -> LabelledImage:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 
 import numpy as np
@@ -60,6 +61,21 @@ def processes_of(env, index):
         time.sleep(0.02)
         yield
     return os.getpid(), os.getppid()
+
+
+def sent_sigterm(env, index):
+    yield
+    os.kill(os.getpid(), signal.SIGTERM)
+    yield
+    return index
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to ignore")
+def test_workers_leave_sigterm_to_the_main_process():
+    """Batch systems send it to all processes of a job."""
+    config = load_config(None, [*POINT, "rl.parallel=true"])
+    with training_envs(config, 2) as envs:
+        assert envs.each(sent_sigterm) == [0, 1]
 
 
 @pytest.mark.slow

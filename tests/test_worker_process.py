@@ -1,12 +1,42 @@
 """What a worker process keeps, and what it must have in common with the main process."""
 
+import os
+import subprocess
+import sys
+import time
 from importlib.metadata import version
 
 import pytest
 
 from utils import worker_process
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 from utils.worker_process import Job, check, facts_of, kept, work
+
+MAIN = """
+import multiprocessing, sys
+from tests.test_worker_process import wait_without_end
+
+if __name__ == "__main__":
+    here, there = multiprocessing.Pipe()
+    multiprocessing.Process(target=wait_without_end, args=(there,), daemon=True).start()
+    here.recv()
+    sys.exit(3)
+"""
+
+
+def wait_without_end(pipe):
+    worker_process.leave_signals()
+    pipe.send(None)
+    time.sleep(300)
+
+
+def test_a_main_process_ends_with_workers_that_ignore_its_sigterm(tmp_path):
+    """Such as after an error while images are loaded."""
+    (tmp_path / "script.py").write_text(MAIN)
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, tmp_path / "script.py"]
+    assert subprocess.run(command, env=environment, timeout=60).returncode == 3
 
 
 class Cell:

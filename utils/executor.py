@@ -31,7 +31,7 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import islice
 from threading import Event, Thread
@@ -41,7 +41,15 @@ from utils.config_schema import ComputeConfig
 from utils.errors import UserError
 from utils.plugins import loaded_modules
 from utils.runs import usable_cpus
-from utils.worker_process import SOURCES, Job, check, facts_of, work, worker_environment
+from utils.worker_process import (
+    SOURCES,
+    Job,
+    check,
+    facts_of,
+    leave_signals,
+    work,
+    worker_environment,
+)
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
@@ -184,18 +192,27 @@ class _Process:
     def run(self, job: Job, call: Call) -> Any:
         """The result of a call. Raises BrokenProcessPool where the process has died."""
         future = self._pool.submit(work, job, call)
-        if not wait([future], job.seconds + FREEZE_SECONDS).done and self._number.done():
-            os.kill(self._number.result(), KILL)
-        return future.result()
+        if not wait([future], job.seconds + FREEZE_SECONDS).done:
+            self._kill()
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            self._kill()  # if it lives, the pool sends it SIGTERM and waits
+            raise
+
+    def _kill(self) -> None:
+        if self._number.done():
+            with suppress(ProcessLookupError):
+                os.kill(self._number.result(), KILL)
 
     def shutdown(self, wait: bool = True) -> None:
         self._pool.shutdown(wait)
 
 
 def _begin_process() -> None:
-    """In a new process: leave Ctrl-C to the main process, and end with it, even if it is killed;
+    """In a new process: leave signals to the main process, and end with it, even if it is killed;
     it would be waited for without an end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals()
     Thread(target=_end_with_parent, daemon=True).start()
 
 

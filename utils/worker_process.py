@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import faulthandler
 import functools
 import hashlib
 import importlib.util
+import multiprocessing.util
 import os
 import platform
+import signal
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -78,6 +81,21 @@ def worker_environment() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def leave_signals(*_: object) -> None:
+    """In a worker process: leave Ctrl-C and SIGTERM, which batch systems send to every process of a
+    job, to the main process, which finishes the tasks under way and then ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+@atexit.register  # after multiprocessing.util's own function, and so called before that
+def _kill_workers() -> None:
+    """End the daemons that are left: multiprocessing would send them SIGTERM and wait."""
+    for process in multiprocessing.active_children():
+        if process.daemon:
+            process.kill()
 
 
 # --- What a process keeps -------------------------------------------------------------------------
