@@ -1,6 +1,7 @@
 """What a worker process keeps, and what it must have in common with the main process."""
 
 import os
+import pickle
 import subprocess
 import sys
 import time
@@ -37,6 +38,24 @@ def test_a_main_process_ends_with_workers_that_ignore_its_sigterm(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     command = [sys.executable, tmp_path / "script.py"]
     assert subprocess.run(command, env=environment, timeout=60).returncode == 3
+
+
+class OddError(Exception):
+    """Can be pickled, but not read again, as errors of many libraries."""
+
+    def __init__(self, part, reason):
+        super().__init__(f"{part} {reason}")
+
+
+def test_an_error_that_cannot_be_read_elsewhere_becomes_its_traceback():
+    def fail():
+        raise OddError("the lens", "is dirty")
+
+    with pytest.raises(RuntimeError, match=r"(?s)in fail.*OddError: the lens is dirty") as raised:
+        work(Job("a", 60.0), fail)
+    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)
+    with pytest.raises(ZeroDivisionError):
+        work(Job("a", 60.0), lambda: 1 / 0)
 
 
 class Cell:

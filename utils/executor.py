@@ -159,6 +159,7 @@ class _Processes(Workers):
         return self._threads.submit(self._try, call)
 
     def _try(self, call: Call) -> Any:
+        cause = None
         for _ in range(MOST_LOSSES):
             try:
                 process = self._idle.pop()
@@ -166,13 +167,13 @@ class _Processes(Workers):
                 process = _Process()
             try:
                 return process.run(self._job, call)
-            except BrokenProcessPool:
+            except BrokenProcessPool as error:
                 process.shutdown()
-                process = None
+                process, cause = None, error
             finally:
                 if process is not None:
                     self._idle.append(process)
-        raise _lost(self._job)
+        raise _lost(self._job) from cause
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._threads.shutdown(wait, cancel_futures=cancel_futures)

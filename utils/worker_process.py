@@ -13,9 +13,11 @@ import hashlib
 import importlib.util
 import multiprocessing.util
 import os
+import pickle
 import platform
 import signal
 import sys
+import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -51,7 +53,8 @@ def work(job: Job, call: Callable[[], Result]) -> Result:
     """Carry out a call.
 
     A process in which the call takes too long is ended, even if it hangs outside Python.
-    Raises UserError where the process would not compute what the main process computes.
+    Raises UserError where the process would not compute what the main process computes, and
+    RuntimeError with the traceback of an error that cannot be pickled.
     """
     _begin(job)
     faulthandler.dump_traceback_later(job.seconds, exit=True)
@@ -60,6 +63,13 @@ def work(job: Job, call: Callable[[], Result]) -> Result:
     except UserError as error:
         if job.facts is not None:  # such as a file that is missing there
             error.args = (f"{error} (on the worker's machine, {platform.node()})",)
+        raise
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # the main process could not read it, and would take us for dead
+            text = "".join(traceback.format_exception(error))
+            raise RuntimeError(f"a call has raised an error:\n{text}") from None
         raise
     finally:
         faulthandler.cancel_dump_traceback_later()
