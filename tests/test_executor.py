@@ -176,6 +176,25 @@ def test_a_call_that_ends_every_worker_is_an_error(compute):
         workers.submit(die).result()
 
 
+class OddError(Exception):
+    """Can be pickled but not read again, as errors of many libraries."""
+
+    def __init__(self, part, reason):
+        super().__init__(f"{part} {reason}")
+
+
+def fail(part):
+    raise OddError(part, "is dirty")
+
+
+def test_an_error_that_cannot_be_read_again_arrives_as_its_traceback():
+    with (
+        pytest.raises(RuntimeError, match=r"(?s)in fail.*OddError: the lens is dirty"),
+        open_executor(load_config().compute, 1) as workers,
+    ):
+        workers.submit(fail, "the lens").result()
+
+
 MAIN = """
 import os, sys, time
 from utils.config import load_config
@@ -244,7 +263,7 @@ def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
 # --- A cluster that cannot be used --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "no address"])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tls://127.0.0.1:1", "no address"])
 def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch):
     pytest.importorskip("distributed", reason="pip install distributed")
     monkeypatch.setattr(executor, "CONNECT_SECONDS", 0.5)
@@ -254,6 +273,17 @@ def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch):
         open_executor(compute),
     ):
         pass
+
+
+def test_workers_with_several_threads_are_refused():
+    """They would share a cell."""
+    with local_cluster(1, threads=2) as cluster:
+        compute = load_config(None, [f"compute.scheduler={cluster.scheduler_address}"]).compute
+        with (
+            pytest.raises(UserError, match="has 2 threads.*start it with --nthreads 1"),
+            open_executor(compute),
+        ):
+            pass
 
 
 @pytest.mark.parametrize("fact", ["Python", "numpy", "the source of utils"])

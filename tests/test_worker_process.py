@@ -1,7 +1,6 @@
 """What a worker process keeps, and what it must have in common with the main process."""
 
 import os
-import pickle
 import subprocess
 import sys
 import time
@@ -40,22 +39,11 @@ def test_a_main_process_ends_with_workers_that_ignore_its_sigterm(tmp_path):
     assert subprocess.run(command, env=environment, timeout=60).returncode == 3
 
 
-class OddError(Exception):
-    """Can be pickled, but not read again, as errors of many libraries."""
-
-    def __init__(self, part, reason):
-        super().__init__(f"{part} {reason}")
-
-
-def test_an_error_that_cannot_be_read_elsewhere_becomes_its_traceback():
-    def fail():
-        raise OddError("the lens", "is dirty")
-
-    with pytest.raises(RuntimeError, match=r"(?s)in fail.*OddError: the lens is dirty") as raised:
-        work(Job("a", 60.0), fail)
-    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)
-    with pytest.raises(ZeroDivisionError):
-        work(Job("a", 60.0), lambda: 1 / 0)
+def test_a_process_carries_out_one_call_at_a_time():
+    job = Job("a", 60.0)
+    with pytest.raises(UserError, match="start it with --nthreads 1"):
+        work(job, lambda: work(job, lambda: 1))
+    assert work(job, lambda: 1) == 1
 
 
 class Cell:

@@ -235,6 +235,7 @@ class _Cluster(Workers):
         self._executor = client.get_executor(pure=False)
         self._count, self._counted = 0, -math.inf
         self._told = time.monotonic()
+        self._look()
         client.run(pickle.loads, _packed(partial(check, job.facts)))
 
     def size(self) -> int:
@@ -250,7 +251,14 @@ class _Cluster(Workers):
         now = time.monotonic()
         if now < self._counted + COUNT_SECONDS:
             return
-        self._count, self._counted = len(self._client.nthreads()), now
+        threads = self._client.nthreads()
+        for worker, count in threads.items():
+            if count > 1:
+                raise UserError(
+                    f"the worker {worker} has {count} threads, but a process computes one call at "
+                    "a time; start it with --nthreads 1"
+                )
+        self._count, self._counted = len(threads), now
         if self._count:
             self._told = now
         elif now > self._told + WAIT_SECONDS:
@@ -298,7 +306,7 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     facts = facts_of((*SOURCES, *loaded_modules()))
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
         raise UserError(
             f"{where}: cannot reach a scheduler there ({error}); start one with `make cluster`, or "
             "set the key to null for processes of this machine"
@@ -309,7 +317,9 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     except KilledWorker as error:
         raise _lost(job) from error
     except (CancelledError, CommClosedError) as error:
-        raise UserError(f"{where}: the scheduler was lost; start it again and go on") from error
+        raise UserError(
+            f"{where}: the scheduler or a worker was lost; start it again and go on"
+        ) from error
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in SOURCES:
             raise

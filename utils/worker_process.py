@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import cv2
@@ -34,6 +35,7 @@ SOURCES = ("envs", "models", "utils")  # this project's packages
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 Result = TypeVar("Result")
+_busy = Lock()
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,17 @@ def work(job: Job, call: Callable[[], Result]) -> Result:
     """Carry out a call.
 
     A process in which the call takes too long is ended, even if it hangs outside Python.
-    Raises UserError where the process would not compute what the main process computes, and
-    RuntimeError with the traceback of an error that cannot be pickled.
+    Raises UserError where the process would not compute what the main process computes or has
+    another call under way, and RuntimeError with the traceback of an error that cannot be pickled.
     """
-    _begin(job)
-    faulthandler.dump_traceback_later(job.seconds, exit=True)
+    if not _busy.acquire(blocking=False):  # what is kept, and the timer, are the process's
+        raise UserError(
+            f"a worker of the cluster on {platform.node()} computes in several threads; start it "
+            "with --nthreads 1"
+        )
     try:
+        _begin(job)
+        faulthandler.dump_traceback_later(job.seconds, exit=True)
         return call()
     except UserError as error:
         if job.facts is not None:  # such as a file that is missing there
@@ -73,6 +80,7 @@ def work(job: Job, call: Callable[[], Result]) -> Result:
         raise
     finally:
         faulthandler.cancel_dump_traceback_later()
+        _busy.release()
 
 
 @contextmanager

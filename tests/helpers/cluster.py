@@ -10,8 +10,9 @@ import pytest
 
 
 @contextmanager
-def local_cluster(count: int) -> Iterator[Any]:
-    """A `distributed.LocalCluster` of `count` workers; skips the test where Dask is missing."""
+def local_cluster(count: int, threads: int = 1) -> Iterator[Any]:
+    """A `distributed.LocalCluster` of `count` workers with as many threads each; skips the test
+    where Dask is missing."""
     distributed = pytest.importorskip("distributed", reason="pip install distributed")
     import dask
 
@@ -20,6 +21,8 @@ def local_cluster(count: int) -> Iterator[Any]:
     patient = {"distributed.deploy.lost-worker-timeout": "1h"}
     with (
         dask.config.set(patient),
-        distributed.LocalCluster(count, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(
+            count, threads_per_worker=threads, dashboard_address=None
+        ) as cluster,
     ):
         yield cluster
