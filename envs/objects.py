@@ -374,7 +374,7 @@ def _random_urdfs(settings: SetSettings) -> ObjectSet:
 
 
 def _random_urdf_files(split: str) -> list[Path]:
-    """Test, and sealed, is every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
+    """Test and sealed: every name that ends in 0, as in Quillen et al. 2018 (arXiv 1802.10264)."""
     data = data_folder()
     if data is None:
         raise ObjectError(

@@ -31,11 +31,16 @@ def test_the_hand_comes_down_straight_and_slowly_at_the_end(cell, box_set, monke
     fingertips lie on the vertical line, and keep the approach speed in the last 4 cm."""
     cell.load(cube_scene(box_set))
     grasp, references = cube_grasp(), []
-    command = cell.robot.command_arm
+    command, close = cell.robot.command_arm, cell.robot.command_gripper
     monkeypatch.setattr(
         cell.robot, "command_arm", lambda q, v: (references.append(np.array(q)), command(q, v))
     )
+    closing = []
+    monkeypatch.setattr(
+        cell.robot, "command_gripper", lambda *args: (closing.append(len(references)), close(*args))
+    )
     assert execute_grasp(cell, grasp).success
+    references = references[: closing[1]]  # it opens, comes down and closes
     tips = np.array([forward_kinematics(q)[:3, 3] for q in references])
     lowest = tips[:, 2].argmin()
     np.testing.assert_allclose(tips[lowest], grasp.position, atol=1e-4)

@@ -155,15 +155,17 @@ def test_the_open_loop_does_not_leave_the_workspace(narrow, box_set):
     narrow.load(make_scene("isolated", box_set, 0, narrow.config))
     T = narrow.object_pose(0)
     side = int(np.argmin(np.abs(T[2, :3])))
-    angle, lowest = np.arctan2(T[1, side], T[0, side]), [0.0]
-    narrow.on_step = lambda cell: lowest.append(cell.robot.tip_pose()[1, 3])
+    angle, places = np.arctan2(T[1, side], T[0, side]), [0.0]
+    narrow.on_step = lambda cell: places.append(cell.robot.tip_pose()[1, 3])
     outcome = execute_grasp(narrow, Grasp(np.array([*T[:2, 3], 0.03]), angle, 0.07, 1.0))
     narrow.on_step = None
     assert outcome.reason == "stopped"
     assert outcome.detail.startswith("stopped: the workspace ends here (y = -0.30")
     assert outcome.object_index == 0, "what was in the hand is named"
-    # It was commanded to stop at the edge, 30 cm, at the carry's full speed of over 1 m/s.
-    assert -0.32 < min(lowest) < -0.30
+    # It was commanded to stop at the edge, 30 cm, at the carry's full speed of over 1 m/s, and
+    # needs no longer way than with the hand's acceleration, 13 m/s2.
+    speed = abs(np.diff(places)).max() / narrow.dt
+    assert speed > 1.0 and -0.30 - speed**2 / (2 * 13) < min(places) < -0.30
     np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
 
 
