@@ -28,7 +28,6 @@ from utils.geometry import (
 from utils.height_map import height_map_from_scene
 
 _SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120).relaxed()
-_JUDGED = 30  # candidates of a pose whose contacts are computed
 _MOST_POSES = 12  # those in which the object lies lowest; round ones have hundreds
 _DISTINCT = np.cos(np.deg2rad(15))  # poses whose undersides differ by less count once
 
@@ -42,7 +41,6 @@ def is_graspable(solids: Sequence[ConvexSolid], friction: float, gripper: Grippe
         corners = np.concatenate([solid.vertices for solid in thing.solids])
         workspace = Workspace((0.0, 0.0), 2 * float(np.abs(corners[:, :2]).max()))
         found = search(height_map_from_scene(scene, workspace), gripper, workspace, _SETTINGS)
-        found = found.distinct(_JUDGED, 0.004, np.deg2rad(8))
         if len(found) and (exact_quality(found, scene, gripper) > 0).any():
             return True
     return False

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envs.object_primitives import NativeShape
+from envs.object_primitives import NativeShape, make_primitive
 from models.graspable import is_graspable, resting_poses
 from utils.geometry import ConvexSolid, GripperGeometry
 
@@ -40,6 +40,18 @@ def test_a_wide_ring_fits_by_its_wall():
     ]
     assert is_graspable([ConvexSolid.from_vertices(box @ R.T) for R in turns], 0.7, HAND)
     assert not is_graspable(solids("cylinder", 0.07, 0.09), 0.7, HAND)
+
+
+@pytest.mark.parametrize("index", [900, 907, 933, 934])
+def test_a_primitive_fits_as_all_of_them_do(index):
+    """Two bowls, whose sloping walls leave few grasps, a T and a mug."""
+    shape = make_primitive(index)
+    parts = [ConvexSolid.from_vertices(part) for part in shape.parts]
+    middle = np.concatenate(shape.parts).mean(axis=0)
+    T = np.eye(4)
+    T[:3, 3] = -middle
+    centred = [part.transformed(T) for part in parts]
+    assert is_graspable(centred, shape.friction, HAND), shape.name
 
 
 def test_a_box_rests_on_each_of_its_faces_and_a_toppling_one_does_not():
