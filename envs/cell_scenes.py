@@ -2,7 +2,7 @@
 
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
-whatever `scene.count` says. `bin`: objects dropped between walls around the workspace, which stay.
+whatever `scene.count` says. `bin`: a pile between walls that stand around the workspace.
 `household`: a pile of objects as different in size as the set has them, see `_mixed`.
 `packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
 
@@ -115,15 +115,7 @@ def _drop_one(table: LayoutTable, models: list[ObjectModel], rng, config: Config
 
 
 def _pile_up(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int]:
-    frame = table.put_walls(square_walls(config.workspace.center, **_PILE_WALLS))
-    bodies = _drop_all(table, models, rng, config)
-    for wall in frame:
-        table.remove(wall)
-    return bodies
-
-
-def _drop_all(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int]:
-    """Objects dropped over the middle of the workspace, each when those before it rest."""
+    walls = table.put_walls(square_walls(config.workspace.center, **_PILE_WALLS))
     bodies = []
     for model in models:
         rotation = Rotation.random(rng=rng)
@@ -132,6 +124,8 @@ def _drop_all(table: LayoutTable, models: list[ObjectModel], rng, config: Config
         position[2] = _PILE_DROP_HEIGHT - _lowest(model, rotation)
         bodies.append(table.put(model, position, rotation.as_quat()))
         table.settle(bodies[-1:])
+    for wall in walls:
+        table.remove(wall)
     return bodies
 
 
@@ -182,5 +176,5 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
-    "bin": _drop_all, "household": _pile_up,
+    "bin": _pile_up, "household": _pile_up,
 }  # fmt: skip
