@@ -92,7 +92,7 @@ def frozen_after(camera, count):
 def test_a_frozen_camera_stops_the_arm(cell, images):
     """The gate's watchdog stops it, and it is at rest before the attempt sends it home."""
     approach = loop(cell, "ibvs", camera=frozen_after(WristCamera(cell), images))
-    settling = 12 if isinstance(cell, MujocoCell) else 0  # its arm needs longer
+    settling = 16 if isinstance(cell, MujocoCell) else 0  # its arm needs longer
     speeds, ends = [], []
 
     def until_it_fails(cell, grasp):
