@@ -25,7 +25,8 @@ from PIL import Image
 
 from benchmarks.soak_tally import Tally
 from envs.object_files import read_object
-from envs.object_meshes import _read_parts, _write_parts
+from envs.object_meshes import Decomposition, _read_parts, _write_parts
+from envs.object_parts import MassProperties
 from models.grasp_policy import GraspPolicyNetwork, load_policy
 from models.graspnet import create_model
 from models.graspnet_io import load_graspnet, save_graspnet
@@ -251,7 +252,11 @@ def _read_intrinsics(path: Path) -> None:
 
 
 _POSE = look_at((0.5, 0.0, 0.8), (0.5, 0.0, 0.0), (1, 0, 0))
-_PARTS = [np.random.default_rng(number).uniform(-1, 1, (8, 3)) for number in range(3)]
+_PARTS = Decomposition(
+    [np.random.default_rng(number).uniform(-1, 1, (8, 3)) for number in range(3)],
+    MassProperties(1.0, np.zeros(3), np.eye(3)),
+    "",
+)
 
 KINDS = (
     Kind("config.yaml", _text(yaml.safe_dump(load_config().model_dump(mode="json"))), load_config),

@@ -105,7 +105,7 @@ class ObjectModel:
     collision: a native shape, or an OBJ file with one `o` group for each convex part.
     fine_visual: the original mesh for pictures, None where the collision shape is the original.
     extents: (3,) sides of the bounding box along the body axes.
-    remark: what of its file was not taken as it stands, or empty.
+    remarks: what of its file was not taken as it stands.
     """
 
     name: str
@@ -119,7 +119,7 @@ class ObjectModel:
     extents: np.ndarray
     rolling_friction: float = 0.0
     spinning_friction: float = 0.0
-    remark: str = ""
+    remarks: tuple[str, ...] = ()
 
     def geometry(self) -> tuple[ConvexSolid, ...]:
         """The convex parts as solids, in the body frame."""

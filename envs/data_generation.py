@@ -65,6 +65,8 @@ def _content(config: Config) -> str:
     for key in ("depth_noise", "depth_noise_args"):  # images are stored clean
         chosen["camera"].pop(key)
     chosen["objects"] = everything["objects"] | {"split": "train"}
+    if not config.objects.skip_broken:  # so that data made before there was this key stays valid
+        chosen["objects"].pop("skip_broken")
     data = everything["data"]
     chosen["data"] = {
         key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")

@@ -93,6 +93,7 @@ def approach_of(name: str, config: Config) -> PolicyApproach:
 def work(config: Config, task: Task) -> TaskResult:
     """Let each policy of a task work on its scene."""
     cell, objects = cell_of(config), load_objects(task.objects, config)
+    objects.told = True  # by the main process, which prepares the sets
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
     for name, controller in task.policies:

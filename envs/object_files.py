@@ -6,6 +6,7 @@ Lengths and axes stay those of the file. This module knows no simulator and no o
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,20 +70,28 @@ class ObjectSource:
     visual_mesh: trimesh.Trimesh | None = None
 
 
-def object_files(folder: Path) -> list[Path]:
+def object_files(folder: Path, skip_broken: bool = False) -> list[Path]:
     """List the URDF and mesh files below a folder, sorted, without the meshes that its URDFs refer
     to.
 
-    Raises ObjectError for a folder that holds none, and for a URDF that is not XML.
+    Raises ObjectError for a folder that holds none, and for a URDF that is not XML; the latter is
+    listed with `skip_broken`, so that whoever reads it can say so.
     """
     files = sorted(
         path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
     )
     referred: set[Path] = set()
     for path in files:
-        if path.suffix.lower() == ".urdf":
-            for mesh in parse_xml(path).iter("mesh"):
-                referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
+        if path.suffix.lower() != ".urdf":
+            continue
+        try:
+            meshes = parse_xml(path).iter("mesh")
+        except ObjectError:
+            if not skip_broken:
+                raise
+            continue
+        for mesh in meshes:
+            referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
     files = [path for path in files if path.resolve() not in referred]
     if not files:
         raise ObjectError(
@@ -143,12 +152,14 @@ def _read_urdf(path: Path) -> ObjectSource:
         # Reading the mesh first gives an error that names it, which yourdfpy's error may not.
         load_mesh(_resolve_mesh(element.get("filename", ""), path))
     try:
-        robot = yourdfpy.URDF.load(
-            str(path),
-            build_collision_scene_graph=True,
-            load_collision_meshes=True,
-            filename_handler=lambda fname: _resolve_mesh(fname, path),
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of textures whose coordinates are no numbers, say
+            robot = yourdfpy.URDF.load(
+                str(path),
+                build_collision_scene_graph=True,
+                load_collision_meshes=True,
+                filename_handler=lambda fname: _resolve_mesh(fname, path),
+            )
         # Collision geometry is solid; a URDF without any is solid where its visual geometry is.
         scene = robot.collision_scene if robot.collision_scene.geometry else robot.scene
         mesh, visual = scene.to_mesh(), robot.scene.to_mesh()
@@ -186,8 +197,10 @@ def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
         own = np.zeros((3, 3)) if link.inertial.inertia is None else link.inertial.inertia
         stated.append((mass, T[:3, 3], T[:3, :3] @ np.asarray(own, float) @ T[:3, :3].T))
     total = sum(mass for mass, _, _ in stated)
-    if total == 0.0:
+    if not stated:
         return None
+    if total == 0.0:
+        raise ValueError("its links state 0 kg in all: state more, or leave <inertial> out")
     centre = sum(mass * at for mass, at, _ in stated) / total
     inertia = np.zeros((3, 3))
     for mass, at, own in stated:  # the parallel axis theorem

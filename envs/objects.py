@@ -7,10 +7,11 @@ the axes of its source. This module knows neither robot nor scene, and no file f
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,13 +22,8 @@ from tqdm import tqdm
 
 from envs.cell_layout import ObjectModel
 from envs.object_files import Inertial, fine_visual, object_files, read_object
-from envs.object_meshes import (
-    MassProperties,
-    ObjectError,
-    decompose,
-    mass_properties,
-    write_parts_obj,
-)
+from envs.object_meshes import ObjectError, decompose, write_parts_obj
+from envs.object_parts import MassProperties
 from envs.object_primitives import (
     FAMILIES,
     THIN_FAMILIES,
@@ -54,10 +50,17 @@ RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda han
 DEFAULT_DENSITY = 700.0
 # An inertia below this share of that of a solid of even density is a placeholder, too.
 LEAST_INERTIA = 0.1
+IMPOSSIBLE_INERTIA = (
+    "states an inertia that no body of its mass and shape can have; that of an even density is "
+    "taken instead"
+)
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
 LARGEST_EXTENT = 0.5
-SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 1e3  # m
+SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 3.0  # m
+USUAL_OBJECT = 0.1  # m, to which a guess of a file's unit is to lead
+# kg/m3: foam has 10, platinum 21,500.
+LIGHTEST, DENSEST = 1.0, 25_000.0
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
 # Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
 ROLLING_FRICTION = 0.0005
@@ -71,8 +74,17 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.told = False  # whether the user has been told the notes, by another process
         self._models: dict[int, ObjectModel] = {}
         self._order: list[int] | None = None
+        self._notes: dict[str, str] = {}  # a sentence for each kind of remark
+        self._said: set[str] = set()  # the kinds that the user has been told
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What the user should know of the objects made so far: a sentence for each kind of
+        remark."""
+        return self._notes
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -91,8 +103,16 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
     def __getitem__(self, index: int) -> ObjectModel:
         index = range(len(self))[index]  # negative indices, and IndexError past the end
         if index not in self._models:
-            self._models[index] = self._build(index)
+            self.keep(index, self._build(index), self._notes)
         return self._models[index]
+
+    def keep(self, index: int, model: ObjectModel, notes: dict[str, str]) -> None:
+        """Take an object that a copy of this set has made, with the copy's notes."""
+        self._models[index] = model
+        self._notes = notes | self._notes
+        for kind in [] if self.told else [kind for kind in self._notes if kind not in self._said]:
+            self._said.add(kind)
+            warnings.warn(self._notes[kind], stacklevel=3)
 
 
 class ObjectPart(ObjectSet):
@@ -119,6 +139,7 @@ class SetSettings:
     density: float
     max_opening: float
     cache_dir: Path
+    skip_broken: bool = False
 
 
 def load_object_set(
@@ -130,6 +151,7 @@ def load_object_set(
     density: float = DEFAULT_DENSITY,
     max_opening: float = GripperGeometry().max_opening,
     cache_dir: str | Path,
+    skip_broken: bool = False,
 ) -> ObjectSet:
     """A set of `OBJECT_SETS`, every URDF and mesh file below a folder (in metres), or a plug-in.
 
@@ -146,6 +168,8 @@ def load_object_set(
     max_opening: m, of the gripper; a warning names the first object of a folder that is far too
         large for it.
     cache_dir: where convex parts are kept.
+    skip_broken: of a folder, let another file take the place of one that cannot be used; a warning
+        names it.
     Raises UserError for an unknown name, a missing or empty folder, a plug-in that cannot be used,
     a split or number that is not allowed; a broken mesh raises it when its object is asked for.
     """
@@ -154,7 +178,7 @@ def load_object_set(
     for key, value in {"scale": scale, "fit": fit, "density": density}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ObjectError(f"objects.{key} is {value}; it must be a number above 0")
-    settings = SetSettings(split, scale, fit, density, max_opening, Path(cache_dir))
+    settings = SetSettings(split, scale, fit, density, max_opening, Path(cache_dir), skip_broken)
     check_object_set(name_or_path, "objects")
     if name_or_path in OBJECT_SETS:
         return OBJECT_SETS[name_or_path](settings)
@@ -180,7 +204,8 @@ def check_object_set(name_or_path: str, where: str) -> None:
 
 def _folder(folder: Path, settings: SetSettings) -> ObjectSet:
     folder = folder.expanduser()
-    return FileSet(folder.resolve().name, object_files(folder), settings.scale or 1.0, settings)
+    files = object_files(folder, settings.skip_broken)
+    return FileSet(folder.resolve().name, files, settings.scale or 1.0, settings)
 
 
 def _plugin(path: str, settings: SetSettings) -> ObjectSet:
@@ -216,16 +241,19 @@ def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> N
     """Make every object of a set, in parallel, so that the cache holds it. One remark names those
     that do not fit the gripper."""
     make, indices = partial(_make, objects, gripper), range(len(objects))
-    made: Iterable[tuple[int, ObjectModel, bool]]
+    made: Iterable[tuple[int, ObjectModel, bool, dict[str, str]]]
     if min(workers.size(), len(objects)) > 1:
         made = completed(workers, make, indices)
     else:  # no process has to be started
         made = map(make, indices)
     too_large = {}
-    for index, model, fitting in tqdm(made, total=len(objects), desc=f"objects {objects.name}"):
-        objects._models[index] = model
-        if not fitting:
-            too_large[index] = model.name
+    with tqdm(total=len(objects), desc=f"objects {objects.name}") as progress:
+        for index, model, fitting, notes in made:
+            objects.keep(index, model, notes)
+            progress.set_postfix_str(model.name, refresh=False)
+            progress.update()
+            if not fitting:
+                too_large[index] = model.name
     if too_large:
         names = ", ".join(too_large[index] for index in sorted(too_large))
         warnings.warn(
@@ -238,9 +266,9 @@ def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> N
 
 def _make(
     objects: ObjectSet, gripper: GripperGeometry, index: int
-) -> tuple[int, ObjectModel, bool]:
-    model = objects[index]
-    return index, model, fits(model, gripper)
+) -> tuple[int, ObjectModel, bool, dict[str, str]]:
+    model = objects._build(index)
+    return index, model, fits(model, gripper), objects.notes
 
 
 @lru_cache(maxsize=1024)
@@ -334,30 +362,40 @@ class FileSet(ObjectSet):
         self.files, self.scale = tuple(files), scale
         self.fit, self.density = settings.fit, settings.density
         self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
+        self.skip_broken = settings.skip_broken
         # random_urdfs is known to hold a few that no hand can take, and placeholders for inertias;
         # of a folder both are a surprise.
-        self._warned = name == "random_urdfs"
-        self._remarked = self._warned
+        self.told = name == "random_urdfs"
 
     def __len__(self) -> int:
         return len(self.files)
 
     def _build(self, index: int) -> ObjectModel:
-        path = self.files[index]
+        for path in (*self.files[index:], *self.files[:index]):
+            try:
+                return self._load(path)
+            except ObjectError as error:
+                if not self.skip_broken:
+                    raise
+                self._notes[str(path)] = f"objects.skip_broken leaves out a file: {error}"
+        raise ObjectError(
+            f"objects {self.name}: none of {len(self.files)} files can be used; set "
+            "objects.skip_broken=false to read why"
+        )
+
+    def _load(self, path: Path) -> ObjectModel:
         model = load_object(
             path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
         )
-        if model.remark and not self._remarked:
-            self._remarked = True
-            warnings.warn(f"object {path}: {model.remark} (and so may others)", stacklevel=3)
-        if model.extents.max() > LARGEST_EXTENT and not self._warned:
-            self._warned = True
+        for remark in model.remarks:
+            self._notes.setdefault(remark, f"object {path}: {remark} (and so may others)")
+        if model.extents.max() > LARGEST_EXTENT:
             sides = " x ".join(f"{side:.3g}" for side in model.extents)
-            warnings.warn(
+            self._notes.setdefault(
+                "too large",
                 f"object {path} measures {sides} m, too large for a hand that opens "
                 f"{self.max_opening} m (and so may others be); set objects.fit, for example to "
                 "0.06, or objects.scale",
-                stacklevel=3,
             )
         return model
 
@@ -417,24 +455,26 @@ def load_object(
     """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
 
     scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
-    volume. Raises ObjectError naming the file.
+    volume; lengths beyond LARGEST_OBJECT are taken for the millimetres or centimetres of a body of
+    that mass. Raises ObjectError naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
     source = read_object(path)
-    parts = decompose(source.mesh, cache_dir, str(path))
-    solid = mass_properties(source.mesh, parts)
+    side = float(np.ptp(source.mesh.vertices, axis=0).max())
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
-    inertial = body_of(source.inertial, solid, source.mesh, density)
-    replaced = source.inertial is not None and inertial is not source.inertial
-    parts = tuple(scale * (part - inertial.centre_of_mass) for part in parts)
-    side = float(np.ptp(np.concatenate(parts), axis=0).max())
-    if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
-        raise ObjectError(
-            f"object {path} is {side:.3g} m long, which no simulator bears; set objects.fit, for "
-            "example to 0.06, or objects.scale"
-        )
+    _check_size(path, scale * side, scale)
+    cut = decompose(source.mesh, cache_dir, str(path))
+    stated = None
+    if source.inertial is not None:
+        stated = in_unit(source.inertial, _unit_of(side) if side > LARGEST_OBJECT else 1.0)
+        _check_density(path, source.inertial.mass, stated.mass / cut.solid.volume)
+    inertial = body_of(stated, cut.solid, source.mesh, density)
+    parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
     mass = max(inertial.mass * scale**3, MIN_MASS)
+    remarks = [cut.remark] if cut.remark else []
+    if stated is not None and inertial is not stated:
+        remarks.append(IMPOSSIBLE_INERTIA)
     return ObjectModel(
         name=path.stem,
         parts=parts,
@@ -445,11 +485,44 @@ def load_object(
         collision=write_parts_obj(parts, cache_dir),
         fine_visual=fine_visual(path, source, scale, inertial.centre_of_mass, cache_dir),
         extents=np.ptp(np.concatenate(parts), axis=0),
-        remark="states an inertia that no body of its mass and shape can have; that of an even "
-        "density is taken instead"
-        if replaced
-        else "",
+        remarks=tuple(remarks),
     )
+
+
+def _unit_of(side: float) -> float:
+    """The unit in which something of this length would be as large as things usually are."""
+    units = (0.001, 0.01, 100.0, 1000.0)
+    return min(units, key=lambda unit: abs(math.log(side * unit / USUAL_OBJECT)))
+
+
+def _check_size(path: Path, side: float, scale: float) -> None:
+    if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
+        raise ObjectError(
+            f"object {path} is {side:.3g} m long, expected {SMALLEST_OBJECT:g} to "
+            f"{LARGEST_OBJECT:g} m; its lengths may be in another unit: try "
+            f"objects.scale={scale * _unit_of(side):g}, or objects.fit=0.06"
+        )
+
+
+def _check_density(path: Path, mass: float, density: float) -> None:
+    """mass: kg, as stated. density: kg/m3, of that mass in the mesh."""
+    if not LIGHTEST <= density <= DENSEST:
+        cause = (
+            "in grams, or the mesh smaller than the body"
+            if density > DENSEST
+            else ("in tonnes, or the mesh larger than the body")
+        )
+        raise ObjectError(
+            f"object {path} states {mass:g} kg, which makes {density:.3g} kg/m3 in its mesh, "
+            f"expected {LIGHTEST:g} to {DENSEST:g}; the mass may be {cause}: correct the file, or "
+            "leave <inertial> out of it and let objects.density count"
+        )
+
+
+def in_unit(stated: Inertial, unit: float) -> Inertial:
+    """Return what a file states of a body that is `unit` (in metres) times as large as its lengths
+    say: the same mass over volume, for a body of these lengths in metres."""
+    return replace(stated, mass=stated.mass / unit**3, inertia=stated.inertia / unit**5)
 
 
 def body_of(

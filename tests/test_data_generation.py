@@ -61,10 +61,16 @@ def test_what_matters_to_an_image_changes_the_folder(override):
     [
         "data.frames=64", "data.validation_frames=32", "data.workers=3", "train.lr=1e-4",
         "camera.depth_noise=kinect", "objects.split=train", "evaluate.rounds=3", "cache_dir=x",
+        "objects.skip_broken=false",
     ],
 )  # fmt: skip
 def test_what_does_not_matter_keeps_the_folder(override):
     assert folder_of(override) == folder_of()
+
+
+def test_the_folder_of_a_config_that_skips_nothing_is_that_of_before_there_was_the_key():
+    assert "skip_broken" not in data_generation._content(load_config())
+    assert folder_of("objects.skip_broken=true") != folder_of()
 
 
 def test_a_named_root_is_taken_as_it_is(tmp_path):

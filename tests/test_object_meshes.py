@@ -1,98 +1,37 @@
-"""Meshes: convex parts that cover the solid, mass properties, and a cache that can be trusted."""
+"""Meshes: what is read and refused, and a cache of convex parts that can be trusted."""
 
-import coacd
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import ConvexHull
 
 from envs import object_meshes
-from envs.object_meshes import (
-    ObjectError,
-    checked_mesh,
-    decompose,
-    load_mesh,
-    mass_properties,
-    parse_xml,
-    simplify_hull,
-)
+from envs.object_meshes import ObjectError, checked_mesh, decompose, load_mesh, parse_xml
+from tests.helpers.meshes import l_shape
 
 
-@pytest.fixture
-def l_shape() -> trimesh.Trimesh:
-    """One clean, concave surface: a 3 x 3 x 1 slab without its upper right 2 x 2 quarter."""
-    slab = trimesh.creation.box(bounds=[[0, 0, 0], [3, 3, 1]])
-    quarter = trimesh.creation.box(bounds=[[1, 1, -1], [4, 4, 2]])
-    return trimesh.boolean.difference([slab, quarter], engine="manifold")
-
-
-def two_boxes(overlap: float) -> trimesh.Trimesh:
-    """Two unit cubes one above the other's half, which share a volume of overlap / 2."""
-    second = trimesh.creation.box()
-    second.apply_translation((0.5, 0.0, 1.0 - overlap))
-    return trimesh.util.concatenate([trimesh.creation.box(), second])
-
-
-def inside(points: np.ndarray, part: np.ndarray) -> np.ndarray:
-    planes = ConvexHull(part).equations
-    return (points @ planes[:, :3].T + planes[:, 3]).max(axis=1) <= 1e-6
-
-
-def test_convex_pieces_are_taken_apart_exactly(tmp_path):
-    parts = decompose(two_boxes(overlap=0.2), tmp_path)
-    assert sorted(ConvexHull(part).volume for part in parts) == pytest.approx([1.0, 1.0], rel=1e-5)
-
-
-def test_overlapping_pieces_weigh_once(tmp_path):
-    mesh = two_boxes(overlap=0.2)
-    solid = mass_properties(mesh, decompose(mesh, tmp_path))
-    assert solid.volume == pytest.approx(2.0 - 0.2 * 0.5)
-    assert solid.centre_of_mass[1] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_pieces_that_share_an_edge_are_still_two_solids(tmp_path):
-    second = trimesh.creation.box()
-    second.apply_translation((1.0, 1.0, 0.0))
-    mesh = object_meshes.checked_mesh(
-        trimesh.util.concatenate([trimesh.creation.box(), second]), "edge"
-    )
-    assert not mesh.is_watertight
-    parts = decompose(mesh, tmp_path)
-    assert len(parts) == 2
-    assert mass_properties(mesh, parts).volume == pytest.approx(2.0)
-
-
-def test_mass_properties_of_an_open_mesh_come_from_its_parts(tmp_path):
-    box = trimesh.creation.box((1, 2, 3))
-    box.update_faces(np.arange(len(box.faces)) > 0)
-    solid = mass_properties(box, [box.vertices])
-    assert solid.volume == pytest.approx(6.0)
-    assert np.diag(solid.inertia) == pytest.approx([6 / 12 * 13, 6 / 12 * 10, 6 / 12 * 5])
-
-
-def test_a_concave_surface_is_cut_and_stays_concave(tmp_path, l_shape):
-    parts = decompose(l_shape, tmp_path)
-    assert 2 <= len(parts) <= object_meshes.MAX_PARTS
-    assert max(map(len, parts)) <= object_meshes.MAX_VERTICES
-    surface = trimesh.sample.sample_surface(l_shape, 500, seed=0)[0]
-    centre = l_shape.bounds.mean(axis=0)
-    within = centre + 0.97 * (surface - centre)
-    assert np.any([inside(within, part) for part in parts], axis=0).all()
-    missing_quarter = np.array([[2.0, 2.0, 0.5], [1.5, 1.5, 0.5]])
-    assert not np.any([inside(missing_quarter, part) for part in parts])
-
-
-def test_decomposition_runs_once_for_a_shape_whatever_its_units(tmp_path, l_shape, monkeypatch):
+def test_decomposition_runs_once_for_a_shape_whatever_its_units(tmp_path, monkeypatch):
     calls = []
-    run_coacd = coacd.run_coacd
-    monkeypatch.setattr(coacd, "run_coacd", lambda *a, **k: calls.append(1) or run_coacd(*a, **k))
-    first = decompose(l_shape, tmp_path)
-    millimetres = l_shape.copy()
-    millimetres.apply_scale(1000)
-    second = decompose(millimetres, tmp_path)
+    cut = object_meshes.convex_parts
+    monkeypatch.setattr(object_meshes, "convex_parts", lambda *a: calls.append(1) or cut(*a))
+    mesh = l_shape()
+    first = decompose(mesh, tmp_path)
+    mesh.apply_scale(1000)
+    second = decompose(mesh, tmp_path)
     assert len(calls) == 1
-    for a, b in zip(first, second, strict=True):
+    for a, b in zip(first.parts, second.parts, strict=True):
         assert b == pytest.approx(1000 * a, rel=1e-9, abs=1e-6)
+    assert second.solid.volume == pytest.approx(1e9 * 5)
+    assert second.solid.centre_of_mass == pytest.approx(1000 * first.solid.centre_of_mass)
+    assert second.solid.inertia == pytest.approx(1e15 * first.solid.inertia)
+
+
+def test_a_changed_constant_is_another_file_of_the_cache(tmp_path, monkeypatch):
+    decompose(trimesh.creation.box(), tmp_path)
+    decompose(trimesh.creation.box(), tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr(object_meshes, "_SETTINGS", (*object_meshes._SETTINGS, 1))
+    decompose(trimesh.creation.box(), tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_corrupt_cache_file_is_named(tmp_path):
@@ -116,20 +55,6 @@ def test_writing_leaves_no_temporary_file(tmp_path):
     assert [file.suffix for file in tmp_path.iterdir()] == [".npz"]
 
 
-def test_simplified_hull_keeps_within_its_tolerance():
-    ball = trimesh.creation.icosphere(3, 0.5).vertices
-    assert len(simplify_hull(ball, max_vertices=32)) == 32
-    few = simplify_hull(ball, max_vertices=1000, tolerance=0.01)
-    planes = ConvexHull(few).equations
-    assert (ball @ planes[:, :3].T + planes[:, 3]).max() <= 0.01 + 1e-9
-    assert len(few) < len(ball) / 2
-
-
-def test_simplifying_a_box_changes_nothing():
-    corners = trimesh.creation.box((1, 2, 3)).vertices
-    assert {*map(tuple, simplify_hull(corners))} == {*map(tuple, corners)}
-
-
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -149,13 +74,6 @@ def test_broken_meshes_are_named_with_their_reason(tmp_path, content, reason):
 def test_a_missing_mesh_is_named(tmp_path):
     with pytest.raises(ObjectError, match="none.stl does not exist"):
         load_mesh(tmp_path / "none.stl")
-
-
-def test_a_mesh_turned_inside_out_is_turned_back(tmp_path):
-    box = trimesh.creation.box()
-    box.invert()
-    box.export(tmp_path / "box.stl")
-    assert load_mesh(tmp_path / "box.stl").volume == pytest.approx(1.0)
 
 
 def test_a_damaged_byte_anywhere_in_the_cache_is_refused_or_harmless(tmp_path):

@@ -114,7 +114,7 @@ def test_a_stated_mass_and_inertia_count_and_grow_with_the_size(tmp_path, factor
         tmp_path, "0.4", _written(_moments(0.4, factor)), '<origin xyz="0.005 0 -0.01"/>'
     )
     model = load_object(path, scale=0.9, density=5000, cache_dir=tmp_path)
-    assert model.mass == pytest.approx(0.4 * 0.9**3) and not model.remark
+    assert model.mass == pytest.approx(0.4 * 0.9**3) and not model.remarks
     assert model.inertia == pytest.approx(_moments(0.4, factor) * 0.9**5)
     middle = (np.concatenate(model.parts).max(axis=0) + np.concatenate(model.parts).min(axis=0)) / 2
     assert middle == pytest.approx(0.9 * np.array([-0.005, 0, 0.01]), abs=1e-6)
@@ -134,7 +134,7 @@ def test_a_stated_mass_and_inertia_count_and_grow_with_the_size(tmp_path, factor
 def test_of_an_impossible_inertia_the_mass_alone_counts(tmp_path, inertia, origin):
     path = _urdf_box(tmp_path, "0.4", _written(inertia), origin)
     model = load_object(path, cache_dir=tmp_path)
-    assert model.mass == pytest.approx(0.4) and "inertia" in model.remark
+    assert model.mass == pytest.approx(0.4) and "inertia" in model.remarks[0]
     assert model.inertia == pytest.approx(_moments(0.4))
     assert np.concatenate(model.parts).mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
 
@@ -509,16 +509,108 @@ def test_fit_makes_the_middle_side_what_it_says(tmp_path):
     assert np.sort(model.extents) == pytest.approx([0.0225, 0.03, 0.06], abs=1e-6)
 
 
-def test_objects_in_wrong_units_warn_once(tmp_path):
+def test_objects_too_large_for_the_hand_warn_once(tmp_path):
     (tmp_path / "big").mkdir()
     for name in ("a", "b"):
-        trimesh.creation.box((3, 4, 8)).export(tmp_path / "big" / f"{name}.stl")
+        trimesh.creation.box((0.3, 0.4, 0.8)).export(tmp_path / "big" / f"{name}.stl")
     objects = load_object_set(str(tmp_path / "big"), cache_dir=tmp_path / "cache")
     with pytest.warns(UserWarning, match="a.stl .* opens 0.08 m .*objects.fit"):
         objects[0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         objects[1]
+
+
+# --- Files that are wrong -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("side", "scale", "advice"),
+    [
+        (92.0, 1.0, "0.001"),  # a mug in millimetres
+        (9.2, 1.0, "0.01"),  # in centimetres
+        (9.2, 0.5, "0.005"),
+        (9.2e-5, 1.0, "1000"),
+    ],
+)
+def test_a_mesh_in_another_unit_is_told_the_scale_to_try(tmp_path, side, scale, advice):
+    trimesh.creation.box((0.8 * side, 0.9 * side, side)).export(tmp_path / "mug.stl")
+    size = f"{side * scale:.3g}".replace("+", r"\+")
+    message = f"mug.stl is {size} m long, expected .* to 3 m; .* try objects.scale={advice},"
+    with pytest.raises(ObjectError, match=message) as error:
+        load_object(tmp_path / "mug.stl", scale=scale, cache_dir=tmp_path)
+    assert "\n" not in str(error.value)
+    load_object(tmp_path / "mug.stl", scale=float(advice), cache_dir=tmp_path)
+
+
+def test_a_mass_stays_that_of_the_body_where_lengths_are_millimetres(tmp_path):
+    path = _urdf_box(tmp_path, "0.4", _written(_moments(0.4)))
+    text = path.read_text().replace("0.04 0.05 0.06", "40 50 60")
+    path.write_text(text)
+    model = load_object(path, scale=0.001, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(0.4) and not model.remarks
+    assert model.inertia == pytest.approx(_moments(0.4))
+    half = load_object(path, scale=0.0005, cache_dir=tmp_path)
+    assert half.mass == pytest.approx(0.4 / 8)
+
+
+@pytest.mark.parametrize(
+    ("mass", "message"),
+    [
+        ("0", "box.urdf .*0 kg in all"),
+        ("400", "box.urdf states 400 kg, .* 3.33e\\+06 kg/m3 .* to 25000; .* in grams"),
+        ("1e-5", "box.urdf states 1e-05 kg, .* 0.0833 kg/m3 .* expected 1 to .* in tonnes"),
+    ],
+)
+def test_a_mass_that_no_body_of_that_size_has_is_refused(tmp_path, mass, message):
+    path = _urdf_box(tmp_path, mass, _written(_moments(0.4)))
+    with pytest.raises(ObjectError, match=message):
+        load_object(path, cache_dir=tmp_path)
+
+
+def _write_bad_folder(folder: Path) -> None:
+    """Two sound boxes, two that are inside out, and three files that are none."""
+    folder.mkdir()
+    box = trimesh.creation.box((0.03, 0.04, 0.08))
+    for name in ("b", "e"):
+        box.export(folder / f"{name}.stl")
+    box.invert()
+    for name in ("c", "f"):
+        box.export(folder / f"{name}.stl")
+    (folder / "a.obj").write_text("v 0 0 0\n")
+    (folder / "d.urdf").write_text("<robot")
+    trimesh.creation.box((30, 40, 80)).export(folder / "g.stl")
+
+
+def test_broken_files_end_a_run_unless_they_are_skipped(tmp_path):
+    _write_bad_folder(tmp_path / "set")
+    with pytest.raises(ObjectError, match=r"d\.urdf cannot be read"):
+        load_object_set(str(tmp_path / "set"), cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_skipped_files_and_mended_ones_are_named_once_for_a_set(tmp_path, count):
+    _write_bad_folder(tmp_path / "set")
+    objects = load_object_set(str(tmp_path / "set"), skip_broken=True, cache_dir=tmp_path)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        with open_executor(load_config().compute, count) as workers:
+            prepare(objects, workers, GripperGeometry())
+        said = sorted(str(one.message) for one in found)
+    assert len(said) == 4
+    for name in ("a.obj", "d.urdf", "g.stl"):
+        assert sum("objects.skip_broken leaves out" in text and name in text for text in said) == 1
+    assert sum("inside out" in text and "(and so may others)" in text for text in said) == 1
+    assert [model.name for model in objects] == ["b", "b", "c", "e", "e", "f", "b"]
+    assert all(model.extents == pytest.approx([0.03, 0.04, 0.08]) for model in objects)
+
+
+def test_a_set_of_broken_files_alone_is_refused(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "a.obj").write_text("v 0 0 0\n")
+    objects = load_object_set(str(tmp_path / "set"), skip_broken=True, cache_dir=tmp_path)
+    with pytest.raises(ObjectError, match="none of 1 files can be used"):
+        objects[0]
 
 
 # --- errors ---------------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def test_what_is_kept_is_made_once_for_a_job_and_closed_after_it():
 
 def test_packages_that_make_the_bits_are_compared():
     """Images, meshes and shards; the names are those of requirements.txt."""
-    makers = {"opencv-python-headless", "pillow", "trimesh", "coacd", "manifold3d", "h5py"}
+    makers = {"opencv-python-headless", "pillow", "trimesh", "manifold3d", "h5py"}
     facts = facts_of([])
     assert makers <= set(facts)
     assert all(facts[name] == version(name) for name in makers)

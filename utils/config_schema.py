@@ -117,7 +117,8 @@ class ObjectsConfig(Section):
     split: Literal["test", "train", "sealed", "unseen_families"]
     scale: Positive | None
     fit: Positive | None
-    density: Positive
+    density: Annotated[float, Field(ge=1, le=25_000)]
+    skip_broken: bool
 
 
 class SceneConfig(Section):

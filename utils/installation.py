@@ -9,7 +9,7 @@ import sys
 # The packages of requirements.txt, under the names by which they are imported. PyBullet is not
 # among them: where it is missing, MuJoCo does its work.
 PACKAGES = (
-    "PIL", "coacd", "collada", "cv2", "gymnasium", "h5py", "imageio", "imageio_ffmpeg", "jinja2",
+    "PIL", "collada", "cv2", "gymnasium", "h5py", "imageio", "imageio_ffmpeg", "jinja2",
     "manifold3d", "matplotlib", "mujoco", "numpy", "onnx", "onnxscript", "pydantic", "scipy",
     "tensorboard", "torch", "torchvision", "tqdm", "trimesh", "typing_extensions", "yaml",
     "yourdfpy",

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = (  # whose versions may change a result
     "numpy", "scipy", "torch", "torchvision", "pybullet", "mujoco", "gymnasium", "pydantic",
-    "opencv-python-headless", "pillow", "trimesh", "coacd", "manifold3d", "pycollada", "yourdfpy",
+    "opencv-python-headless", "pillow", "trimesh", "manifold3d", "pycollada", "yourdfpy",
     "h5py",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
