@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import count, repeat
-from threading import Event
+from threading import Event, Timer
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -166,6 +168,25 @@ def test_a_process_that_freezes_is_replaced(tmp_path, monkeypatch):
     with open_executor(compute, 2) as workers:
         function = partial(first_time, tmp_path, freeze)
         assert sorted(completed(workers, function, range(3))) == [0, 1, 4]
+
+
+def test_a_process_that_starts_late_and_freezes_is_ended(monkeypatch):
+    """A busy machine needs longer to start it than a call may take; only then does it freeze."""
+    monkeypatch.setattr(executor, "FREEZE_SECONDS", 0.05)
+    number, call, ended = Future(), Future(), []
+
+    def end(pid, signal):
+        ended.append(pid)
+        if not call.done():
+            call.set_exception(BrokenProcessPool())
+
+    monkeypatch.setattr(executor.os, "kill", end)
+    process = object.__new__(executor._Process)
+    process._pool, process._number = SimpleNamespace(submit=lambda *_: call), number
+    Timer(0.4, number.set_result, [4711]).start()
+    with pytest.raises(BrokenProcessPool):
+        process.run(executor.Job("late", 0.05), print)
+    assert set(ended) == {4711}
 
 
 def test_a_call_that_ends_every_worker_is_an_error(compute):

@@ -193,6 +193,7 @@ class _Process:
     def run(self, job: Job, call: Call) -> Any:
         """The result of a call. Raises BrokenProcessPool where the process has died."""
         future = self._pool.submit(work, job, call)
+        wait([self._number])  # a busy machine may take long to start it, which does not count
         if not wait([future], job.seconds + FREEZE_SECONDS).done:
             self._kill()
         try:
