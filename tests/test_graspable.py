@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from envs.object_primitives import NativeShape, make_primitive
 from models.graspable import is_graspable, resting_poses
@@ -29,6 +30,11 @@ def test_a_ball_fits_up_to_its_diameter(radius, fits):
     """Over the equator of a ball of 96 mm the hand finds 74 mm, but its pads would slide off: they
     are 40 degrees from vertical there, and the friction cone has 35."""
     assert is_graspable(solids("sphere", radius), 0.7, HAND) == fits
+
+
+def test_the_facets_of_a_rough_ball_are_no_handle():
+    ball = trimesh.creation.icosphere(1, 0.06).vertices  # 80 facets
+    assert not is_graspable([ConvexSolid.from_vertices(ball)], 0.7, HAND)
 
 
 def test_a_wide_ring_fits_by_its_wall():
