@@ -25,16 +25,12 @@ def test_a_box_fits_whose_smallest_side_leaves_3_mm_beside_each_finger(sides, fi
     assert is_graspable(solids("box", *sides), 0.7, GripperGeometry(max_opening=0.10))
 
 
-@pytest.mark.parametrize(("radius", "fits"), [(0.03, True), (0.036, True), (0.048, False)])
+@pytest.mark.parametrize(("radius", "fits"), [(0.03, True), (0.036, True), (0.06, False)])
 def test_a_ball_fits_up_to_its_diameter(radius, fits):
-    """Over the equator of a ball of 96 mm the hand finds 74 mm, but its pads would slide off: they
-    are 40 degrees from vertical there, and the friction cone has 35."""
-    assert is_graspable(solids("sphere", radius), 0.7, HAND) == fits
-
-
-def test_the_facets_of_a_rough_ball_are_no_handle():
-    ball = trimesh.creation.icosphere(1, 0.06).vertices  # 80 facets
-    assert not is_graspable([ConvexSolid.from_vertices(ball)], 0.7, HAND)
+    """Over the equator of a ball of 12 cm, a rough one of 80 facets, the hand finds 74 mm, but its
+    pads would slide off: they are 52 degrees from vertical there, and the friction cone has 35."""
+    ball = trimesh.creation.icosphere(1, radius).vertices
+    assert is_graspable([ConvexSolid.from_vertices(ball)], 0.7, HAND) == fits
 
 
 def test_a_wide_ring_fits_by_its_wall():
