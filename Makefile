@@ -29,6 +29,7 @@ cluster: export OMP_NUM_THREADS := 1
 cluster: export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED := False
 cluster: $(VENV)/.installed-cluster
 	$(BIN)/dask scheduler --host 127.0.0.1 --port 8786 & trap "kill $$! 2>/dev/null" EXIT INT TERM; \
+	echo "in another terminal: .venv/bin/python evaluate.py compute.scheduler=tcp://127.0.0.1:8786 (Ctrl-C here ends the cluster)"; \
 	$(BIN)/dask worker tcp://127.0.0.1:8786 --nworkers $(WORKERS) --nthreads 1
 
 test: $(VENV)/.installed-dev

@@ -22,12 +22,13 @@ from envs.transfer_plan import COLUMNS
 from models.grasp_policy import ACTIVATIONS
 from models.graspnet_backbones import BACKBONES
 from utils.config import Config
+from utils.config_types import AUTO
 from utils.depth import make_depth_noise
 from utils.errors import unknown_choice
 from utils.real_data import FORMATS
 
 REGISTRIES: dict[str, Collection[str]] = {
-    "simulator": SIMULATORS,
+    "simulator": (AUTO, *SIMULATORS),
     "scene.simulator": SIMULATORS,
     "closed_loop.controller": CONTROLLERS,
     "data.kind": ("simulated", *FORMATS),

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from utils.runs import (
     git_state,
     new_run_folder,
     parse_args,
+    plain_remarks,
     run_of_job,
     run_script,
     save_results,
@@ -30,6 +32,15 @@ from utils.runs import (
     write_atomic,
     write_json_atomic,
 )
+
+
+def test_remarks_are_plain_lines_and_faults_keep_their_place(monkeypatch):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    plain_remarks()
+    remark = warnings.formatwarning(UserWarning("2 of 26\nobjects"), UserWarning, "a.py", 3)
+    assert remark == "note: 2 of 26 objects\n"
+    fault = warnings.formatwarning(RuntimeWarning("nan"), RuntimeWarning, "a.py", 3)
+    assert fault.startswith("a.py:3: RuntimeWarning: nan")
 
 
 def test_a_job_of_torchrun_finds_the_run_that_it_has_begun(tmp_path, monkeypatch):

@@ -40,7 +40,7 @@ from typing import Any, TypeVar
 from utils.config_schema import ComputeConfig
 from utils.errors import UserError
 from utils.plugins import loaded_modules
-from utils.runs import usable_cpus
+from utils.runs import plain_remarks, usable_cpus
 from utils.worker_process import (
     SOURCES,
     Job,
@@ -215,6 +215,7 @@ def _begin_process() -> None:
     """In a new process: leave signals to the main process, and end with it, even if it is killed;
     it would be waited for without an end."""
     leave_signals()
+    plain_remarks()
     Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
@@ -94,6 +95,24 @@ def parse_args(
     return load_config(path, options.overrides), options
 
 
+def plain_remarks() -> None:
+    """Print this project's remarks, which are `UserWarning`s, as one plain line each."""
+    whole = warnings.formatwarning
+
+    def line(
+        message: Warning | str,
+        category: type[Warning],
+        file: str,
+        row: int,
+        code: str | None = None,
+    ) -> str:
+        if category is UserWarning:
+            return f"note: {' '.join(str(message).split())}\n"
+        return whole(message, category, file, row, code)
+
+    warnings.formatwarning = line
+
+
 def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     """Run `main(argv)` and exit with its status (None is 0).
 
@@ -106,6 +125,7 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     """
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
+    plain_remarks()
     terminated = []
 
     def terminate(*_: object) -> None:
