@@ -99,18 +99,18 @@ def plain_remarks() -> None:
     """Print this project's remarks, which are `UserWarning`s, as one plain line each."""
     whole = warnings.formatwarning
 
-    def line(
+    def plain(
         message: Warning | str,
         category: type[Warning],
-        file: str,
-        row: int,
-        code: str | None = None,
+        filename: str,
+        lineno: int,
+        line: str | None = None,
     ) -> str:
         if category is UserWarning:
             return f"note: {' '.join(str(message).split())}\n"
-        return whole(message, category, file, row, code)
+        return whole(message, category, filename, lineno, line)
 
-    warnings.formatwarning = line
+    warnings.formatwarning = plain
 
 
 def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
