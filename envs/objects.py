@@ -363,8 +363,8 @@ class FileSet(ObjectSet):
         self.fit, self.density = settings.fit, settings.density
         self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
         self.skip_broken = settings.skip_broken
-        # random_urdfs is known to hold a few that no hand can take, and placeholders for inertias;
-        # of a folder both are a surprise.
+        # random_urdfs is known to hold a few that no hand can take, placeholders for inertias, and
+        # 0.1 kg for each, however thin; of a folder all of it is a surprise.
         self.told = name == "random_urdfs"
 
     def __len__(self) -> int:
@@ -385,8 +385,9 @@ class FileSet(ObjectSet):
 
     def _load(self, path: Path) -> ObjectModel:
         model = load_object(
-            path, scale=self.scale, fit=self.fit, density=self.density, cache_dir=self.cache_dir
-        )
+            path, scale=self.scale, fit=self.fit, density=self.density,
+            any_mass=self.told, cache_dir=self.cache_dir,
+        )  # fmt: skip
         for remark in model.remarks:
             self._notes.setdefault(remark, f"object {path}: {remark} (and so may others)")
         if model.extents.max() > LARGEST_EXTENT:
@@ -450,13 +451,15 @@ def load_object(
     scale: float = 1.0,
     fit: float | None = None,
     density: float = DEFAULT_DENSITY,
+    any_mass: bool = False,
     cache_dir: str | Path,
 ) -> ObjectModel:
     """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
 
     scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
     volume; lengths beyond LARGEST_OBJECT are taken for the millimetres or centimetres of a body of
-    that mass. Raises ObjectError naming the file.
+    that mass. any_mass: take it even where no material is as heavy or as light. Raises ObjectError
+    naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
     source = read_object(path)
@@ -468,7 +471,8 @@ def load_object(
     stated = None
     if source.inertial is not None:
         stated = in_unit(source.inertial, _unit_of(side) if side > LARGEST_OBJECT else 1.0)
-        _check_density(path, source.inertial.mass, stated.mass / cut.solid.volume)
+        if not any_mass:
+            _check_density(path, source.inertial.mass, stated.mass / cut.solid.volume)
     inertial = body_of(stated, cut.solid, source.mesh, density)
     parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
     mass = max(inertial.mass * scale**3, MIN_MASS)

@@ -277,6 +277,16 @@ def test_sizes_and_disjoint_splits(tmp_path, name, train_size, key):
     assert not set(getattr(train, key)) & set(getattr(test, key))
 
 
+@needs_pybullet
+def test_random_urdfs_weigh_a_tenth_of_a_kilogram_however_thin(tmp_path):
+    """Number 350 fills 0.24 cm3; a file of a user would be refused. The set is scaled by 0.65."""
+    objects = load_object_set("random_urdfs", cache_dir=tmp_path)
+    (thin,) = (n for n, file in enumerate(objects.files) if file.stem == "350")
+    assert objects[thin].mass == pytest.approx(0.1 * 0.65**3)
+    with pytest.raises(ObjectError, match="350.urdf states 0.1 kg, which makes 4.2e"):
+        load_object(objects.files[thin], cache_dir=tmp_path)
+
+
 def test_families_are_equally_frequent(tmp_path):
     indices = load_object_set("primitives", split="train", cache_dir=tmp_path).indices
     counts = np.bincount([index % len(FAMILIES) for index in indices])
