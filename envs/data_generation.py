@@ -41,7 +41,7 @@ HELD_OUT = 10  # every tenth training object is kept for validation
 FRAMES_PER_SCENE = 4  # the whole scene, then parts of it, as in a round that clears it
 SCENES_PER_SHARD = 8
 MOST_DRAWS = 100  # for one scene; each draw tries several times to place its objects
-_LAYOUT_SHARES = {"isolated": 0.15, "packed": 0.35, "pile": 0.5}
+_LAYOUT_SHARES = {"isolated": 0.1, "packed": 0.3, "pile": 0.4, "bin": 0.2}
 _PHYSICS = ("object_friction", "object_mass")  # on which labels and their trials can depend
 _FIRST_SEED = {
     "train": 1_000_000_000,

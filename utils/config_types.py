@@ -64,16 +64,19 @@ def _installed_simulator(name: str) -> str:
 
 
 def _offered_sets(names: tuple[str, ...], sets: tuple[str, ...]) -> tuple[str, ...]:
-    """`auto` is `sets`, or else primitives where pybullet_data, which brings random_urdfs, is not
-    installed."""
+    """`auto` is `sets`; without random_urdfs, or else primitives, where pybullet_data, which brings
+    the former, is not installed."""
     if names != (AUTO,):
         return names
-    return ("primitives",) if importlib.util.find_spec("pybullet_data") is None else sets
+    if importlib.util.find_spec("pybullet_data") is None:
+        sets = tuple(name for name in sets if name != "random_urdfs")
+    return sets or ("primitives",)
 
 
 SimulatorName = Annotated[Name, AfterValidator(_installed_simulator)]
 TrainingSets = Annotated[
-    Names, AfterValidator(lambda names: _offered_sets(names, ("random_urdfs", "primitives")))
+    Names,
+    AfterValidator(lambda names: _offered_sets(names, ("random_urdfs", "primitives", "thin"))),
 ]
 TestSets = Annotated[Names, AfterValidator(lambda names: _offered_sets(names, ("random_urdfs",)))]
 
