@@ -42,6 +42,7 @@ FRAMES_PER_SCENE = 4  # the whole scene, then parts of it, as in a round that cl
 SCENES_PER_SHARD = 8
 MOST_DRAWS = 100  # for one scene; each draw tries several times to place its objects
 _LAYOUT_SHARES = {"isolated": 0.1, "packed": 0.3, "pile": 0.4, "bin": 0.2}
+_MOST_PACKED = 6  # objects side by side; for eight, 50 draws often find no places, for ten none did
 _PHYSICS = ("object_friction", "object_mass")  # on which labels and their trials can depend
 _FIRST_SEED = {
     "train": 1_000_000_000,
@@ -79,6 +80,7 @@ def _content(config: Config) -> str:
         "frames_per_scene": FRAMES_PER_SCENE,
         "scenes_per_shard": SCENES_PER_SHARD,
         "layout_shares": _LAYOUT_SHARES,
+        "most_packed": _MOST_PACKED,
         "first_seed": _FIRST_SEED,
     }
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
@@ -234,7 +236,10 @@ def draw_scene(
     for _ in range(MOST_DRAWS):
         layout = layouts[rng.choice(len(layouts), p=shares)]
         name = config.data.object_sets[rng.integers(len(config.data.object_sets))]
-        count = int(rng.integers(2, config.data.max_objects + 1))
+        most = config.data.max_objects
+        if layout == "packed":
+            most = min(most, _MOST_PACKED)
+        count = int(rng.integers(2, most + 1))
         crowded = with_settings(config, "scene", {"count": count})
         try:
             scene_seed = int(rng.integers(2**62))

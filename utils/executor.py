@@ -9,6 +9,7 @@ what the calls compute.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import multiprocessing
@@ -32,7 +33,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from threading import Event, Thread
 from typing import Any, TypeVar
@@ -294,6 +295,20 @@ class _Packed:
         return self._call, ()
 
 
+@cache
+def _event_loop() -> Any:
+    """A Tornado loop that runs in a thread until the process ends. Dask would start one itself, and
+    fails if it does not run within ten seconds, which a busy machine may need."""
+    from tornado.ioloop import IOLoop
+
+    async def current() -> IOLoop:
+        return IOLoop.current()
+
+    loop = asyncio.new_event_loop()
+    Thread(target=loop.run_forever, daemon=True).start()
+    return asyncio.run_coroutine_threadsafe(current(), loop).result()
+
+
 @contextmanager
 def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     """Connect to a scheduler, and put Dask's errors in this project's words."""
@@ -307,7 +322,7 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are raised here
     facts = facts_of((*SOURCES, *loaded_modules()))
     try:
-        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False, loop=_event_loop())
     except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
         raise UserError(
             f"{where}: cannot reach a scheduler there ({error}); start one with `make cluster`, or "

@@ -98,6 +98,8 @@ def dense_labels(
             valid &= frame.segmentation != _ROBOT
         rise = points[..., 2] - frame.truth.table_height
         active = valid & (rise > settings.table_clearance + settings.min_engagement)
+        if frame.segmentation is not None:
+            active &= frame.segmentation >= 0  # walls are part of the table
     quality = np.zeros((ANGLE_BINS, *valid.shape), np.float32)
     width = np.zeros_like(quality)
     v, u = np.nonzero(active)
