@@ -259,10 +259,11 @@ def test_an_error_for_the_user_says_where(compute):
 def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
     """After all workers have vanished, together with the nannies that replace them."""
     monkeypatch.setattr(executor, "WAIT_SECONDS", 0.5)
-    results, stop = [], Event()
+    results, said, stop = [], [], Event()
 
     def it_says_so():
-        return "waiting for workers: tcp://127.0.0.1" in capfd.readouterr().err
+        said.append(capfd.readouterr().err)
+        return "waiting for workers: tcp://127.0.0.1" in said[-1]
 
     with local_cluster(1) as cluster, ThreadPoolExecutor(1) as thread:
         compute = load_config(None, [f"compute.scheduler={cluster.scheduler_address}"]).compute
@@ -279,6 +280,7 @@ def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
             assert not rest.done()
             stop.set()
             rest.result(timeout=10)
+    assert "".join(said).count("has left; what it was computing is computed again") == 2
 
 
 # --- A cluster that cannot be used --------------------------------------------------------------
@@ -287,7 +289,6 @@ def test_calls_wait_for_workers_until_they_are_stopped(monkeypatch, capfd):
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tls://127.0.0.1:1", "no address"])
 def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch):
     pytest.importorskip("distributed", reason="pip install distributed")
-    # Dask begins a thread in that time, too, which a busy machine may not do in less.
     monkeypatch.setattr(executor, "CONNECT_SECONDS", 3.0)
     compute = load_config(None, [f"compute.scheduler={address}"]).compute
     with (

@@ -236,21 +236,22 @@ class _Cluster(Workers):
     def __init__(self, client: Any, most: int | None, job: Job) -> None:
         self._client, self._most, self._job = client, most, job
         self._executor = client.get_executor(pure=False)
-        self._count, self._counted = 0, -math.inf
+        self._names: set[str] = set()
+        self._counted = -math.inf
         self._told = time.monotonic()
         self._look()
         client.run(pickle.loads, _packed(partial(check, job.facts)))
 
     def size(self) -> int:
         self._look()
-        return self._most or max(1, self._count)
+        return self._most or max(1, len(self._names))
 
     def waits(self) -> bool:
         self._look()
-        return self._count == 0
+        return not self._names
 
     def _look(self) -> None:
-        """Count the workers from time to time, and say so as long as there are none."""
+        """List the workers from time to time, and say so when one has left or there is none."""
         now = time.monotonic()
         if now < self._counted + COUNT_SECONDS:
             return
@@ -261,16 +262,16 @@ class _Cluster(Workers):
                     f"the worker {worker} has {count} threads, but a process computes one call at "
                     "a time; start it with --nthreads 1"
                 )
-        self._count, self._counted = len(threads), now
-        if self._count:
+        for name in self._names - set(threads):
+            _say(f"the worker {name} has left; what it was computing is computed again")
+        self._names, self._counted = set(threads), now
+        if self._names:
             self._told = now
         elif now > self._told + WAIT_SECONDS:
             self._told = now
-            print(
-                f"\nwaiting for workers: {self._client.scheduler.address} has none; start some by "
-                "`dask worker`, or stop with Ctrl-C and go on later",
-                file=sys.stderr,
-                flush=True,
+            _say(
+                f"waiting for workers: {self._client.scheduler.address} has none; start some by "
+                "`dask worker`, or stop with Ctrl-C and go on later"
             )
 
     def _submit(self, call: Call) -> Future:
@@ -279,6 +280,10 @@ class _Cluster(Workers):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Cancel the calls under way: after an error there may be no worker that ends them."""
         self._executor.shutdown(wait=False)
+
+
+def _say(text: str) -> None:
+    print(f"\n{text}", file=sys.stderr, flush=True)  # not behind a progress bar
 
 
 def _packed(call: Call) -> bytes:

@@ -73,7 +73,7 @@ def parse_args(
     Returns the config and the parsed options (config, resume: Path or None, and the extra ones).
     Raises ConfigError; an unknown option ends the program with status 2, as argparse does.
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         description=description, epilog=f"All keys, their units and defaults: {DEFAULTS}"
     )
     source = parser.add_mutually_exclusive_group()
@@ -93,6 +93,13 @@ def parse_args(
                 f"runs/{Path(parser.prog).stem}/20250131-120000"
             )
     return load_config(path, options.overrides), options
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        if message.startswith("unrecognized"):
+            message += "; a setting is written KEY=VALUE, such as evaluate.rounds=50"
+        super().error(message)
 
 
 def plain_remarks() -> None:
