@@ -1,36 +1,33 @@
 """Object sets: the objects to be grasped, by name, from a folder of files, or from a plug-in.
 
 `OBJECT_SETS` lists the named sets; `load_object_set` also takes a folder of URDF and mesh files or
-an import path. Every object is one rigid body whose frame has its origin at the centre of mass and
-the axes of its source. This module knows neither robot nor scene, and no file format.
+an import path. `envs.object_bodies` makes the single objects. This module knows neither robot nor
+scene, and no file format.
 """
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import trimesh
 from tqdm import tqdm
 
 from envs.cell_layout import ObjectModel
-from envs.object_files import Inertial, fine_visual, object_files, read_object
-from envs.object_meshes import ObjectError, decompose, write_parts_obj
-from envs.object_parts import MassProperties
+from envs.object_bodies import DEFAULT_DENSITY, compound_object, load_object, native_object
+from envs.object_files import object_files
+from envs.object_meshes import ObjectError
 from envs.object_primitives import (
     FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
     NativeShape,
     make_primitive,
-    random_color,
 )
 from envs.pybullet_files import data_folder
 from models.graspable import is_graspable
@@ -45,26 +42,7 @@ THIN = {"train": 0, "test": 200, "sealed": 250, "end": 300}
 PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
-
-# kg/m3, the median of 26 of the YCB household objects, mass over the volume of their convex parts.
-DEFAULT_DENSITY = 700.0
-# An inertia below this share of that of a solid of even density is a placeholder, too.
-LEAST_INERTIA = 0.1
-IMPOSSIBLE_INERTIA = (
-    "states an inertia that no body of its mass and shape can have; that of an even density is "
-    "taken instead"
-)
-# Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
-MIN_MASS = 0.02
-LARGEST_EXTENT = 0.5
-SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 3.0  # m
-USUAL_OBJECT = 0.1  # m, to which a guess of a file's unit is to lead
-# kg/m3: foam has 10, platinum 21,500.
-LIGHTEST, DENSEST = 1.0, 25_000.0
-# A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
-# Bullet's rolling and spinning friction cost a scene of five objects two thirds of its speed.
-ROLLING_FRICTION = 0.0005
-
+LARGEST_EXTENT = 0.5  # m, of an object that a hand could take at all
 
 Split = Literal["train", "test", "sealed", "unseen_families"]
 
@@ -297,7 +275,7 @@ class BoxSet(ObjectSet):
     def _build(self, index: int) -> ObjectModel:
         side = 0.06 * self.scale
         color = (1.0, 0.2, 0.2, 1.0)
-        return _native_model("cube", NativeShape("box", (side,) * 3), 0.1 / side**3, 0.5, color)
+        return native_object("cube", NativeShape("box", (side,) * 3), 0.1 / side**3, 0.5, color)
 
 
 class PrimitiveSet(ObjectSet):
@@ -331,24 +309,10 @@ class PrimitiveSet(ObjectSet):
     def _build(self, index: int) -> ObjectModel:
         shape = make_primitive(self.indices[index], self.scale, self.families)
         if shape.native is not None:
-            return _native_model(
+            return native_object(
                 shape.name, shape.native, shape.density, shape.friction, shape.color
             )
-        hulls = [trimesh.convex.convex_hull(part) for part in shape.parts]
-        solid = trimesh.util.concatenate(hulls)  # the parts touch but do not overlap
-        centre = np.asarray(solid.center_mass)
-        parts = tuple(part - centre for part in shape.parts)
-        return ObjectModel(
-            name=shape.name,
-            parts=parts,
-            mass=shape.density * float(solid.volume),
-            inertia=shape.density * np.diag(solid.moment_inertia),
-            friction=shape.friction,
-            color=shape.color,
-            collision=write_parts_obj(parts, self.cache_dir),
-            fine_visual=None,
-            extents=np.ptp(np.concatenate(parts), axis=0),
-        )
+        return compound_object(shape, self.cache_dir)
 
 
 class FileSet(ObjectSet):
@@ -440,145 +404,3 @@ OBJECT_SETS: dict[str, Callable[[SetSettings], ObjectSet]] = {
     "random_urdfs": _random_urdfs,
     "thin": partial(PrimitiveSet, thin=True),
 }
-
-
-# --- One object -----------------------------------------------------------------------------
-
-
-def load_object(
-    path: str | Path,
-    *,
-    scale: float = 1.0,
-    fit: float | None = None,
-    density: float = DEFAULT_DENSITY,
-    any_mass: bool = False,
-    cache_dir: str | Path,
-) -> ObjectModel:
-    """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
-
-    scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
-    volume; lengths beyond LARGEST_OBJECT are taken for the millimetres or centimetres of a body of
-    that mass. any_mass: take it even where no material is as heavy or as light. Raises ObjectError
-    naming the file.
-    """
-    path, cache_dir = Path(path), Path(cache_dir)
-    source = read_object(path)
-    side = float(np.ptp(source.mesh.vertices, axis=0).max())
-    if fit is not None:
-        scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
-    _check_size(path, scale * side, scale)
-    cut = decompose(source.mesh, cache_dir, str(path))
-    stated = None
-    if source.inertial is not None:
-        stated = in_unit(source.inertial, _unit_of(side) if side > LARGEST_OBJECT else 1.0)
-        if not any_mass:
-            _check_density(path, source.inertial.mass, stated.mass / cut.solid.volume)
-    inertial = body_of(stated, cut.solid, source.mesh, density)
-    parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
-    mass = max(inertial.mass * scale**3, MIN_MASS)
-    remarks = [cut.remark] if cut.remark else []
-    if stated is not None and inertial is not stated:
-        remarks.append(IMPOSSIBLE_INERTIA)
-    return ObjectModel(
-        name=path.stem,
-        parts=parts,
-        mass=mass,
-        inertia=np.diag(inertial.inertia) * scale**2 * (mass / inertial.mass),
-        friction=source.friction,
-        color=source.color or random_color(np.random.default_rng(list(path.stem.encode()))),
-        collision=write_parts_obj(parts, cache_dir),
-        fine_visual=fine_visual(path, source, scale, inertial.centre_of_mass, cache_dir),
-        extents=np.ptp(np.concatenate(parts), axis=0),
-        remarks=tuple(remarks),
-    )
-
-
-def _unit_of(side: float) -> float:
-    """The unit in which something of this length would be as large as things usually are."""
-    units = (0.001, 0.01, 100.0, 1000.0)
-    return min(units, key=lambda unit: abs(math.log(side * unit / USUAL_OBJECT)))
-
-
-def _check_size(path: Path, side: float, scale: float) -> None:
-    if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
-        raise ObjectError(
-            f"object {path} is {side:.3g} m long, expected {SMALLEST_OBJECT:g} to "
-            f"{LARGEST_OBJECT:g} m; its lengths may be in another unit: try "
-            f"objects.scale={scale * _unit_of(side):g}, or objects.fit=0.06"
-        )
-
-
-def _check_density(path: Path, mass: float, density: float) -> None:
-    """mass: kg, as stated. density: kg/m3, of that mass in the mesh."""
-    if not LIGHTEST <= density <= DENSEST:
-        cause = (
-            "in grams, or the mesh smaller than the body"
-            if density > DENSEST
-            else ("in tonnes, or the mesh larger than the body")
-        )
-        raise ObjectError(
-            f"object {path} states {mass:g} kg, which makes {density:.3g} kg/m3 in its mesh, "
-            f"expected {LIGHTEST:g} to {DENSEST:g}; the mass may be {cause}: correct the file, or "
-            "leave <inertial> out of it and let objects.density count"
-        )
-
-
-def in_unit(stated: Inertial, unit: float) -> Inertial:
-    """Return what a file states of a body that is `unit` (in metres) times as large as its lengths
-    say: the same mass over volume, for a body of these lengths in metres."""
-    return replace(stated, mass=stated.mass / unit**3, inertia=stated.inertia / unit**5)
-
-
-def body_of(
-    stated: Inertial | None, solid: MassProperties, mesh: trimesh.Trimesh, density: float
-) -> Inertial:
-    """Mass, centre of mass and inertia of an object as its file states them.
-
-    density: kg/m3 where it states no mass. Where the inertia is a placeholder, so may the centre of
-    mass be: both are then those of a solid of even density and of the stated mass.
-    """
-    mass = density * solid.volume if stated is None else stated.mass
-    if stated is not None and is_possible(stated, solid, mesh):
-        return stated
-    return Inertial(mass, solid.centre_of_mass, mass / solid.volume * solid.inertia)
-
-
-def is_possible(stated: Inertial, solid: MassProperties, mesh: trimesh.Trimesh) -> bool:
-    """Whether a body of this shape, however its mass is spread, can have a stated inertia.
-
-    Its centre of mass lies within the bounding box. No principal moment is larger than the sum of
-    the two others, or than that of all the mass in the vertex that is farthest from the axis; none
-    is below LEAST_INERTIA of that of even density. Three equal moments of a body that is not as
-    long as it is wide, such as 1e-3 in many data sets, are a placeholder, too.
-    """
-    lower, upper = mesh.bounds
-    if not ((lower <= stated.centre_of_mass) & (stated.centre_of_mass <= upper)).all():
-        return False
-    moments, axes = np.linalg.eigh(stated.inertia)
-    even = np.linalg.eigvalsh(solid.inertia) * stated.mass / solid.volume
-    along = (mesh.vertices - stated.centre_of_mass) @ axes
-    squared = (along**2).sum(axis=1, keepdims=True) - along**2
-    isotropic = np.ptp(moments) < 1e-6 * moments.max() and even.max() > 1.2 * even.min()
-    return bool(
-        not isotropic
-        and (moments >= LEAST_INERTIA * even).all()
-        and (moments <= stated.mass * squared.max(axis=0)).all()
-        and moments[0] + moments[1] >= (1 - 1e-6) * moments[2]
-    )
-
-
-def _native_model(name, shape: NativeShape, density, friction, color) -> ObjectModel:
-    solid = shape.mesh(fine=True)
-    vertices = np.asarray(shape.mesh().vertices)
-    return ObjectModel(
-        name=name,
-        parts=(vertices,),
-        mass=density * float(solid.volume),
-        inertia=density * np.diag(solid.moment_inertia),
-        friction=friction,
-        color=color,
-        collision=shape,
-        fine_visual=None,
-        extents=np.asarray(solid.extents),
-        rolling_friction=0.0 if shape.kind == "box" else ROLLING_FRICTION,
-    )

@@ -76,6 +76,35 @@ def played_here(monkeypatch):
     forget()
 
 
+@pytest.fixture
+def client():
+    """A PyBullet client with a plane; modules that need another client define their own."""
+    pybullet = pytest.importorskip("pybullet")
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+    plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    pybullet.createMultiBody(0, plane, physicsClientId=client)
+    yield client
+    pybullet.disconnect(client)
+
+
+@pytest.fixture
+def make_env(config: Config):
+    """Makes environments, state-only unless given otherwise, and closes them after the test."""
+    from envs.grasping_env import RobotGraspingEnv
+
+    made = []
+
+    def make(render_mode=None, **settings) -> RobotGraspingEnv:
+        settings = {"observations": ["state"], "resolution": 32} | settings
+        made.append(RobotGraspingEnv(render_mode, config, **settings))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
 @pytest.fixture(scope="module", params=INSTALLED)
 def taught_cell(request, config: Config):
     """The cell of each simulator, whose wrist camera has been shown the board."""
