@@ -125,7 +125,7 @@ def test_bars_are_learned(tmp_path, monkeypatch):
     root = write_cornell(tmp_path / "cornell", 12, shape=(480, 640))
     folder = run(
         monkeypatch, tmp_path, "data.kind=cornell", f"data.root={root}", "data.folds=2",
-        "data.fold=0", "data.repeats=20", "train.batch_size=4", "train.epochs=6",
+        "data.fold=0", "data.repeats=20", "train.batch_size=4", "train.epochs=4",
         "train.backbone=tutorial_skip", f"train.initial={SHIPPED}", "train.lr=0.001",
     )  # fmt: skip
     results = json.loads((folder / "results.json").read_text())

@@ -301,7 +301,7 @@ class _Packed:
 
 
 @cache
-def _event_loop() -> Any:
+def event_loop() -> Any:
     """A Tornado loop that runs in a thread until the process ends. Dask would start one itself, and
     fails if it does not run within ten seconds, which a busy machine may need."""
     from tornado.ioloop import IOLoop
@@ -327,7 +327,7 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are raised here
     facts = facts_of((*SOURCES, *loaded_modules()))
     try:
-        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False, loop=_event_loop())
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False, loop=event_loop())
     except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
         raise UserError(
             f"{where}: cannot reach a scheduler there ({error}); start one with `make cluster`, or "

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from utils.executor import event_loop
+
 
 @contextmanager
 def local_cluster(count: int, threads: int = 1) -> Iterator[Any]:
@@ -22,7 +24,7 @@ def local_cluster(count: int, threads: int = 1) -> Iterator[Any]:
     with (
         dask.config.set(patient),
         distributed.LocalCluster(
-            count, threads_per_worker=threads, dashboard_address=None
+            count, threads_per_worker=threads, dashboard_address=None, loop=event_loop()
         ) as cluster,
     ):
         yield cluster
