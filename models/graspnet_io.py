@@ -72,7 +72,7 @@ def save_graspnet(
     config: dict[str, Any] | None = None,
     **extra: Any,
 ) -> None:
-    """Write a network for use, without the state of its training.
+    """Write a network for use, in half precision and without the state of its training.
 
     model: the bare module, not its DistributedDataParallel. metres_per_pixel, config, extra: see
     SavedGraspNet. Raises TypeError for values that could not be loaded again.
@@ -86,6 +86,7 @@ def save_graspnet(
         model=model,
         config=config,
         extra={**extra, PIXEL_SIZE: float(metres_per_pixel)},
+        half_precision=True,
     )
 
 

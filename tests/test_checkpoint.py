@@ -74,6 +74,21 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(tmp_path) -> None:
         assert torch.equal(value, resumed[0].state_dict()[name]), name
 
 
+def test_half_precision_is_rounded_to_eleven_bits_where_float16_reaches(tmp_path) -> None:
+    model = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Linear(2, 1))
+    with torch.no_grad():
+        model[0].weight.copy_(torch.tensor([[1 + 2**-11, 1 + 3 * 2**-11], [-1 / 3, 1e-9]]))
+        model[0].bias.fill_(1 / 3)
+        model[1].weight.copy_(torch.tensor([[70_000.0, 1 / 3]]))
+    save(tmp_path / "half.pt", model, half_precision=True)
+    stored = load_checkpoint(tmp_path / "half.pt", "test")["model"]
+    # Halves round to the even last bit: 1 + 2^-11 down, 1 + 3 x 2^-11 up.
+    expected = torch.tensor([[1.0, 1 + 2**-9], [-0.333251953125, 0.0]])
+    assert torch.equal(stored["0.weight"].float(), expected)
+    for name in ("0.bias", "1.weight"):  # a vector, and more than float16 holds
+        assert torch.equal(stored[name], model.state_dict()[name])
+
+
 def test_torch_generators_continue_too(tmp_path) -> None:
     generator = torch.Generator().manual_seed(3)
     save(tmp_path / "g.pt", rng=rng_states({"order": generator}))

@@ -43,7 +43,15 @@ def test_round_trip(tmp_path, model):
     x = torch.rand(2, 4, 36, 40)
     with torch.no_grad():
         for ours, theirs in zip(saved.model(x), model.eval()(x)):
-            assert torch.equal(ours, theirs)
+            torch.testing.assert_close(ours, theirs, rtol=2e-3, atol=2e-3)
+    whole = 4 * sum(value.numel() for value in model.state_dict().values())
+    assert (tmp_path / "net.pt").stat().st_size < 0.6 * whole
+    save_graspnet(tmp_path / "again.pt", saved.model, PIXEL, {"seed": 3}, epoch=7)
+    for (name, once), twice in zip(
+        saved.model.state_dict().items(),
+        load_graspnet(tmp_path / "again.pt").model.state_dict().values(),
+    ):
+        assert once.dtype == twice.dtype and torch.equal(once, twice), name
 
 
 def test_a_training_checkpoint_loads_too(tmp_path, model):
@@ -72,7 +80,8 @@ def test_a_network_starts_from_another_with_or_without_a_centre_head(
     load_initial(new, tmp_path / "net.pt")
     for name, value in new.state_dict().items():
         shared = name in saved.state_dict()
-        assert torch.equal(value, saved.state_dict()[name] if shared else before[name]), name
+        expected = saved.state_dict()[name] if shared else before[name]
+        torch.testing.assert_close(value, expected, rtol=2**-11 if shared else 0, atol=2**-25)
     assert (new.centre_head is not None) == new_head
     with pytest.raises(UserError, match="net.pt.*another architecture"):
         load_initial(GraspNet(backbone="tutorial"), tmp_path / "net.pt")
