@@ -1,4 +1,5 @@
-"""The scoreboard: policies x scenarios x object sets on the same seeded scenes, with the full arm.
+"""The scoreboard: policies x scenarios x object sets x depth noises on the same seeded scenes, with
+the full arm.
 
     python evaluate.py
     python evaluate.py evaluate.policies=heuristic evaluate.scenarios=pile evaluate.rounds=50
@@ -36,7 +37,9 @@ from utils.errors import UserError
 from utils.evaluation import (
     FREE_TO_CHANGE,
     check_controllers,
+    check_depth_noises,
     check_rounds,
+    depth_noises_of,
     describe_workers,
     interruption,
     play,
@@ -79,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return report_replay(options.replay, options.overrides)
     check_resume(config, options.resume, FREE_TO_CHANGE)
     check_rounds(config, options.resume)
+    check_depth_noises(config, options.overrides)
     if config.transfer.policies is not None:
         return report_transfer(config, options)
     check_controllers(config, options.overrides)
@@ -146,9 +150,9 @@ def announce(config: Config, run: Path) -> None:
     print(
         f"{', '.join(policy_name(*pair) for pair in policies_of(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
-        f"{', '.join(plan.object_sets)} ({config.objects.split}), {plan.rounds} rounds each, "
-        f"seed {config.seed}, in {config.simulator}, on {describe_workers(config)}; results in "
-        f"{run}",
+        f"{', '.join(plan.object_sets)} ({config.objects.split}) with depth noise "
+        f"{', '.join(depth_noises_of(config))}, {plan.rounds} rounds each, seed {config.seed}, in "
+        f"{config.simulator}, on {describe_workers(config)}; results in {run}",
         flush=True,
     )
 

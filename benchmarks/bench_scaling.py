@@ -37,7 +37,8 @@ from utils.runs import run_script
 from utils.worker_process import worker_environment
 
 SCENES = ("evaluate.policies=heuristic", "evaluate.scenarios=pile",
-          "evaluate.object_sets=primitives", "evaluate.videos=0")  # fmt: skip
+          "evaluate.object_sets=primitives", "evaluate.depth_noises=none",
+          "evaluate.videos=0")  # fmt: skip
 SHORT = ("evaluate.scenarios=isolated",)  # of the evaluations in which workers are killed
 QUICK = ("evaluate.scenarios=isolated", "evaluate.object_sets=box")
 SIZES = (8, 64, 512)  # workers of the model

@@ -204,7 +204,7 @@ FAULTS = {"hang": (_hang, 2), "freeze": (_freeze, 2), "are slow": (_nap, 1)}
 EVALUATION = (
     "evaluate.py", "evaluate.policies=heuristic", "evaluate.scenarios=isolated",
     "evaluate.object_sets=box", "evaluate.rounds=8", "evaluate.workers=1", "evaluate.videos=0",
-    "evaluate.gallery=1", "sim.renderer=tiny",
+    "evaluate.depth_noises=none", "evaluate.gallery=1", "sim.renderer=tiny",
 )  # fmt: skip
 TRAINING = (
     "train_rl.py", "rl.env_id=Pendulum-v1", "rl.parallel=false", "rl.envs=4", "rl.device=cpu",

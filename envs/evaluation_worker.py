@@ -1,7 +1,8 @@
 """What a worker process of evaluate.py does: every policy works on the scene of a task.
 
-`utils.evaluation` hands out the tasks. Each process has one cell, and one planner of each name,
-which is reset for every round.
+`utils.evaluation` hands out the tasks. Each process has a cell for each depth noise (every further
+one takes 30 MB in PyBullet and 50 MB in MuJoCo), and one planner of each name, which is reset for
+every round.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ from envs.simulators import make_cell
 from envs.studio import Film
 from models.planners import Planner, make_planner, needs_truth
 from utils.config import Config
-from utils.evaluation import FilmFile, Task, TaskResult, policies_of
+from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
 from utils.geometry import Workspace
 from utils.report import picture
-from utils.result_records import policy_name
+from utils.result_formats import depth_in_words
+from utils.result_records import CLEAN, policy_name
 from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
@@ -92,23 +94,27 @@ def approach_of(name: str, config: Config) -> PolicyApproach:
 
 def work(config: Config, task: Task) -> TaskResult:
     """Let each policy of a task work on its scene."""
-    cell, objects = cell_of(config), load_objects(task.objects, config)
+    objects = load_objects(task.objects, config)
     objects.told = True  # by the main process, which prepares the sets
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
-    for name, controller in task.policies:
+    for name, controller, noise in task.policies:
+        noisy = with_depth_noise(config, noise)
+        cell = cell_of(noisy)
         policy, approach, planner = policy_name(name, controller), None, placeholder
         if is_learned(name):
-            approach = approach_of(name, config)
+            approach = approach_of(name, noisy)
         else:
             planner = planner_of(name, config)
+        caption = f"{policy}, {task.scenario}{depth_in_words(noise)}"
 
-        def keep(frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy) -> None:
+        def keep(
+            frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy, caption=caption
+        ) -> None:
             if task.keep_pictures or not outcome.success:
-                shown = picture(frame, grasp, policy, task.scenario, outcome.reason)
-                result.gallery.append(shown)
+                result.gallery.append(picture(frame, grasp, policy, caption, outcome.reason))
 
-        film = Film(cell) if task.filmed else None
+        film = Film(cell) if noise == task.filmed else None
         result.rounds.append(
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
@@ -117,15 +123,17 @@ def work(config: Config, task: Task) -> TaskResult:
             )
         )  # fmt: skip
         if film is not None:
-            name = film_name(task, policy, config.evaluate.film_format)
+            name = film_name(task, policy, noise, config.evaluate.film_format)
             with TemporaryDirectory() as folder:  # the run's folder may be on another machine
                 film.write(Path(folder) / name)
                 content = (Path(folder) / name).read_bytes()
-            result.films.append(FilmFile(name, content, f"{policy} on {task.scenario}"))
+            result.films.append(FilmFile(name, content, caption))
     return result
 
 
-def film_name(task: Task, policy: str, suffix: str) -> str:
-    """A file's name on every system: policies and object sets may be paths or MODULE:NAME."""
-    stem = f"{task.scenario}-{Path(task.objects).name}-{policy}-{task.seed}"
+def film_name(task: Task, policy: str, noise: str, suffix: str) -> str:
+    """A file's name on every system: policies, noises and object sets may be paths or
+    MODULE:NAME."""
+    kind = [task.scenario, Path(task.objects).name, *([] if noise == CLEAN else [noise])]
+    stem = "-".join([*kind, policy, str(task.seed)])
     return re.sub(r"[^\w.+-]", "_", stem) + f".{suffix}"

@@ -55,8 +55,9 @@ def check_names(config: Config) -> None:
             check_object_set(name, key)
     make_reward(config.env.reward)
     config.camera.make_noise(float(config.camera.height))
-    for name in config.train.depth_noises:
-        make_depth_noise(name, float(config.camera.height), key="train.depth_noises")
+    for key in ("train.depth_noises", "evaluate.depth_noises"):
+        for name in _names(config, key):
+            make_depth_noise(name, float(config.camera.height), key=key)
     for row in config.transfer.policies or ():
         if row.scenes is not None:
             scenario, objects = row.scenes

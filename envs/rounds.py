@@ -156,6 +156,7 @@ def run_round(
     return RoundRecord(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
+        cell.config.camera.depth_noise,
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from models.photographs import judge_as_taken, judge_photographs
 from models.rectangle_examples import Judged, draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
 from utils.errors import UserError, unknown_choice
-from utils.evaluation import policies_of
+from utils.evaluation import depth_noises_of, policies_of
 from utils.rectangles import RealSample
 from utils.result_records import OPEN_LOOP
 from utils.transfer import Column, Score, TransferLine
@@ -103,6 +103,11 @@ def evaluations_of(config: Config) -> list[TransferEvaluation]:
         raise UserError(
             "transfer.policies: the report compares open loops; leave evaluate.controllers null "
             "and closed_loop.controller open_loop"
+        )
+    if len(depth_noises_of(config)) > 1:
+        raise UserError(
+            "transfer.policies: the report compares columns with one depth noise; set "
+            "evaluate.depth_noises=null, and camera.depth_noise for another one than none"
         )
     trained = [row for row in config.transfer.policies if is_trained(row)]
     found = []

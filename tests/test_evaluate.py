@@ -30,7 +30,8 @@ from utils.result_records import differing_rounds, read_rounds, write_sample
 from utils.runs import run_script as end_like_a_script
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box"]
+SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box",
+         "evaluate.depth_noises=none"]  # fmt: skip
 
 
 def run_script(arguments, folder, **options):
@@ -204,6 +205,40 @@ def test_resume_runs_only_what_is_missing(finished, monkeypatch, played_here):
     }
 
 
+@pytest.mark.slow
+def test_each_depth_noise_is_the_same_as_when_it_is_scored_alone(
+    tmp_path, monkeypatch, capsys, played_here
+):
+    """Noisy rows first; the noisy round is to the last bit that of a camera with this noise, and
+    not the clean one; resumed after it, and played again."""
+    settings = ["evaluate.rounds=1", "evaluate.workers=1", "evaluate.videos=0",
+                "evaluate.object_sets=box", "evaluate.scenarios=isolated",
+                "evaluate.policies=heuristic", "sim.renderer=tiny"]  # fmt: skip
+
+    def play(name, *overrides):
+        folder = tmp_path / name
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        assert evaluate.main([*settings, *overrides]) == 0
+        return only_run(folder)
+
+    both = play("both")
+    rows = json.loads((both / "results.json").read_text())["rows"]
+    assert [row["depth_noise"] for row in rows] == ["realsense", "none"]
+    noisy, clean = rounds = read_rounds(both / "rounds.jsonl")
+    assert noisy.attempts[0].grasp != clean.attempts[0].grasp
+    alone = read_rounds(play("alone", "camera.depth_noise=realsense") / "rounds.jsonl")
+    assert len(alone) == 1 and differing_rounds([noisy], alone) == []
+    journal = (both / "rounds.jsonl").read_text().splitlines(keepends=True)
+    (both / "rounds.jsonl").write_text(journal[0])
+    assert evaluate.main(["--resume", str(both)]) == 0
+    assert differing_rounds(rounds, read_rounds(both / "rounds.jsonl")) == []
+    write_sample(both, tmp_path / "sample.jsonl")
+    capsys.readouterr()
+    assert evaluate.main(["--replay", str(tmp_path / "sample.jsonl")]) == 0
+    assert "2 of 2 rounds are the same" in capsys.readouterr().out
+
+
 @pytest.fixture(params=["local", "cluster"])
 def engine(request):
     """Overrides that choose the engine, and a function that lists its worker processes."""
@@ -295,7 +330,10 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         ),
         (["--replay", "a", "--config", str(DEFAULTS)], "--replay: --config would have no effect"),
         (
-            ["transfer.policies=[[a, b, no_such_module:plan, null, null]]"],
+            [
+                "transfer.policies=[[a, b, no_such_module:plan, null, null]]",
+                "evaluate.depth_noises=null",
+            ],
             "transfer.policies: 'no_such_module:plan' cannot be loaded",
         ),
         (["compute.scheduler=nowhere"], "compute.scheduler=nowhere: cannot reach a scheduler"),
@@ -325,6 +363,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
             "closed_loop.controller=pbvs would be ignored: evaluate.controllers is [open_loop,",
         ),
         (["evaluate.controllers=ibvs", "closed_loop.controller=open_loop"], "would be ignored"),
+        (["evaluate.depth_noises=kinect,foggy"], "evaluate.depth_noises: got 'foggy'"),
+        (
+            ["evaluate.depth_noises=realsense,none", "camera.depth_noise=kinect"],
+            "camera.depth_noise=kinect would be ignored: evaluate.depth_noises is [realsense, none",
+        ),
     ],
 )
 def test_bad_input_is_one_clear_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -359,7 +402,7 @@ def test_own_meshes_are_picked(tmp_path, monkeypatch, played_here):
     monkeypatch.chdir(tmp_path)
     arguments = ["evaluate.object_sets=meshes", "objects.fit=0.05", "evaluate.policies=oracle",
                  "evaluate.scenarios=isolated,pile", "evaluate.rounds=2", "evaluate.videos=0",
-                 "scene.count=3", "evaluate.workers=1"]  # fmt: skip
+                 "scene.count=3", "evaluate.workers=1", "evaluate.depth_noises=none"]  # fmt: skip
     assert evaluate.main(arguments) == 0
     results = json.loads((only_run(tmp_path) / "results.json").read_text())
     assert sum(row["successes"] for row in results["rows"]) >= 6
@@ -398,7 +441,7 @@ def test_meshes_from_pybullet_data_are_picked(tmp_path, monkeypatch, played_here
     monkeypatch.chdir(tmp_path)
     arguments = ["evaluate.object_sets=toys", "objects.fit=0.055", "evaluate.policies=heuristic",
                  "evaluate.scenarios=isolated", "evaluate.rounds=6", "evaluate.videos=0",
-                 "evaluate.workers=1"]  # fmt: skip
+                 "evaluate.workers=1", "evaluate.depth_noises=none"]  # fmt: skip
     assert evaluate.main(arguments) == 0
     (row,) = json.loads((only_run(tmp_path) / "results.json").read_text())["rows"]
     assert row["successes"] >= 5
@@ -432,7 +475,7 @@ def test_a_filmed_round_without_an_attempt_has_a_picture(tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     arguments = ["evaluate.object_sets=meshes", "evaluate.policies=heuristic", "evaluate.rounds=1",
                  "evaluate.scenarios=isolated", "evaluate.videos=1",
-                 "evaluate.workers=1"]  # fmt: skip
+                 "evaluate.workers=1", "evaluate.depth_noises=none"]  # fmt: skip
     assert evaluate.main(arguments) == 0
     assert list((only_run(tmp_path) / "films").glob("*.mp4"))
 

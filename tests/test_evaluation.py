@@ -1,19 +1,24 @@
 """The plan of an evaluation, and playing it."""
 
+from dataclasses import replace
+
 import pytest
 
 from tests.helpers.records import CONFIG, ROUNDS
-from utils.config import load_config
+from utils.config import changed_keys, load_config
 from utils.errors import UserError
 from utils.evaluation import (
     TaskResult,
+    check_depth_noises,
     check_rounds,
+    depth_noises_of,
     in_order,
     interruption,
     planned_rounds,
     play,
     replay,
     tasks,
+    with_depth_noise,
 )
 from utils.result_records import Sample, append_round, read_rounds
 from utils.runs import new_run_folder
@@ -23,13 +28,15 @@ def test_tasks_cover_the_plan_once(config):
     plan = config.evaluate
     listed = list(tasks(config, []))
     assert len(listed) == plan.rounds * len(plan.scenarios) * len(plan.object_sets)
-    pairs = tuple((policy, "open_loop") for policy in plan.policies)
-    assert all(task.policies == pairs for task in listed)
+    entries = tuple(
+        (policy, "open_loop", noise) for noise in ("realsense", "none") for policy in plan.policies
+    )
+    assert all(task.policies == entries for task in listed)
 
 
 def test_only_missing_rounds_are_left_to_do():
     (task,) = tasks(CONFIG, ROUNDS[1:])
-    assert (task.seed, task.policies) == (0, (("heuristic", "open_loop"),))
+    assert (task.seed, task.policies) == (0, (("heuristic", "open_loop", "none"),))
 
 
 def test_interruption():
@@ -38,11 +45,68 @@ def test_interruption():
     assert interruption(3, CONFIG) == "interrupted: 3 of 4 rounds"
     several = load_config(None, ["evaluate.controllers=open_loop,ibvs", "evaluate.scenarios=moved",
                               "evaluate.policies=heuristic", "evaluate.rounds=7"])  # fmt: skip
-    assert planned_rounds(several) == 14
+    assert planned_rounds(several) == 28
 
 
 def test_rounds_are_in_the_order_of_the_plan():
     assert in_order(ROUNDS[::-1], CONFIG) == ROUNDS
+
+
+def test_each_depth_noise_is_a_row_of_its_own_in_the_order_of_the_key():
+    """Noisy rows come first, and only the clean rounds are left to do."""
+    config = one_worker("evaluate.depth_noises=realsense,none")
+    noisy = [replace(record, depth_noise="realsense") for record in ROUNDS]
+    assert in_order([*ROUNDS, *noisy][::-1], config) == [*noisy, *ROUNDS]
+    assert planned_rounds(config) == 8
+    left = [task.policies for task in tasks(config, noisy)]
+    assert left == 2 * [(("heuristic", "open_loop", "none"), ("random", "open_loop", "none"))]
+
+
+def test_only_the_first_depth_noise_is_filmed():
+    config = one_worker("evaluate.depth_noises=gamma,none", "evaluate.videos=1")
+    assert [task.filmed for task in tasks(config, [])] == ["gamma", None]
+
+
+# --- Which depth noise counts -------------------------------------------------------------------
+
+
+def test_the_camera_s_own_noise_is_scored_alone_where_it_is_set(tmp_path):
+    """On the command line, in a file, and in a run of an older version, which has no
+    evaluate.depth_noises. A list that is set, too, counts."""
+    (tmp_path / "mine.yaml").write_text("camera: {depth_noise: kinect}\n")
+    for config in (load_config(None, ["camera.depth_noise=kinect"]),
+                   load_config(tmp_path / "mine.yaml")):  # fmt: skip
+        assert depth_noises_of(config) == ("kinect",)
+        assert load_config(None, changed_keys(config)) == config
+    assert depth_noises_of(load_config(None, ["camera.depth_noise=none"])) == ("none",)
+    both = load_config(tmp_path / "mine.yaml", ["evaluate.depth_noises=none,kinect"])
+    assert depth_noises_of(both) == ("none", "kinect")
+    assert load_config(None, changed_keys(both)) == both
+    assert depth_noises_of(load_config()) == ("realsense", "none")
+
+
+def test_parameters_belong_to_the_camera_s_own_noise():
+    config = load_config(None, ["camera.depth_noise=kinect", "camera.depth_noise_args={noise: 0.3}",
+                                "evaluate.depth_noises=kinect,realsense"])  # fmt: skip
+    check_depth_noises(config)
+    assert with_depth_noise(config, "kinect") == config
+    assert with_depth_noise(config, "kinect").camera.make_noise(480.0).noise == 0.3
+    usual = load_config(None, ["camera.depth_noise=realsense", "evaluate.depth_noises=null"]).camera
+    assert with_depth_noise(config, "realsense").camera == usual
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["camera.depth_noise=kinect"], "camera.depth_noise=kinect would be ignored: evaluate"),
+        (["camera.depth_noise=none"], "camera.depth_noise=none would be ignored"),
+        (["camera.depth_noise_args={noise: 0.3}"], "camera.depth_noise_args would be ignored"),
+    ],
+)
+def test_a_noise_that_would_be_ignored_is_refused(overrides, message):
+    overrides = ["evaluate.depth_noises=realsense,gamma", *overrides]
+    with pytest.raises(UserError, match=message):
+        check_depth_noises(load_config(None, overrides), overrides)
 
 
 def test_an_evaluation_can_only_grow(tmp_path):
@@ -57,8 +121,12 @@ def test_an_evaluation_can_only_grow(tmp_path):
 
 
 def known_round(config, task):
-    rounds = [r for r in ROUNDS if r.seed == task.seed and (r.policy, "open_loop") in task.policies]
-    return TaskResult(rounds)
+    return TaskResult([
+        replace(r, depth_noise=noise)
+        for policy, _, noise in task.policies
+        for r in ROUNDS
+        if (r.policy, r.seed) == (policy, task.seed)
+    ])  # fmt: skip
 
 
 def no_second_scene(config, task):
@@ -68,26 +136,30 @@ def no_second_scene(config, task):
 
 
 def test_a_resumed_evaluation_plays_the_rest(tmp_path):
-    config = load_config(None, [*_overrides(), "evaluate.workers=1"])
+    config = one_worker()
     append_round(tmp_path / "rounds.jsonl", ROUNDS[2])
     outcome = play(config, tmp_path, known_round)
     assert outcome.rounds == ROUNDS and outcome.error is None and not outcome.interrupted
     assert len(read_rounds(tmp_path / "rounds.jsonl")) == 4
 
 
+def test_a_round_with_a_noise_that_the_config_does_not_play_is_refused(tmp_path):
+    append_round(tmp_path / "rounds.jsonl", replace(ROUNDS[0], depth_noise="gamma"))
+    with pytest.raises(UserError, match="with the depth noise gamma, which its config does not"):
+        play(one_worker(), tmp_path, known_round)
+
+
 def test_a_scene_that_cannot_be_made_ends_the_run_but_not_the_results(tmp_path):
-    config = load_config(None, [*_overrides(), "evaluate.workers=1"])
-    outcome = play(config, tmp_path, no_second_scene)
+    outcome = play(one_worker(), tmp_path, no_second_scene)
     assert "second scene" in str(outcome.error)
     assert outcome.rounds == [ROUNDS[0], ROUNDS[2]] == read_rounds(tmp_path / "rounds.jsonl")
 
 
 def test_a_sample_is_played_again():
     sample = Sample(None, {}, [], ROUNDS[:3])
-    again = replay(sample, load_config(None, [*_overrides(), "evaluate.workers=1"]), known_round)
-    assert again == ROUNDS[:3]
+    assert replay(sample, one_worker(), known_round) == ROUNDS[:3]
 
 
-def _overrides():
-    return ["evaluate.policies=heuristic,random", "evaluate.scenarios=pile", "evaluate.rounds=2",
-            "evaluate.object_sets=box"]  # fmt: skip
+def one_worker(*overrides):
+    changes = [*changed_keys(CONFIG), "evaluate.workers=1", *overrides]
+    return load_config(None, changes)

@@ -58,6 +58,15 @@ def test_a_privileged_planner_is_a_bound_not_the_headline(tmp_path, name, contro
     assert f"succeed with <strong>{name}" in report(tmp_path, rounds), "unless it is fair"
 
 
+def test_each_depth_noise_has_its_own_cards(tmp_path):
+    noisy = [replace(record, depth_noise="realsense") for record in ROUNDS]
+    page = report(tmp_path, [*noisy, *ROUNDS])
+    heading = '<h3>pile <span class="soft">· {}</span></h3>'
+    places = [page.index(heading.format(words)) for words in ("box, realsense depth", "box")]
+    assert places == sorted(places) and "<th>depth</th>" in page
+    assert "depth</span>" not in report(tmp_path) and "<th>depth</th>" not in report(tmp_path)
+
+
 def test_report_refuses_bad_videos(tmp_path):
     with pytest.raises(UserError, match=r"\.gif, \.mp4"):
         report(tmp_path, videos=[(tmp_path / "a.avi", "")])

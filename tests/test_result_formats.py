@@ -38,7 +38,7 @@ def test_results_json_is_strict_and_complete(tmp_path):
     assert content["commit"] == git_state().commit
     assert content["versions"]["numpy"] == np.__version__
     assert content["device"] == "CPU" and content["config"]["evaluate"]["rounds"] == 2
-    fields = """policy scenario objects seed rounds attempts successes objects_total
+    fields = """policy scenario objects depth_noise seed rounds attempts successes objects_total
         objects_cleared success_rate success_ci95 cleared_rate cleared_ci95 plan_ms_median
         sim_seconds_per_pick picks_per_hour"""
     loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
@@ -83,6 +83,24 @@ def test_a_closed_loop_s_turns_have_a_column():
     assert "turn ms" not in format_table(summarise(ROUNDS, 0))
 
 
+def test_a_depth_noise_has_a_column_where_there_is_any(tmp_path):
+    noisy = [replace(record, depth_noise="realsense") for record in [*ROUNDS, *STOPS]]
+    rounds = [*noisy, *ROUNDS]
+    lines = format_table(summarise(rounds, 0)).splitlines()
+    assert lines[0].split()[:4] == ["policy", "scenario", "objects", "depth"]
+    assert [line.split()[3] for line in lines[2:]] == 3 * ["realsense"] + 2 * ["none"]
+    assert "depth" not in format_table(summarise(ROUNDS, 0))
+    assert "pile, box, realsense depth: stopped" in format_stop_reasons(stop_reasons(rounds))
+    pairs = compare(noisy[:4] + ROUNDS, seed=0)
+    text = format_comparisons(pairs).splitlines()
+    assert text[0].split()[4] == "depth" and text[2].split()[5:6] == ["realsense"]
+    assert "depth" not in format_comparisons(pairs[1:])
+    write_comparisons_latex(tmp_path / "pairs.tex", pairs)
+    tex = (tmp_path / "pairs.tex").read_text()
+    assert r"{llllrrr}" in tex and "Difference & Scenario & Objects & Depth & Success" in tex
+    assert "& box & realsense &" in tex and "& box & none &" in tex
+
+
 def test_a_new_column_is_an_entry_of_the_list(monkeypatch, tmp_path):
     """The printed table and the page show it without any other change."""
     new = TableColumn("seed of the run", lambda row: str(row.seed), number=True)
@@ -118,7 +136,7 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     write_comparisons_csv(tmp_path / "none.csv", undefined)
     assert (tmp_path / "none.csv").read_text().splitlines()[
         1
-    ] == "random,heuristic,pile,box" + "," * 8
+    ] == "random,heuristic,pile,box,none" + "," * 8
     renamed = [replace(pairs[0], objects="random_urdfs")]
     write_comparisons_latex(tmp_path / "pairs.tex", renamed)
     lines = (tmp_path / "pairs.tex").read_text().splitlines()

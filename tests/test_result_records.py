@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,6 +85,13 @@ def test_a_journal_of_an_older_version_is_read(tmp_path):
     (tmp_path / "old.jsonl").write_text(json.dumps(old) + "\n")
     (record,) = read_rounds(tmp_path / "old.jsonl")
     assert (record.successes, record.controller, record.randomization) == (1, "open_loop", None)
+    assert record.depth_noise == "none"
+    (record,) = read_rounds(tmp_path / "old.jsonl", "kinect")
+    assert record.depth_noise == "kinect", "of the run's config"
+    origin = {"commit": None, "versions": {}, "overrides": ["camera.depth_noise=gamma"]}
+    (tmp_path / "sample.jsonl").write_text(f"{json.dumps(origin)}\n{json.dumps(old)}\n")
+    (record,) = read_sample(tmp_path / "sample.jsonl").rounds
+    assert record.depth_noise == "gamma"
 
 
 def test_a_torn_last_line_of_the_journal_is_taken_off(journal):
@@ -108,13 +116,26 @@ def test_a_sample_holds_the_first_rounds_of_each_row_and_their_origin(tmp_path):
     write_sample(run, tmp_path / "sample.jsonl", count=1)
     sample = read_sample(tmp_path / "sample.jsonl")
     assert sample.rounds == [ROUNDS[2], ROUNDS[0]], "the first round of each of two policies"
+    append_round(run / "rounds.jsonl", replace(ROUNDS[0], depth_noise="kinect"))
+    write_sample(run, tmp_path / "noisy.jsonl", count=1)
+    noises = [record.depth_noise for record in read_sample(tmp_path / "noisy.jsonl").rounds]
+    assert sorted(noises) == ["kinect", "none", "none"]
     assert load_config(None, sample.overrides) == CONFIG
     facts = environment()
     assert sample.commit == facts["commit"] and sample.versions["python"] == facts["python"]
     assert sample.versions["numpy"] == np.__version__
 
 
-@pytest.mark.parametrize("text", ["", "no json\n", '{"policy": "heuristic"}\n', "[1]\n"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "no json\n",
+        '{"policy": "heuristic"}\n',
+        "[1]\n",
+        '{"commit": null, "versions": {}, "overrides": ["camera=3"]}',
+    ],
+)
 def test_a_file_that_is_no_sample_is_refused(tmp_path, text):
     (tmp_path / "file.jsonl").write_text(text)
     with pytest.raises(UserError, match="not a sample of rounds"):

@@ -85,6 +85,21 @@ def test_comparison_adds_all_of_clutter():
     assert together.cleared.value == pytest.approx(0 / 15 - (2 * first + second) / 15)
 
 
+def test_policies_are_compared_within_the_same_depth_noise():
+    """The noisy heuristic clears nothing; clutter is added up for each noise alone."""
+    lost = [replace(r, depth_noise="kinect", objects_cleared=0) for r in ROUNDS]
+    pairs = compare([*lost, *ROUNDS], seed=0)
+    assert [(pair.depth_noise, pair.cleared.value) for pair in pairs] == [
+        ("kinect", 0.0), ("none", pytest.approx(-0.3)),
+    ]  # fmt: skip
+    packed = [replace(r, scenario="packed") for r in lost]
+    together = compare([*lost, *ROUNDS, *packed], seed=0)[-1]
+    assert (together.scenario, together.depth_noise) == ("pile + packed", "kinect")
+    assert together.cleared.rounds == 4
+    rows = summarise([*lost, *ROUNDS], seed=0)
+    assert [row.depth_noise for row in rows] == ["kinect", "kinect", "none", "none"]
+
+
 def test_a_closed_loop_is_a_policy_of_its_own():
     assert policy_name("heuristic", "open_loop") == "heuristic"
     assert policy_name("heuristic", "ibvs") == "heuristic+ibvs"
@@ -144,6 +159,26 @@ def test_runs_of_different_policies_are_compared_in_every_pair(tmp_path):
     runs = a_run(tmp_path / "a", ROUNDS), a_run(tmp_path / "b", other)
     names = [(pair.first, pair.second) for pair in compare_runs(*runs)]
     assert names == [("heuristic (a)", "graspnet (b)"), ("random (a)", "graspnet (b)")]
+
+
+def test_runs_with_one_depth_noise_each_show_its_effect(tmp_path):
+    noisy = [replace(record, depth_noise="kinect", objects_cleared=0) for record in ROUNDS[:2]]
+    runs = a_run(tmp_path / "noisy", noisy), a_run(tmp_path / "clean", ROUNDS[:2])
+    (pair,) = compare_runs(*runs)
+    assert (pair.depth_noise, pair.cleared.value) == ("kinect - none", pytest.approx(-0.3))
+    (same,) = compare_runs(a_run(tmp_path / "both", [*noisy, *ROUNDS[:2]]), runs[0])
+    assert (same.depth_noise, same.cleared.value) == ("kinect", 0.0)
+
+
+def test_the_rounds_of_an_older_run_have_the_noise_of_its_config(tmp_path):
+    config = load_config(None, ["camera.depth_noise=kinect"])
+    old, new = a_run(tmp_path / "old", ROUNDS[:2], config), a_run(tmp_path / "new", [])
+    journal = (old / "rounds.jsonl").read_text()
+    (old / "rounds.jsonl").write_text(journal.replace(', "depth_noise": "none"', ""))
+    for record in ROUNDS[:2]:
+        append_round(new / "rounds.jsonl", replace(record, depth_noise="kinect"))
+    (pair,) = compare_runs(old, new)
+    assert (pair.depth_noise, pair.cleared.value) == ("kinect", 0.0)
 
 
 def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):

@@ -50,7 +50,7 @@ def test_a_written_file_that_is_not_whole_is_lost(tmp_path, name):
 
     def write_most(path):
         with path.open("ab" if name == JOURNAL else "wb") as file:
-            file.write(whole[: len(whole) * 9 // 10])
+            file.write(whole[: len(whole) * 4 // 5])
 
     path.write_bytes(whole)
     most = Kind(name, write_most, kind.read)

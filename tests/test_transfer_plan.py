@@ -19,6 +19,7 @@ from envs.transfer_plan import (
 )
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
+from utils.evaluation import depth_noises_of
 from utils.transfer import pairs_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -75,7 +76,8 @@ def test_rows_on_the_same_scenes_are_one_evaluation():
     config = load_config(
         None,
         [f"transfer.policies={json.dumps(rows)}", "evaluate.scenarios=pile",
-         "evaluate.object_sets=box", "transfer.columns=[outside,mujoco,cornell]"],
+         "evaluate.object_sets=box", "transfer.columns=[outside,mujoco,cornell]",
+         "evaluate.depth_noises=null"],
     )  # fmt: skip
     played = evaluations_of(config)
     found = [(one.column, str(one.scenes), [row.policy for row in one.rows]) for one in played]
@@ -125,8 +127,18 @@ def test_a_row_that_cannot_play_its_scenes_is_named():
     with pytest.raises(UserError, match="the row PPO, none is scored on pile of box; give it"):
         evaluate.main(
             ["transfer.policies=[[PPO, none, ppo, null, null]]", "evaluate.scenarios=pile",
-             "evaluate.object_sets=box", "transfer.columns=pybullet"]
+             "evaluate.object_sets=box", "transfer.columns=pybullet",
+             "evaluate.depth_noises=null"]
         )  # fmt: skip
+
+
+def test_the_report_has_one_depth_noise():
+    with pytest.raises(UserError, match="columns with one depth noise; set evaluate.depth_noises"):
+        evaluations_of(load_config(REPORT, ["evaluate.depth_noises=realsense,none"]))
+    row = 'transfer.policies=[[a, "-", heuristic, null, null]]'
+    config = load_config(REPORT, ["camera.depth_noise=kinect", row, "transfer.columns=mujoco"])
+    (noisy,) = evaluations_of(config)
+    assert depth_noises_of(noisy.config) == ("kinect",)
 
 
 def test_rows_that_cannot_see_photographs_have_no_score_there(tmp_path):

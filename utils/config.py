@@ -126,14 +126,9 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     takes a list also takes "a,b" or a single item.
     Raises ConfigError on a missing file, bad YAML, an unknown key, a wrong type or range.
     """
-    layers = [Layer(str(DEFAULTS), _defaults())]
-    if path is not None:
-        layers.append(Layer(str(path), read_config(Path(path))))
+    layers = [] if path is None else [Layer(str(path), read_config(Path(path)))]
     layers += [Layer("command line", _parse_override(text)) for text in overrides]
-    try:
-        return Config.model_validate(_merged(layer.values for layer in layers))
-    except ValidationError as error:
-        raise ConfigError(explain(error, layers)) from error
+    return _over_defaults(layers)
 
 
 def load_foreign(stored: Mapping[str, Any], source: str, overrides: Sequence[str] = ()) -> Config:
@@ -145,11 +140,7 @@ def load_foreign(stored: Mapping[str, Any], source: str, overrides: Sequence[str
     """
     given = values_of(overrides)
     kept = _without(stored, FOREIGN_KEYS)
-    layers = [Layer(str(DEFAULTS), _defaults()), Layer(source, kept), Layer("command line", given)]
-    try:
-        config = Config.model_validate(_merged(layer.values for layer in layers))
-    except ValidationError as error:
-        raise ConfigError(explain(error, layers)) from error
+    config = _over_defaults([Layer(source, kept), Layer("command line", given)])
     named = {name for _, name in code_named_in(given)}
     # Of the config, not of the data: a set in these becomes a list there.
     for key, name in code_named_in(config.model_dump()):
@@ -159,6 +150,16 @@ def load_foreign(stored: Mapping[str, Any], source: str, overrides: Sequence[str
                 f"you trust it, name it yourself: {key.partition('[')[0]}={name}"
             )
     return config
+
+
+def _over_defaults(layers: Sequence[Layer]) -> Config:
+    """The checked config of layers laid over the defaults. Raises ConfigError."""
+    below = _defaults_under(_merged(layer.values for layer in layers))
+    layers = [Layer(str(DEFAULTS), below), *layers]
+    try:
+        return Config.model_validate(_merged(layer.values for layer in layers))
+    except ValidationError as error:
+        raise ConfigError(explain(error, layers)) from error
 
 
 def with_settings(config: Config, section: str, settings: Mapping[str, Any]) -> Config:
@@ -225,7 +226,10 @@ def changed_keys(config: Config) -> list[str]:
             elif value != below[name]:
                 yield f"{prefix}{name}={json.dumps(value, ensure_ascii=False)}"  # JSON is YAML
 
-    return list(changes(config.model_dump(mode="json"), load_config().model_dump(mode="json"), ""))
+    plain = config.model_dump(mode="json")
+    noise, usual = plain["camera"]["depth_noise"], _defaults()["camera"]["depth_noise"]
+    below = _defaults_under({"camera": {"depth_noise": noise}} if noise != usual else {})
+    return list(changes(plain, Config.model_validate(below).model_dump(mode="json"), ""))
 
 
 class _Loader(yaml.SafeLoader):
@@ -292,6 +296,15 @@ def read_config(path: Path) -> dict[str, Any]:
 def _defaults() -> dict[str, Any]:
     """The values of `DEFAULTS`, read once, because that takes 50 ms; nobody changes them."""
     return read_config(DEFAULTS)
+
+
+def _defaults_under(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The defaults under the keys that a user sets: who sets `camera.depth_noise` means this noise
+    alone, and the default of `evaluate.depth_noises` gives way to it."""
+    camera = values.get("camera")
+    if isinstance(camera, dict) and "depth_noise" in camera:
+        return _merge(_defaults(), {"evaluate": {"depth_noises": None}})
+    return _defaults()
 
 
 def _parse_override(text: str) -> dict[str, Any]:

@@ -189,6 +189,7 @@ class EvaluateConfig(Section):
     controllers: Names | None
     scenarios: Names
     object_sets: TestSets
+    depth_noises: Names | None
     rounds: Count
     randomise: bool
     workers: Count | None

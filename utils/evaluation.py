@@ -17,11 +17,13 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from utils.config import COMPUTE_KEYS, Config, load_config
+from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
 from utils.report import GalleryItem
 from utils.result_records import (
+    CLEAN,
     OPEN_LOOP,
     RoundRecord,
     Sample,
@@ -43,16 +45,17 @@ FREE_TO_CHANGE = (
 class Task:
     """One scene, on which every policy that is still to be scored works in turn.
 
-    policies: planner and controller of each. keep_pictures: whether pictures of successes are kept
-    as well as those of failures. filmed: whether each policy is filmed.
+    policies: planner, controller and depth noise of each. keep_pictures: whether pictures of
+    successes are kept as well as those of failures. filmed: the depth noise with which each policy
+    is filmed; None films nothing.
     """
 
     objects: str
     scenario: str
     seed: int
-    policies: tuple[tuple[str, str], ...]
+    policies: tuple[tuple[str, str, str], ...]
     keep_pictures: bool = False
-    filmed: bool = False
+    filmed: str | None = None
 
 
 class FilmFile(NamedTuple):
@@ -95,34 +98,53 @@ def policies_of(config: Config) -> list[tuple[str, str]]:
     ]
 
 
+def depth_noises_of(config: Config) -> tuple[str, ...]:
+    """The depth noises with which every policy of the evaluation is scored."""
+    return config.evaluate.depth_noises or (config.camera.depth_noise,)
+
+
+def with_depth_noise(config: Config, noise: str) -> Config:
+    """The config of a cell whose cameras have one of the depth noises of the evaluation.
+    `camera.depth_noise_args` belong to `camera.depth_noise`, the others have their own defaults."""
+    if noise == config.camera.depth_noise:
+        return config
+    changes = {"depth_noise": noise, "depth_noise_args": Arguments()}
+    return config.model_copy(update={"camera": config.camera.model_copy(update=changes)})
+
+
 def tasks(config: Config, done: Sequence[RoundRecord]) -> Iterator[Task]:
     """The tasks that are not in `done` yet; every policy gets the same seeds."""
     plan = config.evaluate
-    known = {(r.policy, r.scenario, r.objects, r.seed) for r in done}
+    noises = depth_noises_of(config)
+    known = {(r.policy, *r.kind, r.seed) for r in done}
     for number in range(plan.rounds):
         seed = config.seed * 100_000 + number
         for objects in plan.object_sets:
             for scenario in plan.scenarios:
                 policies = tuple(
-                    pair
+                    (*pair, noise)
+                    for noise in noises
                     for pair in policies_of(config)
-                    if (policy_name(*pair), scenario, objects, seed) not in known
+                    if (policy_name(*pair), scenario, objects, noise, seed) not in known
                 )
                 if policies:
                     filmed = number < plan.videos and scenario == plan.scenarios[-1]
-                    yield Task(objects, scenario, seed, policies, number < plan.gallery, filmed)
+                    film = noises[0] if filmed else None
+                    yield Task(objects, scenario, seed, policies, number < plan.gallery, film)
 
 
 def in_order(rounds: Sequence[RoundRecord], config: Config) -> list[RoundRecord]:
     """The rounds in the order of the plan, whichever was finished first."""
     plan = config.evaluate
     policies = [policy_name(*pair) for pair in policies_of(config)]
+    noises = depth_noises_of(config)
 
     def place(record: RoundRecord) -> tuple[int, ...]:
         known = record.policy in policies  # a resumed report may have lost the weights of one
         return (
             plan.object_sets.index(record.objects),
             plan.scenarios.index(record.scenario),
+            noises.index(record.depth_noise),
             policies.index(record.policy) if known else len(policies),
             record.seed,
         )
@@ -133,17 +155,21 @@ def in_order(rounds: Sequence[RoundRecord], config: Config) -> list[RoundRecord]
 def planned_rounds(config: Config) -> int:
     """The number of rounds of the whole evaluation."""
     plan = config.evaluate
-    return plan.rounds * len(policies_of(config)) * len(plan.scenarios) * len(plan.object_sets)
+    policies, scenes = policies_of(config), len(plan.scenarios) * len(plan.object_sets)
+    return plan.rounds * scenes * len(policies) * len(depth_noises_of(config))
 
 
 def check_recorded(rounds: Sequence[RoundRecord], config: Config, source: str) -> None:
-    """Raise UserError for a round on a scene that this config does not play."""
+    """Raise UserError for a round on a scene, or with a depth noise, that this config does not
+    play."""
     plan = config.evaluate
+    known = plan.scenarios, plan.object_sets, depth_noises_of(config)
     for record in rounds:
-        if record.objects not in plan.object_sets or record.scenario not in plan.scenarios:
+        if not all(name in names for name, names in zip(record.kind, known)):
             raise UserError(
-                f"{source}: holds a round of {record.objects} in the scenario {record.scenario}, "
-                "which its config does not play; it was changed by hand, start a new run"
+                f"{source}: holds a round of {record.objects} in the scenario {record.scenario} "
+                f"with the depth noise {record.depth_noise}, which its config does not play; it "
+                "was changed by hand, start a new run"
             )
 
 
@@ -163,6 +189,26 @@ def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
             f"[{', '.join(several)}] and says which controllers are scored; write "
             f"evaluate.controllers={one} or, to have closed_loop.controller count, "
             "evaluate.controllers=null"
+        )
+
+
+def check_depth_noises(config: Config, overrides: Sequence[str] = ()) -> None:
+    """Raise UserError for a camera.depth_noise that evaluate.depth_noises leaves out, and for
+    parameters that belong to none of its noises."""
+    several, camera = config.evaluate.depth_noises, config.camera
+    if several is None:
+        return
+    asked = any(change.split("=")[0].strip() == "camera.depth_noise" for change in overrides)
+    if camera.depth_noise not in several and (asked or camera.depth_noise != CLEAN):
+        raise UserError(
+            f"camera.depth_noise={camera.depth_noise} would be ignored: evaluate.depth_noises is "
+            f"[{', '.join(several)}] and says with which noises policies are scored; set one of "
+            "the two keys"
+        )
+    if camera.depth_noise_args and camera.depth_noise == CLEAN:
+        raise UserError(
+            "camera.depth_noise_args would be ignored: they are the parameters of "
+            f"camera.depth_noise, which is {CLEAN}; set that, too"
         )
 
 
@@ -195,7 +241,7 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
     tasks under way are finished after Ctrl-C, and the outcome holds everything that was played.
     """
     journal = run / "rounds.jsonl"
-    outcome = Outcome(rounds=read_rounds(journal))
+    outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
     todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
@@ -243,9 +289,12 @@ def replay(
                 "not score; it was changed by hand, choose another"
             )
     todo = [
-        Task(record.objects, record.scenario, record.seed, ((record.planner, record.controller),))
+        Task(
+            record.objects, record.scenario, record.seed,
+            ((record.planner, record.controller, record.depth_noise),),
+        )
         for record in sample.rounds
-    ]
+    ]  # fmt: skip
     with open_executor(config.compute, config.evaluate.workers) as workers:
         results = completed(workers, partial(work, config), todo)
         return [

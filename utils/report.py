@@ -23,7 +23,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
 from utils.image_overlay import contact_sheet, draw_grasp
-from utils.result_formats import columns_of, failures_in_words
+from utils.result_formats import columns_of, depth_in_words, failures_in_words
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stop_reasons
 from utils.runs import git_state, write_atomic
@@ -78,6 +78,7 @@ def write_report(
         few_rounds=FEW_ROUNDS,
         labels={SUCCESS: "success", **FAILURES},
         failures_in_words=failures_in_words,
+        depth_in_words=depth_in_words,
         stops=stop_reasons(rounds),
         turns_known=any(row.turn_ms_p95 is not None for row in rows),
         rows=rows,
@@ -102,18 +103,19 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 
 def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, Any]]:
-    """The rows by (scenario, objects), each with its best row and its stacked outcomes."""
-    cells: dict[tuple[str, str], list[Row]] = {}
+    """The rows by (scenario, objects, depth noise), each with its best row and its stacked
+    outcomes."""
+    cells: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
-        cells.setdefault((row.scenario, row.objects), []).append(row)
+        cells.setdefault((row.scenario, row.objects, row.depth_noise), []).append(row)
     groups = []
-    for (scenario, objects), cell in cells.items():
+    for (scenario, objects, noise), cell in cells.items():
         bounds = [row for row in cell if _sees_truth(row, privileged)]
         best = _best([row for row in cell if row not in bounds] or cell)
         groups.append(
             {
                 "scenario": scenario,
-                "objects": Path(objects).name or objects,  # a folder by its last part
+                "objects": _objects_in_words(objects, noise),
                 "rows": cell,
                 "best": best,
                 "bounds": [row for row in bounds if row != best],
@@ -121,6 +123,11 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
             }
         )
     return groups
+
+
+def _objects_in_words(objects: str, noise: str) -> str:
+    """A folder by its last part."""
+    return (Path(objects).name or objects) + depth_in_words(noise)
 
 
 def _sees_truth(row: Row, privileged: Collection[str]) -> bool:
@@ -147,20 +154,21 @@ def _outcomes(row: Row) -> list[dict[str, Any]]:
 
 
 def _comparisons(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
-    """Pairs of policies with difference and verdict, by (scenario, objects) and measure."""
-    cells: dict[tuple[str, str], list[Comparison]] = {}
+    """Pairs of policies with difference and verdict, by (scenario, objects, depth noise) and
+    measure."""
+    cells: dict[tuple[str, str, str], list[Comparison]] = {}
     for pair in comparisons:
-        cells.setdefault((pair.scenario, pair.objects), []).append(pair)
+        cells.setdefault((pair.scenario, pair.objects, pair.depth_noise), []).append(pair)
     return [
         {
             "scenario": scenario,
-            "objects": Path(objects).name or objects,
+            "objects": _objects_in_words(objects, noise),
             "measures": [
                 ("success", [(pair, pair.success, _verdict(pair.success)) for pair in pairs]),
                 ("cleared", [(pair, pair.cleared, _verdict(pair.cleared)) for pair in pairs]),
             ],
         }
-        for (scenario, objects), pairs in cells.items()
+        for (scenario, objects, noise), pairs in cells.items()
     ]
 
 
@@ -211,11 +219,12 @@ def _number(value: float | None, digits: int = 0) -> str:
 MOST_FAILURES = 24  # on failures.png
 
 
-def picture(frame: RGBDFrame, grasp: Grasp, policy: str, scenario: str, reason: str) -> GalleryItem:
-    """Draw a grasp on its frame; reason: "success" or a key of FAILURES."""
+def picture(frame: RGBDFrame, grasp: Grasp, policy: str, caption: str, reason: str) -> GalleryItem:
+    """Draw a grasp on its frame; caption: begins the picture's, which ends with the reason,
+    "success" or a key of FAILURES."""
     on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
     image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
-    return GalleryItem(image, f"{policy}, {scenario}: {reason}", success, policy)
+    return GalleryItem(image, f"{caption}: {reason}", success, policy)
 
 
 def write_failures(path: Path, pictures: list[GalleryItem]) -> None:

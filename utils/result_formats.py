@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from utils.config import Config
-from utils.result_records import FAILURES
+from utils.result_records import CLEAN, FAILURES
 from utils.results import Comparison, Row, StopReason
 from utils.runs import save_results, write_atomic
 from utils.statistics import Difference
@@ -76,11 +76,16 @@ def format_table(rows: Sequence[Row]) -> str:
 def format_stop_reasons(stops: Iterable[StopReason]) -> str:
     """One line for each under a title; an empty text if there are none."""
     lines = [
-        f"{stop.count:4d} x {stop.policy}, {stop.scenario}, {stop.objects}: {stop.sentence} "
-        f"({stop.place})"
+        f"{stop.count:4d} x {stop.policy}, {stop.scenario}, {stop.objects}"
+        f"{depth_in_words(stop.depth_noise)}: {stop.sentence} ({stop.place})"
         for stop in stops
     ]
     return "\n".join(["why attempts failed", *lines]) if lines else ""
+
+
+def depth_in_words(noise: str) -> str:
+    """', realsense depth'; nothing for a camera without noise."""
+    return "" if noise == CLEAN else f", {noise} depth"
 
 
 def aligned(
@@ -157,6 +162,7 @@ COLUMNS = (
     TableColumn("policy", lambda row: row.policy),
     TableColumn("scenario", lambda row: row.scenario),
     TableColumn("objects", lambda row: row.objects),
+    TableColumn("depth", lambda row: row.depth_noise, known=lambda row: row.depth_noise != CLEAN),
     TableColumn("rounds", lambda row: str(row.rounds), number=True, printed=False),
     TableColumn(
         "success",
@@ -196,14 +202,21 @@ def format_comparisons(comparisons: Sequence[Comparison]) -> str:
     """Paired differences in percentage points as aligned text; an empty text if there are none."""
     if not comparisons:
         return ""
-    header = ("paired difference", "scenario", "objects", "success", "cleared", "rounds")
-    return aligned(header, [_difference_cells(pair) for pair in comparisons])
+    return aligned(*_difference_cells(comparisons, "paired difference"))
 
 
-def _difference_cells(pair: Comparison) -> tuple[str, ...]:
-    names = (f"{pair.first} - {pair.second}", pair.scenario, pair.objects)
-    rounds = "-" if pair.success is None else str(pair.success.rounds)
-    return (*names, _points(pair.success), _points(pair.cleared), rounds)
+def _difference_cells(
+    comparisons: Sequence[Comparison], first: str
+) -> tuple[list[str], list[list[str]]]:
+    """Header, which begins with `first`, and lines; the depth noise where there is any."""
+    depth = ["depth"] if any(pair.depth_noise != CLEAN for pair in comparisons) else []
+    lines = []
+    for pair in comparisons:
+        noise = [pair.depth_noise] if depth else []
+        rounds = "-" if pair.success is None else str(pair.success.rounds)
+        names = [f"{pair.first} - {pair.second}", pair.scenario, pair.objects, *noise]
+        lines.append([*names, _points(pair.success), _points(pair.cleared), rounds])
+    return [first, "scenario", "objects", *depth, "success", "cleared", "rounds"], lines
 
 
 def _points(difference: Difference | None) -> str:
@@ -219,7 +232,8 @@ def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None
     flat = []
     for pair in comparisons:
         line: dict[str, object] = {
-            name: getattr(pair, name) for name in ("first", "second", "scenario", "objects")
+            name: getattr(pair, name)
+            for name in ("first", "second", "scenario", "objects", "depth_noise")
         }
         for measure in ("success", "cleared"):
             difference = getattr(pair, measure)
@@ -231,12 +245,11 @@ def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None
 
 def write_comparisons_latex(path: Path, comparisons: Sequence[Comparison]) -> None:
     """Write a LaTeX tabular (package booktabs) of paired differences in percentage points."""
-    header = ["Difference", "Scenario", "Objects", "Success", "Cleared", "Rounds"]
-    lines = [
-        " & ".join(_latex(cell) for cell in _difference_cells(pair)) + r" \\"
-        for pair in comparisons
-    ]
-    text = [r"\begin{tabular}{lllrrr}", r"\toprule", " & ".join(header) + r" \\", r"\midrule"]
+    header, cells = _difference_cells(comparisons, "difference")
+    lines = [" & ".join(map(_latex, line)) + r" \\" for line in cells]
+    titles = " & ".join(title.capitalize() for title in header) + r" \\"
+    shape = "l" * (len(header) - 3) + "rrr"
+    text = [rf"\begin{{tabular}}{{{shape}}}", r"\toprule", titles, r"\midrule"]
     text += [*lines, r"\bottomrule", r"\end{tabular}"]
     write_atomic(path, "\n".join(text) + "\n")
 

@@ -16,13 +16,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from utils.config import changed_keys, load_config
+from utils.config import changed_keys, load_config, values_of
 from utils.errors import UserError
 from utils.runs import cannot_write, write_atomic
 from utils.transforms import ImageGrasp
 
 SUCCESS = "success"
 OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way to the grasp
+CLEAN = "none"  # the depth noise of a camera without noise
 NO_PLAN = "no_plan"
 PLANNER_ERROR = "planner_error"
 FAILURES = {  # reason: its name in tables, in the order in which a grasp can fail
@@ -111,11 +112,13 @@ class RoundRecord:
     """One policy's work on one scene until `ended` (a key of ENDINGS).
 
     policy: the planner's name, in a closed loop with the controller's (see `policy_name`).
-    seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, seed).
+    seed: the scene's own seed; rounds of two policies pair up by (scenario, objects, depth_noise,
+        seed).
     attempts: a round that ended with "no_plan" or "planner_error" has this reason at its end.
     controller: how the arm reached the grasps.
     randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
     ungraspable: how many of the scene's objects do not fit the gripper.
+    depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
     """
 
     policy: str
@@ -129,6 +132,7 @@ class RoundRecord:
     controller: str = OPEN_LOOP
     randomization: dict[str, Any] | None = None
     ungraspable: int = 0
+    depth_noise: str = CLEAN
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:
@@ -139,6 +143,11 @@ class RoundRecord:
         for reason in (NO_PLAN, PLANNER_ERROR):
             if (self.ended == reason) != (last == reason):
                 raise ValueError(f"a round that ended with {self.ended!r} has {last!r} at its end")
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """Scenario, object set and depth noise: rounds of other kinds are counted apart."""
+        return self.scenario, self.objects, self.depth_noise
 
     @property
     def planner(self) -> str:
@@ -181,9 +190,10 @@ def _line(record: RoundRecord) -> str:
     return json.dumps(content, allow_nan=False) + "\n"
 
 
-def read_rounds(path: Path) -> list[RoundRecord]:
+def read_rounds(path: Path, depth_noise: str = CLEAN) -> list[RoundRecord]:
     """The rounds of a journal; an empty list where there is none yet.
 
+    depth_noise: of the rounds of older files, which name none: their config's.
     A last line that a crash cut short is removed from the file; any other line that is no round
     raises UserError.
     """
@@ -193,14 +203,17 @@ def read_rounds(path: Path) -> list[RoundRecord]:
     whole = text[: text.rfind("\n") + 1]
     if whole != text:
         write_atomic(path, whole)
-    return _parse(path, whole.split("\n")[:-1])
+    return _parse(path, whole.split("\n")[:-1], depth_noise)
 
 
-def _parse(path: Path, lines: Sequence[str], first_line: int = 1) -> list[RoundRecord]:
+def _parse(
+    path: Path, lines: Sequence[str], depth_noise: str, first_line: int = 1
+) -> list[RoundRecord]:
     rounds = []
     for number, line in enumerate(lines, start=first_line):
         try:
-            rounds.append(_round(json.loads(line, parse_constant=_no_number)))
+            content = json.loads(line, parse_constant=_no_number)
+            rounds.append(_round({"depth_noise": depth_noise} | content))
         # Missing entries and entries of other types are any of these; nesting without end is one.
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise UserError(
@@ -227,6 +240,7 @@ def _round(content: dict[str, Any]) -> RoundRecord:
 _ROUND_TYPES = {
     "policy": str, "scenario": str, "objects": str, "seed": int, "objects_total": int,
     "objects_cleared": int, "ended": str, "controller": str, "ungraspable": int,
+    "depth_noise": str,
 }  # fmt: skip
 _ATTEMPT_TYPES = {
     "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
@@ -268,17 +282,19 @@ class Sample:
 
 
 def write_sample(run: Path, path: Path, count: int = 10) -> None:
-    """Write the first `count` rounds of each policy, scenario and object set of a run folder to a
-    file of JSON lines, the first of which holds config, commit and versions."""
+    """Write the first `count` rounds of each policy, scenario, object set and depth noise of a run
+    folder to a file of JSON lines, the first of which holds config, commit and versions."""
     facts = json.loads((run / "environment.json").read_text(encoding="utf-8"))
+    config = load_config(run / "config.yaml")
     origin = {
         "commit": facts["commit"],
         "versions": {"python": facts["python"], **facts["packages"]},
-        "overrides": changed_keys(load_config(run / "config.yaml")),
+        "overrides": changed_keys(config),
     }
-    rows: dict[tuple[str, str, str], list[RoundRecord]] = {}
-    for record in sorted(read_rounds(run / "rounds.jsonl"), key=lambda record: record.seed):
-        rows.setdefault((record.policy, record.scenario, record.objects), []).append(record)
+    rows: dict[tuple[str, ...], list[RoundRecord]] = {}
+    rounds = read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
+    for record in sorted(rounds, key=lambda record: record.seed):
+        rows.setdefault((record.policy, *record.kind), []).append(record)
     lines = [_line(record) for row in rows.values() for record in row[:count]]
     write_atomic(path, json.dumps(origin) + "\n" + "".join(lines))
 
@@ -290,13 +306,14 @@ def read_sample(path: Path) -> Sample:
         origin = Sample(**json.loads(first), rounds=[])
         if not all(isinstance(one, str) for one in [*origin.overrides, *origin.versions]):
             raise ValueError("its overrides and versions are no texts")
+        noise = values_of(origin.overrides).get("camera", {}).get("depth_noise", CLEAN)
     except OSError as error:
         raise UserError(f"{path}: cannot read this sample: {error.strerror}") from error
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f"{path}: not a sample of rounds ({error}); choose a file of docs/results"
         ) from error
-    return replace(origin, rounds=_parse(path, lines, first_line=2))
+    return replace(origin, rounds=_parse(path, lines, noise, first_line=2))
 
 
 def without_times(record: RoundRecord) -> RoundRecord:

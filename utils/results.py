@@ -17,10 +17,12 @@ from typing import Any
 
 from utils.config import read_config
 from utils.errors import UserError
-from utils.result_records import FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
+from utils.result_records import CLEAN, FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
 from utils.statistics import Difference, paired_difference_interval, wilson_interval
 
 CLUTTER = ("packed", "pile")  # scenarios that are also compared together
+
+_Key = tuple[str, str, str, str]  # of a row: policy, scenario, object set, depth noise
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Row:
     policy: str
     scenario: str
     objects: str
+    depth_noise: str
     seed: int
     rounds: int
     attempts: int
@@ -68,14 +71,15 @@ class Row:
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
-    """One row for each (policy, scenario, objects), in the order of their first round."""
-    groups: dict[tuple[str, str, str], list[RoundRecord]] = {}
+    """One row for each (policy, scenario, objects, depth noise), in the order of their first
+    round."""
+    groups: dict[_Key, list[RoundRecord]] = {}
     for record in rounds:
-        groups.setdefault((record.policy, record.scenario, record.objects), []).append(record)
+        groups.setdefault((record.policy, *record.kind), []).append(record)
     return [_row(key, records, seed) for key, records in groups.items()]
 
 
-def _row(key: tuple[str, str, str], rounds: Sequence[RoundRecord], seed: int) -> Row:
+def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
     calls = [attempt for record in rounds for attempt in record.attempts]
     attempts = sum(call.executed for call in calls)
     successes = sum(call.success for call in calls)
@@ -123,7 +127,8 @@ _NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
 
 @dataclass(frozen=True)
 class StopReason:
-    """Failures of one policy on a scenario and object set for the same reason.
+    """Failures of one policy on a scenario and object set, with one depth noise, for the same
+    reason.
 
     count: of attempts. reason: a key of `utils.result_records.FAILURES`. sentence: of the first
     attempt; those of the others differ in their numbers only. seed: of the first attempt's scene.
@@ -133,6 +138,7 @@ class StopReason:
     policy: str
     scenario: str
     objects: str
+    depth_noise: str
     reason: str
     count: int
     sentence: str
@@ -147,10 +153,10 @@ class StopReason:
 
 def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
     """The failures that have a sentence, in the order of the rounds; the most frequent first within
-    one policy, scenario and object set."""
-    kinds: dict[tuple[str, str, str], dict[tuple[str, str], list[tuple[str, int, str | None]]]] = {}
+    one policy, scenario, object set and depth noise."""
+    kinds: dict[_Key, dict[tuple[str, str], list[tuple[str, int, str | None]]]] = {}
     for record in rounds:
-        cell = kinds.setdefault((record.policy, record.scenario, record.objects), {})
+        cell = kinds.setdefault((record.policy, *record.kind), {})
         for attempt in record.attempts:
             if attempt.detail and not attempt.success:
                 kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
@@ -173,6 +179,7 @@ class Comparison:
     second: str
     scenario: str
     objects: str
+    depth_noise: str
     success: Difference | None
     cleared: Difference | None
 
@@ -180,27 +187,30 @@ class Comparison:
 def compare(
     rounds: Iterable[RoundRecord], seed: int, pairs: Collection[tuple[str, str]] | None = None
 ) -> list[Comparison]:
-    """Paired differences of policies on each scenario and object set that they share, and at last
-    on all their rounds in clutter together, where these are of several kinds.
+    """Paired differences of policies on each scenario, object set and depth noise that they share,
+    and at last, for each depth noise, on all their rounds in clutter together, where these are of
+    several scenarios or object sets.
 
     seed: of the bootstrap. pairs: the policies to compare, (first, second); None: every pair, the
     later one first.
     """
-    cells: dict[tuple[str, str], dict[str, dict[tuple, RoundRecord]]] = {}
-    clutter: dict[str, dict[tuple, RoundRecord]] = {}
+    cells: dict[tuple[str, str, str], dict[str, dict[tuple, RoundRecord]]] = {}
+    clutter: dict[str, dict[str, dict[tuple, RoundRecord]]] = {}
     for record in rounds:
         scene = (record.scenario, record.objects, record.seed)
-        policies = cells.setdefault((record.scenario, record.objects), {})
+        policies = cells.setdefault(record.kind, {})
         policies.setdefault(record.policy, {})[scene] = record
         if record.scenario in CLUTTER:
-            clutter.setdefault(record.policy, {})[scene] = record
-    kinds = [kind for kind in cells if kind[0] in CLUTTER]
-    if len(kinds) > 1:
-        scenarios, sets = (list(dict.fromkeys(names)) for names in zip(*kinds))
-        cells[" + ".join(scenarios), " + ".join(sets)] = clutter
+            policies = clutter.setdefault(record.depth_noise, {})
+            policies.setdefault(record.policy, {})[scene] = record
+    for noise, policies in clutter.items():
+        kinds = [kind for kind in cells if kind[0] in CLUTTER and kind[2] == noise]
+        if len(kinds) > 1:
+            scenarios, sets, _ = (list(dict.fromkeys(names)) for names in zip(*kinds))
+            cells[" + ".join(scenarios), " + ".join(sets), noise] = policies
     return [
-        _compared(first, second, scenario, objects, policies, seed)
-        for (scenario, objects), policies in cells.items()
+        _compared(first, second, kind, policies, seed)
+        for kind, policies in cells.items()
         for first, second in (_every_pair(list(policies)) if pairs is None else pairs)
         if first in policies and second in policies
     ]
@@ -213,8 +223,7 @@ def _every_pair(names: Sequence[str]) -> list[tuple[str, str]]:
 def _compared(
     first: str,
     second: str,
-    scenario: str,
-    objects: str,
+    kind: tuple[str, str, str],
     rounds: dict[str, dict[tuple, RoundRecord]],
     seed: int,
 ) -> Comparison:
@@ -222,7 +231,7 @@ def _compared(
     a, b = ([rounds[name][scene] for scene in shared] for name in (first, second))
     success = _difference(a, b, "successes", "executed", seed)
     cleared = _difference(a, b, "objects_cleared", "objects_total", seed)
-    return Comparison(first, second, scenario, objects, success, cleared)
+    return Comparison(first, second, *kind, success, cleared)
 
 
 def _difference(
@@ -244,30 +253,36 @@ SCENE_KEYS = ("scene", "objects", "workspace", "sim.frequency", "sim.solver_iter
 def compare_runs(first: Path, second: Path) -> list[Comparison]:
     """Paired differences between two run folders of evaluate.py on their common scenes, first run -
     second run: of the policies that both have played, else of every policy of the first and every
-    one of the second.
+    one of the second. Runs with one depth noise each are compared whatever these are: where they
+    differ, the noise is named 'first - second'.
 
     Raises UserError where a folder holds no evaluation, and where the scenes do not match.
     """
-    runs = [(folder, *_read_run(folder)) for folder in (first, second)]
-    (_, config, before), (_, other, after) = runs
+    (config, before), (other, after) = (_read_run(folder) for folder in (first, second))
     for key in SCENE_KEYS:
         if _differ(config, other, key):
             raise UserError(
                 f"--compare {first} {second}: their scenes do not match, because {key} differs in "
                 "their configs; compare runs of the same scenes"
             )
+    a, b = ({record.depth_noise for record in rounds} for rounds in (before, after))
+    if a != b and len(a) == len(b) == 1:
+        noise = f"{a.pop()} - {b.pop()}"
+        before, after = (
+            [replace(one, depth_noise=noise) for one in rounds] for rounds in (before, after)
+        )
     if not _scenes(before) & _scenes(after):
         raise UserError(
             f"--compare {first} {second}: they have no scene in common; compare runs with the same "
-            "seed, evaluate.scenarios and evaluate.object_sets"
+            "seed, evaluate.scenarios, evaluate.object_sets and evaluate.depth_noises"
         )
-    names = [list(dict.fromkeys(record.policy for record in rounds)) for *_, rounds in runs]
+    names = [list(dict.fromkeys(record.policy for record in rounds)) for rounds in (before, after)]
     common = [name for name in names[0] if name in names[1]]
     pairs = [(name, name) for name in common] or [(a, b) for a in names[0] for b in names[1]]
     labels = ["A", "B"] if first.name == second.name else [first.name, second.name]
     renamed = [
         replace(record, policy=f"{record.policy} ({label})")
-        for label, (*_, rounds) in zip(labels, runs)
+        for label, rounds in zip(labels, (before, after))
         for record in rounds
     ]
     labelled = [(f"{a} ({labels[0]})", f"{b} ({labels[1]})") for a, b in pairs]
@@ -293,8 +308,10 @@ def _read_run(folder: Path) -> tuple[dict[str, Any], list[RoundRecord]]:
     plain = read_config(config)
     if type(plain.get("seed")) is not int:
         raise UserError(f"{config}: holds no seed, so that it is not the config of a run")
-    return plain, read_rounds(journal)
+    camera = plain.get("camera")
+    noise = camera.get("depth_noise") if isinstance(camera, dict) else None
+    return plain, read_rounds(journal, noise or CLEAN)
 
 
-def _scenes(rounds: Iterable[RoundRecord]) -> set[tuple[str, str, int]]:
-    return {(record.scenario, record.objects, record.seed) for record in rounds}
+def _scenes(rounds: Iterable[RoundRecord]) -> set[tuple[str, str, str, int]]:
+    return {(*record.kind, record.seed) for record in rounds}

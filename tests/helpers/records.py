@@ -32,7 +32,7 @@ ROUNDS = [
 CONFIG = load_config(
     None,
     ["evaluate.policies=heuristic,random", "evaluate.scenarios=pile", "evaluate.rounds=2",
-     "evaluate.object_sets=box"],
+     "evaluate.object_sets=box", "evaluate.depth_noises=none"],
 )  # fmt: skip
 
 OLD = "stopped: what was seen last is {} ms old, the watchdog allows 100 ms"
