@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from utils.result_records import CLEAN
 from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
@@ -53,7 +54,7 @@ PUBLISHED_BESIDE = (
 )
 
 _AHEAD = (
-    "On 15 objects GraspNet's success minus the heuristic's is {} points (95 % bootstrap, paired "
+    "On 15 objects{} GraspNet's success minus the heuristic's is {} points (95 % bootstrap, paired "
     "by scene)."
 )
 CHINESE = {
@@ -67,8 +68,10 @@ CHINESE = {
     "5 objects": "5 个物体",
     "15 objects": "15 个物体",
     "not measured yet": "尚未测量",
+    "depth": "深度噪声",
+    " with `{}` depth": "、深度噪声为 `{}` ",
     _AHEAD: (
-        "15 个物体时,GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"
+        "15 个物体{}时,GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"
         "(95 % bootstrap,按场景配对)。"
     ),
     "OrbitGrasp (published: floating hand, noisy side view)": (
@@ -141,6 +144,22 @@ def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
 
 
+def with_depths(
+    header: Sequence[str],
+    lines: Sequence[Sequence[str]],
+    noises: Sequence[str],
+    place: int,
+    say: Say = str,
+) -> str:
+    """A Markdown table whose first rows have these depth noises, in column number `place`; the
+    column is left out where there is no noise."""
+    if set(noises) <= {CLEAN}:
+        return table(header, lines)
+    column = [say("depth"), *(f"`{noise}`" for noise in noises), *["-"] * len(lines)]
+    wider = [[*line[:place], cell, *line[place:]] for line, cell in zip([header, *lines], column)]
+    return table(wider[0], wider[1:])
+
+
 def metrics_table(metrics: Figures) -> str:
     """What a benchmark reports, as a Markdown table."""
     lines = [
@@ -187,21 +206,28 @@ def rows_of(part: Figures, command: str | None = None) -> list[Figures]:
 
 
 def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
-    """The README's: four planners on piles of 5 and of 15 objects, and published systems."""
-    few = {row["policy"]: row for row in rows_of(scoreboard) if _is(row, "pile", "random_urdfs")}
+    """The README's: four planners on piles of 5 and of 15 objects, noisy rows first, and published
+    systems."""
+    few, many = (
+        {(_noise(row), row["policy"]): [success(row), cleared(row)] for row in rows}
+        for rows in (
+            [row for row in rows_of(scoreboard) if _is(row, "pile", "random_urdfs")],
+            rows_of(clutter),
+        )
+    )
+    none = ["-", "-"]
+    kinds = sorted(dict.fromkeys([*few, *many]), key=lambda kind: kind[0] == CLEAN)
     header = ["planner", "5 objects: success", "cleared", "15 objects: success", "cleared"]
-    lines = [
-        [f"`{row['policy']}`", success(few[row["policy"]]), cleared(few[row["policy"]]),
-         success(row), cleared(row)]
-        for row in rows_of(clutter)
-    ]  # fmt: skip
+    lines = [[f"`{kind[1]}`", *few.get(kind, none), *many.get(kind, none)] for kind in kinds]
     for name, five, fifteen in PUBLISHED_BESIDE:
         lines.append([say(name), *five, *fifteen])
-    ahead = points(_pair(clutter, "graspnet", "heuristic")["success"])
-    sentence = say(_AHEAD)
+    noises = [noise for noise, _ in kinds]
+    pair = _pair(clutter, "graspnet", "heuristic")
+    noisy = "" if _noise(pair) == CLEAN else say(" with `{}` depth").format(_noise(pair))
+    ahead = say(_AHEAD).format(noisy, points(pair["success"]))
     others = say("In real bins of 300 objects AnyGrasp reaches 93 %.")
-    below = f"{sentence.format(ahead)} {others} {_short(say, scoreboard, clutter)}"
-    return "\n\n".join([table(list(map(say, header)), lines), below])
+    below = f"{ahead} {others} {_short(say, scoreboard, clutter)}"
+    return "\n\n".join([with_depths(list(map(say, header)), lines, noises, 1, say), below])
 
 
 def published(say: Say) -> str:
@@ -215,35 +241,46 @@ def scoreboard(say: Say, part: Figures) -> str:
     header = ["objects", "scenario", "planner", "success", "cleared", "picks an hour"]
     lines = [[f"`{row['objects']}`", row["scenario"], *_planner_cells(row)]
              for row in rows_of(part)]  # fmt: skip
-    return "\n\n".join([table(header, lines), origin(say, part)])
+    return "\n\n".join([with_depths(header, lines, _noises(rows_of(part)), 2), origin(say, part)])
 
 
 def differences(say: Say, part: Figures) -> str:
     """GraspNet against the heuristic, paired by scene."""
-    lines = [
-        [f"`{pair['objects']}`", pair["scenario"], points(pair["success"]), points(pair["cleared"])]
+    pairs = [
+        pair
         for command in part["commands"].values()
         for pair in command["comparisons"]
         if (pair["first"], pair["second"]) == ("graspnet", "heuristic")
     ]
+    lines = [
+        [f"`{pair['objects']}`", pair["scenario"], points(pair["success"]), points(pair["cleared"])]
+        for pair in pairs
+    ]
     header = ["objects", "scenario", "success, points", "cleared, points"]
-    return "\n\n".join([table(header, lines), origin(say, part)])
+    return "\n\n".join([with_depths(header, lines, _noises(pairs), 2), origin(say, part)])
 
 
 def clutter15(say: Say, part: Figures) -> str:
     header = ["planner", "success", "cleared", "picks an hour"]
     lines = [_planner_cells(row) for row in rows_of(part)]
-    return "\n\n".join([table(header, lines), origin(say, part)])
+    return "\n\n".join([with_depths(header, lines, _noises(rows_of(part)), 1), origin(say, part)])
 
 
 def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
-    """With a Kinect's noise beside the scoreboard's rows of the same scenes without it."""
-    lines = []
-    for row in rows_of(part):
-        same = [one for one in rows_of(scoreboard) if _key(one) == _key(row)]
-        lines.append([f"`{row['objects']}`", row["scenario"], f"`{row['policy']}`", success(row),
-                      success(same[0]) if same else "-"])  # fmt: skip
-    header = ["objects", "scenario", "planner", "success with noise", "without"]
+    """Success with each depth noise: those of the scoreboard, and those by which the part's
+    commands are named, on the same scenes."""
+    cells: dict[tuple[str, str, str], dict[str, str]] = {}
+    for name, command in part["commands"].items():
+        for row in command["rows"]:
+            cells.setdefault(_key(row), {})[name] = success(row)
+    for row in rows_of(scoreboard):
+        cells.get(_key(row), {})[_noise(row)] = success(row)
+    noises = dict.fromkeys([*_noises(rows_of(scoreboard)), *part["commands"]])
+    lines = [
+        [f"`{objects}`", scenario, f"`{policy}`", *(of.get(noise, "-") for noise in noises)]
+        for (policy, scenario, objects), of in cells.items()
+    ]
+    header = ["objects", "scenario", "planner", *(f"`{noise}`" for noise in noises)]
     return "\n\n".join([table(header, lines), origin(say, part, scoreboard)])
 
 
@@ -397,6 +434,15 @@ def _pair(part: Figures, first: str, second: str) -> Figures:
 
 def _is(row: Figures, scenario: str, objects: str) -> bool:
     return (row["scenario"], row["objects"]) == (scenario, objects)
+
+
+def _noise(row: Figures) -> str:
+    """The depth noise of a row or a pair; older figures do not name it."""
+    return row.get("depth_noise", CLEAN)
+
+
+def _noises(rows: Sequence[Figures]) -> list[str]:
+    return [_noise(row) for row in rows]
 
 
 def _key(row: Figures) -> tuple[str, str, str]:

@@ -95,10 +95,14 @@ class Part:
 
 
 EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
+NOISY_FIRST = "realsense,none"
 
 
-def _evaluation(name: str, rounds: int, arguments: str, kept: int = 10) -> Command:
-    return Command(name, EVALUATE, f"{arguments} evaluate.videos=0", rounds, kept)
+def _evaluation(
+    name: str, rounds: int, arguments: str, kept: int = 10, noises: str = "none"
+) -> Command:
+    ending = f"evaluate.depth_noises={noises} evaluate.videos=0"
+    return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept)
 
 
 def _policy(objects: str, file: str) -> Command:
@@ -109,17 +113,19 @@ def _policy(objects: str, file: str) -> Command:
 
 PARTS = (
     Part("scoreboard", "four planners on single objects, packed scenes and piles", 100, (
-        _evaluation("scoreboard", 100, f"evaluate.policies={ALL} "
+        _evaluation("scoreboard", 50, f"evaluate.policies={ALL} "
                     "evaluate.scenarios=isolated,packed,pile "
-                    "evaluate.object_sets=random_urdfs,primitives"),
+                    "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST),
     )),
     Part("clutter15", "four planners on piles of 15 objects", 50, (
-        _evaluation("clutter15", 60, f"scene.count=15 evaluate.policies={ALL} "
-                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs"),
+        _evaluation("clutter15", 30, f"scene.count=15 evaluate.policies={ALL} "
+                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs",
+                    noises=NOISY_FIRST),
     )),
-    Part("noise", "the depth image of a first Kinect", 20, (
-        _evaluation("kinect", 100, "camera.depth_noise=kinect evaluate.policies=heuristic,graspnet "
-                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs,primitives", kept=3),
+    Part("noise", "other depth noises than the scoreboard's", 20, tuple(
+        _evaluation(noise, 50, "evaluate.policies=heuristic,graspnet evaluate.scenarios=pile "
+                    "evaluate.object_sets=random_urdfs,primitives", kept=3, noises=noise)
+        for noise in ("kinect", "gamma")
     )),
     Part("servo", "closed loops on objects that move", 30, (
         _evaluation("servo", 10, "--config configs/servo.yaml", kept=1),

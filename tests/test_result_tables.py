@@ -75,6 +75,66 @@ def test_both_languages_have_the_same_figures(tmp_path):
     ]
 
 
+def noisy(row: dict, noise: str = "realsense") -> dict:
+    return row | {"depth_noise": noise}
+
+
+def test_noisy_rows_come_first_with_a_column_that_names_the_noise(tmp_path):
+    """Also beside a part that was measured without noise; its other cells are empty."""
+    rows = [row("heuristic", 400, 500), row("graspnet", 450, 500)]
+    figures(tmp_path, "scoreboard", rows)
+    figures(tmp_path, "clutter15", [*map(noisy, rows), *rows])
+    page = "".join(
+        f"<!-- results:{name} -->\n<!-- /results -->\n" for name in ("planners", "clutter15")
+    )
+    written = with_tables(page, tmp_path).splitlines()
+    header = "| planner | depth | 5 objects: success | cleared | 15 objects: success | cleared |"
+    assert written[1] == header
+    assert [line.split(" | ")[:3] for line in written[3:7]] == [
+        ["| `heuristic`", "`realsense`", "-"], ["| `graspnet`", "`realsense`", "-"],
+        ["| `heuristic`", "`none`", "80 % [76, 83] (400/500)"],
+        ["| `graspnet`", "`none`", "90 % [87, 92] (450/500)"],
+    ]  # fmt: skip
+    assert written[7].startswith("| OrbitGrasp") and " | - | 97 % | 98 % |" in written[7]
+    assert "| planner | depth | success | cleared | picks an hour |" in written
+    chinese = with_tables(page, tmp_path, chinese=True)
+    assert "| 规划器 | 深度噪声 | 5 个物体:成功率 |" in chinese
+
+
+def test_differences_name_the_noise_of_the_first_pair(tmp_path):
+    for part in ("scoreboard", "clutter15"):
+        figures(tmp_path, part, [noisy(row("graspnet", 450, 500)), row("graspnet", 460, 500)])
+        content = json.loads((tmp_path / f"{part}.json").read_text())
+        (pair,) = content["commands"][part]["comparisons"]
+        content["commands"][part]["comparisons"] = [noisy(pair), pair]
+        (tmp_path / f"{part}.json").write_text(json.dumps(content))
+    page = "".join(
+        f"<!-- results:{name} -->\n<!-- /results -->\n" for name in ("planners", "differences")
+    )
+    written = with_tables(page, tmp_path)
+    assert "On 15 objects with `realsense` depth GraspNet's success minus" in written
+    assert "| `random_urdfs` | pile | `realsense` | +1.5 [-0.2, +3.1] | - |" in written
+    chinese = with_tables(page, tmp_path, chinese=True)
+    assert "15 个物体、深度噪声为 `realsense` 时,GraspNet" in chinese
+
+
+def test_every_depth_noise_is_a_column(tmp_path):
+    """The scoreboard's, noisy first, then those of the part's commands."""
+    figures(tmp_path, "scoreboard", [noisy(row("graspnet", 95, 100)), row("graspnet", 98, 100)])
+    figures(tmp_path, "noise", [row("graspnet", 90, 100)])
+    content = json.loads((tmp_path / "noise.json").read_text())
+    command = content["commands"]["noise"]
+    other = command | {"rows": [noisy(row("graspnet", 80, 100), "gamma")]}
+    content["commands"] = {"kinect": command, "gamma": other}
+    (tmp_path / "noise.json").write_text(json.dumps(content))
+    written = with_tables("<!-- results:noise -->\n<!-- /results -->", tmp_path).splitlines()
+    header = "| objects | scenario | planner | `realsense` | `none` | `kinect` | `gamma` |"
+    assert written[1] == header
+    assert [cell.split(" [")[0] for cell in written[3].split(" | ")[3:]] == [
+        "95 %", "98 %", "90 %", "80 %",
+    ]  # fmt: skip
+
+
 def test_a_table_that_is_not_measured_says_how_to(tmp_path):
     written = with_tables("<!-- results:servo -->\n<!-- /results -->", tmp_path)
     assert "*not measured yet: `make results PARTS=servo`*" in written
@@ -176,7 +236,7 @@ def test_each_part_has_its_own_scale_and_the_date_of_its_measuring(two_parts):
     assert main(["--parts", "mujoco"]) == 0
     assert main(["--parts", "clutter15", "--scale", "0.5", "--write-docs"]) == 0
     page = two_parts.read_text()
-    assert "(50 rounds a row)" in page and "(30 rounds a row)" in page
+    assert "(50 rounds a row)" in page and "(15 rounds a row)" in page
     assert "`cccccccccc` (2026-01-02)" in page
     content = json.loads((results.FIGURES / "clutter15.json").read_text())
     assert (content["scale"], content["date"]) == (0.5, "2026-01-02")
