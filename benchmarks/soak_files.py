@@ -230,6 +230,21 @@ URDF = """<?xml version="1.0"?>
 </link></robot>
 """
 
+MJCF = """<mujoco>
+<compiler angle="radian" meshdir="."/>
+<default><geom friction="0.8"/>
+  <default class="visual"><geom contype="0" conaffinity="0" density="0"/></default></default>
+<asset><material name="red" rgba="1 0 0 1"/>
+  <mesh name="wedge" vertex="0 0 0 0.04 0 0 0 0.05 0 0 0 0.06" scale="1 1 1"/></asset>
+<worldbody><body name="box" pos="0 0 0.03"><freejoint/>
+  <inertial pos="0 0 0" mass="0.1" diaginertia="5e-5 4e-5 3e-5"/>
+  <geom class="visual" type="mesh" mesh="wedge" material="red"/>
+  <geom name="solid" type="box" size="0.02 0.025 0.03" euler="0 0 0.1"/>
+  <body><geom type="capsule" size="0.01 0.02" mass="0.05"/></body>
+</body></worldbody>
+</mujoco>
+"""
+
 
 def _image(path: Path, kind: str) -> None:
     random = np.random.default_rng(0)
@@ -276,6 +291,7 @@ KINDS = (
     Kind("pose.npy", lambda path: np.save(path, _POSE), read_pose),
     *(Kind(f"mesh{suffix}", _mesh, read_object) for suffix in (".obj", ".stl", ".ply", ".glb")),
     Kind("object.urdf", _text(URDF), read_object),
+    Kind("object.xml", _text(MJCF), read_object),
     Kind("parts.npz", lambda path: _write_parts(path, _PARTS), _read_parts),
     Kind("shard.h5", _shard, _read_shard),
     Kind(

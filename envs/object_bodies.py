@@ -1,4 +1,4 @@
-"""Object bodies: one rigid body from a URDF or mesh file, or from a procedural solid.
+"""Object bodies: one rigid body from a file or from a procedural solid.
 
 A body's frame has its origin at the centre of mass and the axes of its source. What a file states
 of size, mass and inertia is checked here, and replaced where no body of that shape can have it.
@@ -15,13 +15,11 @@ import numpy as np
 import trimesh
 
 from envs.cell_layout import ObjectModel
-from envs.object_files import Inertial, fine_visual, read_object
+from envs.object_files import DEFAULT_DENSITY, Inertial, fine_visual, read_object
 from envs.object_meshes import ObjectError, decompose, write_parts_obj
 from envs.object_parts import MassProperties
 from envs.object_primitives import NativeShape, Primitive, random_color
 
-# kg/m3, the median of 26 of the YCB household objects, mass over the volume of their convex parts.
-DEFAULT_DENSITY = 700.0
 # An inertia below this share of that of a solid of even density is a placeholder, too.
 LEAST_INERTIA = 0.1
 IMPOSSIBLE_INERTIA = (
@@ -48,7 +46,7 @@ def load_object(
     any_mass: bool = False,
     cache_dir: str | Path,
 ) -> ObjectModel:
-    """One URDF (all its links at zero joint angles, as one rigid body) or mesh file.
+    """One URDF (all its links at zero joint angles, as one rigid body), MJCF or mesh file.
 
     scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
     volume; lengths beyond LARGEST_OBJECT are taken for the millimetres or centimetres of a body of
@@ -56,7 +54,7 @@ def load_object(
     naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
-    source = read_object(path)
+    source = read_object(path, density)
     side = float(np.ptp(source.mesh.vertices, axis=0).max())
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
@@ -159,7 +157,7 @@ def _check_density(path: Path, mass: float, density: float) -> None:
         raise ObjectError(
             f"object {path} states {mass:g} kg, which makes {density:.3g} kg/m3 in its mesh, "
             f"expected {LIGHTEST:g} to {DENSEST:g}; the mass may be {cause}: correct the file, or "
-            "leave <inertial> out of it and let objects.density count"
+            "let it state none, so that objects.density counts"
         )
 
 

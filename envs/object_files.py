@@ -1,14 +1,18 @@
-"""Object files: the URDF and mesh files of a folder, their geometry, colour, friction and mass.
+"""Object files: the URDF, MJCF and mesh files of a folder, their shape, colour, friction and mass.
 
-Lengths and axes stay those of the file. This module knows no simulator and no object set.
+Lengths and axes stay those of the file. `envs.mujoco_files` reads MJCF, and is imported where there
+is any. This module knows no simulator and no object set.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import trimesh
@@ -24,8 +28,10 @@ from envs.object_meshes import (
     write_mesh_obj,
 )
 
-SUFFIXES = (".urdf", *MESH_SUFFIXES)
-DEFAULT_FRICTION = 0.7  # for a file that states none
+SUFFIXES = (".urdf", ".xml", *MESH_SUFFIXES)
+# For files that state none. The density, kg/m3, is the median of 26 of the YCB household objects,
+# mass over the volume of their convex parts.
+DEFAULT_FRICTION, DEFAULT_DENSITY = 0.7, 700.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class FineVisual:
 
 @dataclass(frozen=True)
 class Inertial:
-    """What a URDF states of all its links together, in the file's axes.
+    """What a file states of all its links or bodies together, in the file's axes.
 
     mass: kg. centre_of_mass: (3,) m. inertia: (3, 3) kg m2 about the centre of mass.
     """
@@ -57,9 +63,9 @@ class ObjectSource:
     """The content of an object file.
 
     mesh: the solid geometry. inertial: None where the file states no mass. visual: (mesh file,
-    scale (3,), T (4, 4)) of a URDF that has a single visual mesh. visual_mesh: all visual geometry
-    of a URDF as one mesh. Pictures show the first of visual, visual_mesh and the file itself that
-    exists.
+    scale (3,), T (4, 4)) of a file that has a single visual mesh. visual_mesh: all visual geometry
+    of a URDF or MJCF as one mesh. Pictures show the first of visual, visual_mesh and the file
+    itself that exists.
     """
 
     mesh: trimesh.Trimesh
@@ -71,42 +77,58 @@ class ObjectSource:
 
 
 def object_files(folder: Path, skip_broken: bool = False) -> list[Path]:
-    """List the URDF and mesh files below a folder, sorted, without the meshes that its URDFs refer
-    to.
+    """List the URDF, MJCF and mesh files below a folder, sorted, without those that others of them
+    refer to, and without XML files that are no MJCF.
 
-    Raises ObjectError for a folder that holds none, and for a URDF that is not XML; the latter is
-    listed with `skip_broken`, so that whoever reads it can say so.
+    Raises ObjectError for a folder that holds none, and for a URDF or MJCF that is not XML; the
+    latter is listed with `skip_broken`, so that whoever reads it can say so.
     """
     files = sorted(
         path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
     )
     referred: set[Path] = set()
     for path in files:
-        if path.suffix.lower() != ".urdf":
-            continue
         try:
-            meshes = parse_xml(path).iter("mesh")
+            referred |= {file.resolve() for file in _referred_files(path)}
         except ObjectError:
             if not skip_broken:
                 raise
-            continue
-        for mesh in meshes:
-            referred.add(Path(_resolve_mesh(mesh.get("filename", ""), path)).resolve())
     files = [path for path in files if path.resolve() not in referred]
     if not files:
+        is_sdf = next(folder.rglob("*.sdf"), None) is not None
         raise ObjectError(
             f"objects: folder {folder} holds no object; "
             f"put in files ending in {', '.join(SUFFIXES)}"
+            + (" (SDF becomes MJCF by sdf2mjcf of the package sdformat-mjcf)" if is_sdf else "")
         )
     return files
 
 
-def read_object(path: Path) -> ObjectSource:
-    """Read a mesh file, or a URDF with all its links at zero joint angles as one body.
+def _referred_files(path: Path) -> set[Path]:
+    """The files of which an object file takes a part; of an XML file that is no MJCF, itself."""
+    suffix = path.suffix.lower()
+    if suffix == ".urdf":
+        names = [mesh.get("filename", "") for mesh in parse_xml(path).iter("mesh")]
+        return {Path(_resolve_mesh(name, path)) for name in names}
+    if suffix == ".xml":
+        return _mjcf().referred_files(path) if parse_xml(path).tag == "mujoco" else {path}
+    return set()
 
+
+def read_object(path: Path, density: float = DEFAULT_DENSITY) -> ObjectSource:
+    """Read a mesh file, a file in MJCF, or a URDF with all its links at zero joint angles as one
+    body.
+
+    density: kg/m3 of the geoms of an MJCF that state neither mass nor density where others do.
     Raises ObjectError, which names the file.
     """
+    if path.suffix.lower() == ".xml":
+        return _mjcf().read_mjcf(path, density)
     return _read_urdf(path) if path.suffix.lower() == ".urdf" else ObjectSource(load_mesh(path))
+
+
+def _mjcf() -> ModuleType:
+    return importlib.import_module("envs.mujoco_files")
 
 
 def fine_visual(
@@ -196,11 +218,15 @@ def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
             T = T @ link.inertial.origin
         own = np.zeros((3, 3)) if link.inertial.inertia is None else link.inertial.inertia
         stated.append((mass, T[:3, 3], T[:3, :3] @ np.asarray(own, float) @ T[:3, :3].T))
+    return combined(stated) if stated else None
+
+
+def combined(stated: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> Inertial:
+    """The sum of bodies that are one: of each the mass, the centre of mass (3,), and the inertia
+    (3, 3) about it. Raises ValueError where it is none that a body can have."""
     total = sum(mass for mass, _, _ in stated)
-    if not stated:
-        return None
-    if total == 0.0:
-        raise ValueError("its links state 0 kg in all: state more, or leave <inertial> out")
+    if not 0 < total < math.inf:
+        raise ValueError(f"it states {total:g} kg in all: state another, or leave masses out")
     centre = sum(mass * at for mass, at, _ in stated) / total
     inertia = np.zeros((3, 3))
     for mass, at, own in stated:  # the parallel axis theorem

@@ -1,8 +1,8 @@
 """Object sets: the objects to be grasped, by name, from a folder of files, or from a plug-in.
 
-`OBJECT_SETS` lists the named sets; `load_object_set` also takes a folder of URDF and mesh files or
-an import path. `envs.object_bodies` makes the single objects. This module knows neither robot nor
-scene, and no file format.
+`OBJECT_SETS` lists the named sets; `load_object_set` also takes a folder of files or an import
+path. `envs.object_bodies` makes the single objects. This module knows neither robot nor scene, and
+no file format.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 from tqdm import tqdm
 
 from envs.cell_layout import ObjectModel
-from envs.object_bodies import DEFAULT_DENSITY, compound_object, load_object, native_object
-from envs.object_files import object_files
+from envs.object_bodies import compound_object, load_object, native_object
+from envs.object_files import DEFAULT_DENSITY, object_files
 from envs.object_meshes import ObjectError
 from envs.object_primitives import (
     FAMILIES,
@@ -131,7 +131,8 @@ def load_object_set(
     cache_dir: str | Path,
     skip_broken: bool = False,
 ) -> ObjectSet:
-    """A set of `OBJECT_SETS`, every URDF and mesh file below a folder (in metres), or a plug-in.
+    """A set of `OBJECT_SETS`, the URDF, MJCF and mesh files below a folder (in metres), or a
+    plug-in.
 
     name_or_path: a name, a folder, or an import path `module:name` of an `ObjectSet`, of a folder's
         path, or of a function that takes `SetSettings` and returns one of the two.
@@ -316,7 +317,7 @@ class PrimitiveSet(ObjectSet):
 
 
 class FileSet(ObjectSet):
-    """URDF and mesh files, one object each. scale: factor on their lengths, in place of the
+    """URDF, MJCF and mesh files, one object each. scale: factor on their lengths, in place of the
     settings' own."""
 
     def __init__(

@@ -293,7 +293,9 @@ def test_an_unknown_set_names_what_is_allowed(tmp_path):
 
 
 def test_an_empty_folder_names_the_suffixes(tmp_path):
-    with pytest.raises(ObjectError, match=r"holds no object.*\.urdf, \.obj, \.stl, \.ply, \.glb"):
+    with pytest.raises(
+        ObjectError, match=r"holds no object.*\.urdf, \.xml, \.obj, \.stl, \.ply, \.glb, \.dae$"
+    ):
         load_object_set(str(tmp_path), cache_dir=tmp_path)
 
 
