@@ -354,7 +354,8 @@ def figures_of(run: Path) -> dict[str, Any]:
     figures: dict[str, Any] = {"rows": results["rows"]}
     if (run / "rounds.jsonl").exists():
         # In the order of the plan: an interval by resampling depends on the order of the rounds.
-        rounds = in_order(read_rounds(run / "rounds.jsonl"), load_config(run / "config.yaml"))
+        config = load_config(run / "config.yaml")
+        rounds = in_order(read_rounds(run / "rounds.jsonl", config.camera.depth_noise), config)
         comparisons = compare(rounds, SEED)
         figures |= {"comparisons": [asdict(pair) for pair in comparisons], "run": str(run)}
     return figures
