@@ -28,6 +28,7 @@ SECTIONS = ("compiler", "default", "asset", "worldbody")
 ASSETS = ("material", "mesh")
 SOLID = ("body", "frame", "freejoint", "geom", "inertial", "joint")
 WEIGHTLESS = ("camera", "light", "site")
+MOST_GEOMS = 2000  # MuJoCo takes a time that grows with their square
 UNSTATED = 1e-12  # kg/m3 of a geom whose density neither it nor its class states
 UNCOLOURED = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's RGBA of a geom that states none
 
@@ -74,20 +75,21 @@ def _source(path: Path, root: Element, density: float) -> ObjectSource:
             found = load_mesh(files[mesh.name])
             mesh.uservert, mesh.userface = found.vertices.ravel(), found.faces.ravel()
             mesh.file = ""
-    solid = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
-    shown = [geom for geom in spec.geoms if geom not in solid] or solid
+    geoms = spec.geoms
+    solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
+    shown = [geom for geom in geoms if geom not in solid and geom.rgba[3] > 0] or solid
     solid = solid or shown
     if not solid:
         raise ValueError("it has neither collision nor visual geometry; add some")
     stated = _fill_in_densities(spec, root, solid, density)
-    for geom in spec.geoms:
+    for geom in geoms:
         geom.contype = geom.conaffinity = 0  # it spares MuJoCo the convex hulls
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     spec.compiler.balanceinertia = True  # what no body can have is found out by its even moments
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    shapes = {geom.id: _shape(model, data, geom) for geom in spec.geoms}
+    shapes = {geom.id: _shape(model, data, geom) for geom in geoms}
     if not 0 <= solid[0].friction[0] < np.inf:
         raise ValueError(f"its friction is {solid[0].friction[0]}")
     return ObjectSource(
@@ -165,6 +167,9 @@ def _model(root: Element) -> Element:
         mesh.attrib.setdefault("name", Path(mesh.attrib["file"]).stem)
     for material in model.iter("material"):
         material.attrib.pop("texture", None)
+    count = sum(1 for worldbody in model.findall("worldbody") for _ in worldbody.iter("geom"))
+    if count > MOST_GEOMS:
+        raise ValueError(f"it has {count:,} geoms, expected at most {MOST_GEOMS:,}")
     for worldbody in model.findall("worldbody"):
         for parent in list(worldbody.iter()):
             parent[:] = [child for child in parent if child.tag not in WEIGHTLESS]

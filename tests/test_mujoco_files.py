@@ -205,7 +205,8 @@ def test_geometry_without_collision_is_solid_and_a_mesh_with_a_frame_is_drawn_in
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "box.obj")
     model = load(
         tmp_path,
-        '<geom type="mesh" mesh="box" contype="0" conaffinity="0" rgba="1 0 0 1"/>',
+        '<geom type="mesh" mesh="box" contype="0" conaffinity="0" rgba="1 0 0 1"/>'
+        '<geom type="box" size="1 1 1" contype="0" conaffinity="0" rgba="0 0 1 0"/>',  # invisible
         '<asset><mesh file="box.obj" refpos="0.02 0 0"/></asset>',
     )
     assert model.mass == pytest.approx(700 * VOLUME) and model.color == (1, 0, 0, 1)
@@ -245,7 +246,7 @@ def test_a_folder_of_sdf_alone_says_how_to_convert_it(tmp_path):
 
 # --- What is refused ------------------------------------------------------------------------------
 
-BALL = "<body><geom size='0.03'/></body>"
+BALL = "<body><geom size='0.03'/></body>"  # MuJoCo's default geom is a sphere
 MESH = "<geom type='mesh' mesh='m'/>"
 ASSET = "<asset><mesh name='m' {}/></asset>"
 
@@ -283,6 +284,7 @@ def test_what_is_no_body_is_named(tmp_path, content, message):
         (MESH, ASSET.format("file='../m.obj'"), "names ../m.obj, which is outside"),
         (MESH, ASSET.format("file='/m.obj'"), "names /m.obj, which is outside"),
         (MESH, "", "mesh 'm' not found"),
+        (2001 * BALL, "", "2,001 geoms"),
         (BOX, "<include file='other.xml'/>", "other.xml cannot be read"),
         (BOX, "<include file='../other.xml'/>", "outside its folder"),
         (BOX, "<include file='thing.xml'/>", "includes thing.xml twice"),
