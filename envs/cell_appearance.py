@@ -85,13 +85,14 @@ def draw_camera(rng: np.random.Generator, camera: CameraConfig) -> tuple[Intrins
     """Intrinsics and pose (4, 4) T_WC near the configured overhead camera's, now and then far.
 
     Near: within 2 cm, 3 degrees and 8 % of the focal length, of every roll. Far: up to 25 degrees
-    oblique and 12 cm nearer or farther.
+    oblique, though not over the robot, and 12 cm nearer or farther.
     """
     far = rng.random() < _OBLIQUE_SHARE
     position, target = np.array(camera.position), np.array(camera.target)
     distance = np.linalg.norm(position - target)
     tilt = np.radians(rng.uniform(0, 25 if far else 3))
-    heading = rng.uniform(0, 2 * np.pi)
+    # From the robot's side its hand would hide the table from an oblique camera.
+    heading = rng.uniform(-1, 1) * np.pi * (2 / 3 if far else 1)
     away = np.array([np.cos(heading) * np.sin(tilt), np.sin(heading) * np.sin(tilt), np.cos(tilt)])
     shift = np.append(rng.uniform(-0.02, 0.02, 2), 0.0)
     length = distance + rng.uniform(-1, 1) * (0.12 if far else 0.02)

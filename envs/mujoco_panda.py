@@ -1,6 +1,6 @@
 """The Panda in MuJoCo: the links of `envs.panda_model`, servos, gripper and contacts.
 
-This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.4,<4".
+This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.12,<4".
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def load_mujoco():
         import mujoco
     except ImportError as error:
         raise UserError(
-            'MuJoCo is not installed: pip install "mujoco>=3.4,<4" (4.0.0 is another package)'
+            'MuJoCo is not installed: pip install "mujoco>=3.12,<4" (4.0.0 is another package)'
         ) from error
     return mujoco
 

@@ -58,7 +58,7 @@ SIMULATORS: dict[str, Simulator] = {
         "mujoco",
         "envs.mujoco_cell:MujocoCell",
         "envs.mujoco_bodies:MujocoTable",
-        'pip install "mujoco>=3.4,<4" (4.0.0 is another package)',
+        'pip install "mujoco>=3.12,<4" (4.0.0 is another package)',
     ),
 }
 

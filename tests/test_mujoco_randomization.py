@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.4,<4"')
+pytest.importorskip("mujoco", reason='MuJoCo is optional: pip install "mujoco>=3.12,<4"')
 
 import mujoco
 
