@@ -14,3 +14,8 @@ def same(a, b) -> bool:
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(same, a, b))
     return a == b
+
+
+def halved(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A network's weights as a file in half precision gives them back."""
+    return {name: w.half().float() if w.dim() > 1 else w for name, w in weights.items()}
