@@ -142,6 +142,14 @@ def test_only_what_may_change_is_changed_when_a_run_is_resumed(tmp_path):
     check_resume(CONFIG, run, free, ["last.pt", "fold*/last.pt"])
 
 
+def test_an_unknown_option_is_told_how_a_setting_is_written(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        parse_args(["--rounds", "3"], "a script")
+    assert "--rounds; a setting is written KEY=VALUE, such as evaluate.rounds=50" in (
+        capsys.readouterr().err
+    )
+
+
 def test_parse_args(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("seed: 3\n")
