@@ -76,9 +76,11 @@ soak: $(VENV)/.installed-dev
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
+# Python 3.10 brings a pip that tries versions for a quarter of an hour; the newest one needs a minute.
 # Without compiling all of torch to bytecode, pip needs half the time.
 # LOCKED=1 takes the versions and hashes of requirements.lock, as CI does; they include what tests need.
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python
+	-$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --no-compile -r $(if $(LOCKED),requirements.lock,requirements.txt)
 	touch $@
 
