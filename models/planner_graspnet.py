@@ -3,7 +3,8 @@
 A network's maps are exact to a few millimetres; fingers beside an object need better. So the
 antipodal search proposes exact poses, and the network's quality at their places and angles is a
 factor on their scores: before they are measured on the height map, so that few have to be, and
-after. Colours tell table from object in the holes of the depth image (`table_in_holes`).
+after. In the holes of the depth image, colours tell which surface is seen (`table_in_holes`,
+`surfaces_in_holes`).
 
 Where the network has a centre head, its votes segment the height map into objects. At each pixel
 the head predicts the offset to the centre of mass of the object there. All parts of one object
@@ -26,7 +27,7 @@ from models.graspnet_inference import scaled_maps
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import Candidates, SearchSettings
-from utils.depth import table_in_holes
+from utils.depth import surfaces_in_holes, table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, local_maxima
 from utils.images import PixelScaling
@@ -143,7 +144,7 @@ class GraspNetPlanner(SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         model, metres_per_pixel, *_ = self.network
-        frame = table_in_holes(frame, self.workspace.table_height)
+        frame = surfaces_in_holes(table_in_holes(frame, self.workspace.table_height))
         knows_centres = model.centre_head is not None
         scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
         heights = height_map_from_frame(frame, self.workspace)

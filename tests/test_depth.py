@@ -25,6 +25,7 @@ from utils.depth import (
     depth_of_plane,
     make_depth_noise,
     near_side,
+    surfaces_in_holes,
     table_in_holes,
 )
 from utils.errors import UserError
@@ -507,11 +508,46 @@ def test_noisy_colours_are_told_apart(noise: int) -> None:
     assert (np.abs(found - clean)[lost & ~on_box] < 1e-5).mean() > 0.85
 
 
+def test_a_hole_at_an_edge_takes_the_depth_of_the_surface_that_has_its_colour() -> None:
+    """Along the outline of a box, on it and on the table; a colour of neither stays unknown, and
+    so does a hole within a surface, in which a thin part may stand that was lost whole."""
+    frame, clean, _ = with_a_hole()
+    on_box = (frame.rgb == ITEM).all(axis=-1)
+    square = np.ones((3, 3), np.uint8)
+    outline = cv2.dilate(on_box.astype(np.uint8), square) != cv2.erode(
+        on_box.astype(np.uint8), square
+    )
+    assert (outline & on_box).sum() > 50 and (outline & ~on_box).sum() > 50
+    frame = replace(frame, depth=np.where(outline, 0, clean))
+    found = surfaces_in_holes(frame).depth
+    np.testing.assert_allclose(found, clean, atol=1e-3)
+    np.testing.assert_array_equal(found[~outline], clean[~outline])
+    strange = np.where(outline[..., None], (200, 30, 30), frame.rgb).astype(np.uint8)
+    assert (surfaces_in_holes(replace(frame, rgb=strange)).depth[outline] == 0).all()
+    within = cv2.erode(on_box.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    assert within.sum() > 20
+    found = surfaces_in_holes(replace(frame, depth=np.where(within, 0, clean))).depth
+    assert (found[within] == 0).all()
+
+
+def test_of_two_surfaces_of_one_colour_the_nearer_one_in_the_image_counts() -> None:
+    depth = np.full((20, 40), 0.8, np.float32)
+    depth[:, 20:] = 0.7
+    depth[:, 18:21] = 0.0
+    frame = RGBDFrame(
+        np.full((20, 40, 3), 90, np.uint8), depth, np.diag([400.0, 400.0, 1.0]), np.eye(4)
+    )
+    found = surfaces_in_holes(frame).depth[10]
+    np.testing.assert_array_equal(found[[18, 20]], np.float32([0.8, 0.7]))
+
+
 def test_images_without_holes_or_without_depth_are_left_alone() -> None:
     frame = boxes_frame([BOX])
     assert table_in_holes(frame, 0.0) is frame
     nothing = replace(frame, depth=np.zeros_like(frame.depth))
     assert table_in_holes(nothing, 0.0) is nothing
+    assert surfaces_in_holes(frame) is frame
+    assert surfaces_in_holes(nothing) is nothing
 
 
 @pytest.mark.parametrize("height", [0.0, 0.05])

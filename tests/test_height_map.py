@@ -143,6 +143,17 @@ def test_what_is_in_a_hole_may_be_higher_than_what_is_beside_it() -> None:
     assert np.abs(at - (0.0, 0.5)).max() < 0.012
 
 
+def test_holes_along_an_edge_do_not_raise_the_ceiling() -> None:
+    """A box 5 cm high without the pixels on both sides of its outline: nothing is lost there."""
+    frame = boxes_frame([((0.06, 0.06, 0.05), 0.0, (0.5, 0.0))])
+    on_box = (frame.depth < frame.depth.max() - 0.02).astype(np.uint8)
+    square = np.ones((3, 3), np.uint8)
+    edge = cv2.dilate(on_box, square) > cv2.erode(on_box, square)
+    lossy = replace(frame, depth=np.where(edge, 0, frame.depth).astype(np.float32))
+    ceiling = height_map_from_frame(lossy, Workspace()).ceiling
+    assert ceiling.max() == pytest.approx(0.05, abs=1e-3)
+
+
 def test_an_object_that_the_camera_did_not_measure_is_a_wall() -> None:
     """A black box, say: all of its pixels are holes."""
     small, black = ((0.03, 0.03, 0.04), 0.0, (0.45, 0.0)), ((0.10, 0.16, 0.10), 0.0, (0.56, 0.0))

@@ -14,8 +14,8 @@ classification" (ICRA 2014), whose window of projected dots makes the holes. `Re
 active stereo camera, `GammaNoise` the noise with which Dex-Net 2.0 and GIGA were trained.
 
 Holes (pixels without a depth) lie at the edges of whatever stands up, in its shadow, and cover thin
-parts. `near_side`, `table_in_holes` and `fill_holes` fill them, each for another purpose. This
-module knows no simulator, no network and no grasps.
+parts. `near_side`, `table_in_holes`, `surfaces_in_holes` and `fill_holes` fill them, each for
+another purpose. This module knows no simulator, no network and no grasps.
 """
 
 from __future__ import annotations
@@ -460,6 +460,12 @@ SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
 # less than LIKE_TABLE, and UNLIKE_OBJECT times as much from the nearest object's.
 LIKE_TABLE = 30.0
 UNLIKE_OBJECT = 2.0
+# A hole is at an edge where measured depths within EDGE_REACH pixels differ by EDGE_STEP metres. In
+# other holes may stand a thin part that was lost whole.
+EDGE_REACH = 3
+EDGE_STEP = 0.012
+SURFACE_REACH = 0.012  # m around a hole's pixel in which a surface of its colour is looked for
+LIKE_SURFACE = 20.0  # by less than this differ the colours of one surface, three channels together
 
 
 def fill_holes(depth: np.ndarray) -> np.ndarray:
@@ -506,6 +512,15 @@ def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
     return cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
 
 
+def at_edges(depth: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels within EDGE_REACH of measured depths that differ by EDGE_STEP."""
+    known = known_depth(depth)
+    square = np.ones((2 * EDGE_REACH + 1, 2 * EDGE_REACH + 1), np.uint8)
+    farthest = cv2.dilate(np.where(known, depth, 0).astype(np.float32), square)
+    nearest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), square)
+    return farthest - nearest > EDGE_STEP
+
+
 def reach_in_pixels(frame: RGBDFrame, metres: float) -> int:
     """The number of pixels that span `metres` at the median known depth; at least 1."""
     known = known_depth(frame.depth)
@@ -538,6 +553,34 @@ def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     like_table = (table < LIKE_TABLE) & (UNLIKE_OBJECT * table < item)
     depth[holes] = np.where(like_table, depth_of_plane(frame, table_height)[holes], depth[holes])
     return replace(frame, depth=depth)
+
+
+def surfaces_in_holes(frame: RGBDFrame) -> RGBDFrame:
+    """The frame with the depth of the surfaces beside them in those holes that have their colour.
+
+    The lost rim of an object has the object's colour, and the shadow beside it that of what lies
+    below. Each pixel takes the depth of the nearest measured pixel within SURFACE_REACH whose
+    colour differs by less than LIKE_SURFACE; where there is none it stays unknown. So do holes
+    that are not `at_edges`.
+    """
+    known = known_depth(frame.depth)
+    if known.all() or not known.any():
+        return frame
+    reach = reach_in_pixels(frame, SURFACE_REACH)
+    width = known.shape[1] + 2 * reach
+    measured = np.pad(np.where(known, frame.depth, 0), reach).ravel()
+    colours = np.pad(frame.rgb.astype(np.int32), ((reach, reach), (reach, reach), (0, 0)))
+    colours = colours.reshape(-1, 3)
+    filled = measured.copy()
+    left = np.flatnonzero(np.pad(~known & at_edges(frame.depth), reach))
+    for down, right in reversed(_farthest_first(reach)):
+        beside = left + down * width + right
+        difference = ((colours[beside] - colours[left]) ** 2).sum(axis=1)
+        alike = (measured[beside] > 0) & (difference < LIKE_SURFACE**2)
+        filled[left[alike]] = measured[beside[alike]]
+        left = left[~alike]
+    depth = filled.reshape(-1, width)[reach:-reach, reach:-reach]
+    return replace(frame, depth=np.where(known, frame.depth, depth).astype(frame.depth.dtype))
 
 
 def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:

@@ -14,12 +14,19 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth import HOLE_REACH, depth_of_plane, near_side, nearest_values, reach_in_pixels
+from utils.depth import (
+    HOLE_REACH,
+    at_edges,
+    depth_of_plane,
+    near_side,
+    nearest_values,
+    reach_in_pixels,
+)
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
 from utils.transforms import RGBDFrame, deproject, known_depth
 
-# Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole may be
-# this much higher than the surface beside it.
+# Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole that is
+# not at an edge may be this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
@@ -80,11 +87,13 @@ def height_map_from_frame(
 ) -> HeightMap:
     """The height map of a depth image; uses nothing of the frame but depth, K and T_WC.
 
-    Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over them is
-    a little higher. Labels are the pieces between height discontinuities; their centres are volume
-    centroids of the columns between the table and the visible surface.
+    Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over those
+    that are not `at_edges` is a little higher. Labels are the pieces between height
+    discontinuities; their centres are volume centroids of the columns between the table and the
+    visible surface.
     """
     measured = known_depth(frame.depth)
+    hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
         reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))
@@ -99,8 +108,8 @@ def height_map_from_frame(
     # The rays that graze an edge bound the matter in its shadow.
     ceiling = _highest(_grazing_points(frame, origin, cell), grid.shape[:2])
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
-    if not measured.all():
-        nearer = replace(frame, depth=np.where(measured, 0, frame.depth - HOLE_RISE))
+    if hiding.any():
+        nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
         risen = _highest(_surface_points(nearer, origin, cell), grid.shape[:2])
         ceiling = np.maximum(ceiling, risen)
     label = label_walls(label_pieces(height, table, cell), grid, workspace, cell)
