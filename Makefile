@@ -76,7 +76,7 @@ soak: $(VENV)/.installed-dev
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
-# Python 3.10 brings a pip that tries versions for a quarter of an hour; the newest one needs a minute.
+# The pip of Python 3.10.13 tries versions for more than ten minutes; the newest one does not.
 # Without compiling all of torch to bytecode, pip needs half the time.
 # LOCKED=1 takes the versions and hashes of requirements.lock, as CI does; they include what tests need.
 $(VENV)/.installed: requirements.txt | $(VENV)/bin/python

@@ -183,7 +183,7 @@ def _runs(
     picked = np.arange(rows[0], rows[-1] + 1, 2) if len(rows) else rows
     matter = turned[picked] > levels[:, None, None]
     edge = np.diff(np.pad(matter, ((0, 0), (0, 0), (1, 1))).view(np.int8), axis=-1)
-    # np.nonzero of three axes takes ten times as long.
+    # np.nonzero of three axes is slower.
     level, row, first = np.unravel_index(np.flatnonzero(edge == 1), edge.shape)
     last = np.flatnonzero(edge == -1) % edge.shape[2] - 1
     found = []

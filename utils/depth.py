@@ -513,7 +513,8 @@ def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
 
 
 def at_edges(depth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels within EDGE_REACH of measured depths that differ by EDGE_STEP."""
+    """(H, W) bool: pixels of a depth image (H, W), m, within EDGE_REACH pixels of measured depths
+    that differ by more than EDGE_STEP."""
     known = known_depth(depth)
     square = np.ones((2 * EDGE_REACH + 1, 2 * EDGE_REACH + 1), np.uint8)
     farthest = cv2.dilate(np.where(known, depth, 0).astype(np.float32), square)
