@@ -7,6 +7,7 @@ same for all. This module knows no simulator, object, camera or task.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -37,6 +38,7 @@ LEFT, RIGHT = 0, 1  # fingers; the left one is on the side of E's +y axis
 
 _WAYPOINT_SPACING = 0.01  # m
 _MAX_JUMP = 0.3  # rad between neighbouring waypoints
+_NEARLY_SINGULAR = 1e-9  # m^2, added where a Jacobian is inverted, of which 0.01 is a small eigenvalue
 
 Contact = tuple[tuple[float, float, float], float]  # normal in W, and newtons along it
 
@@ -190,8 +192,9 @@ class Robot(ABC):
         torques = self.external_torques()
         if not torques.any():
             return 0.0
-        wrench = np.linalg.lstsq(geometric_jacobian(self.q).T, torques, rcond=None)[0]
-        return float(np.linalg.norm(wrench[:3]))
+        J = geometric_jacobian(self.q)
+        wrench = np.linalg.solve(J @ J.T + _NEARLY_SINGULAR * np.eye(6), J @ torques)
+        return math.hypot(*wrench[:3])
 
     @abstractmethod
     def external_torques(self) -> np.ndarray:

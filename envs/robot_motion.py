@@ -11,6 +11,7 @@ ended. Pure numpy: no simulator, no cell, no object.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -174,13 +175,21 @@ def blended(
     """
     change = second.positions - first.positions[-1]
     waiting = np.broadcast_to(first.positions[-1], change.shape)
-    for early in range(min(most, len(first), len(second)), -1, -1):
+
+    def together(early: int) -> np.ndarray:
         positions = np.vstack([first.positions, waiting[early:]])
         positions[len(first) - early :] += change
+        return positions
+
+    def illegal(early: int) -> bool:
+        positions = together(early)
         within = (positions >= JOINT_LOWER).all() and (positions <= JOINT_UPPER).all()
-        if within and limits.excess(start, positions, dt) <= _ROUNDING:
-            break
-    return _trajectory(start, positions, dt)
+        return not within or limits.excess(start, positions, dt) > _ROUNDING
+
+    early = min(most, len(first), len(second))
+    if illegal(early):  # the earlier, the faster both are together: a few halvings find the limit
+        early = bisect_left(range(1, early), True, key=illegal)
+    return _trajectory(start, together(early), dt)
 
 
 def _trajectory(start: np.ndarray, positions: np.ndarray, dt: float) -> Trajectory:
