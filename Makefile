@@ -6,6 +6,10 @@ BIN := $(VENV)/bin
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
+# pip leaves compiling to the first import. With this variable set, every process would compile torch
+# again, which takes 5 s.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results soak lock clean
 
 # Two processes of one thread each; a test file stays in one of them, so that its fixtures are made once.
