@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+REQUIREMENTS := $(if $(LOCKED),requirements.lock,requirements.txt)
+INSTALLED := $(VENV)/.installed$(if $(LOCKED),-locked)
 
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
@@ -17,11 +19,11 @@ unexport PYTHONDONTWRITEBYTECODE
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 test test-fast test-oldest: export OMP_NUM_THREADS := 1
 
-run: $(VENV)/.installed
+run: $(INSTALLED)
 	$(BIN)/python evaluate.py $(ARGS)
 
 # The whole chain in five minutes: a little data, a short training, a scored network.
-quick: $(VENV)/.installed
+quick: $(INSTALLED)
 	mkdir -p runs
 	$(BIN)/python train_graspnet.py --config configs/quick.yaml --weights runs/quick.pt
 	$(BIN)/python evaluate.py --config configs/quick.yaml
@@ -83,16 +85,16 @@ $(VENV)/bin/python:
 # The pip of Python 3.10.13 tries versions for more than ten minutes; the newest one does not.
 # Without compiling all of torch to bytecode, pip needs half the time.
 # LOCKED=1 takes the versions and hashes of requirements.lock, as CI does; they include what tests need.
-$(VENV)/.installed: requirements.txt | $(VENV)/bin/python
+$(INSTALLED): $(REQUIREMENTS) | $(VENV)/bin/python
 	-$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --no-compile -r $(if $(LOCKED),requirements.lock,requirements.txt)
+	$(BIN)/python -m pip install --no-compile -r $(REQUIREMENTS)
 	touch $@
 
-$(VENV)/.installed-cluster: $(VENV)/.installed
+$(VENV)/.installed-cluster: $(INSTALLED)
 	$(BIN)/python -m pip install "distributed>=2025.1"
 	touch $@
 
-$(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
+$(VENV)/.installed-dev: requirements-dev.txt $(INSTALLED)
 	$(BIN)/python -m pip install --no-compile -r requirements-dev.txt
 	touch $@
 

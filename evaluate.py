@@ -62,7 +62,7 @@ from utils.runs import (
     check_resume,
     check_writable,
     environment,
-    new_run_folder,
+    open_run,
     parse_args,
     run_script,
     save_results,
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return report_transfer(config, options)
     check_controllers(config, options.overrides)
     check_everything(config)
-    run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
+    run = open_run(options.resume, "evaluate", config.evaluate.name, config)
     announce(config, run)
 
     outcome = play(config, run, work)
@@ -209,7 +209,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     for evaluation in evaluations:
         check_everything(evaluation.config, "transfer.policies")
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
-    run = options.resume or new_run_folder("evaluate", config.evaluate.name, config)
+    run = open_run(options.resume, "evaluate", config.evaluate.name, config)
 
     scores, error, interrupted = {row: {} for row in rows}, None, False
     for evaluation in evaluations:

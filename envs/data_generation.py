@@ -72,6 +72,8 @@ def _content(config: Config) -> str:
     chosen["data"] = {
         key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")
     }
+    if config.data.executed_share > 0:
+        chosen |= {key: everything[key] for key in ("robot", "execution", "safety")}
     if config.data.randomise_physics:
         physics = everything["randomization"]["physics"]
         chosen["physics"] = {key: physics[key] for key in _PHYSICS}

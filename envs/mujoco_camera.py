@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import mujoco
 
 CAMERA, LIGHT = "camera", "light"  # names in the model
-_MOST_SHAPES = 2000  # in one picture
+_MORE_SHAPES = 100  # in one picture beside the model's
 # The window's first view: degrees, and metres in W.
 SCENIC_VIEW = {"azimuth": 150.0, "elevation": -30.0, "distance": 1.6, "lookat": (0.4, -0.1, 0.15)}
 
@@ -48,7 +48,7 @@ class MujocoCamera(Camera):
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
         self._mujoco, self._model, self._data = load_mujoco(), model, data
         _gl_context().make_current()
-        self._scene = self._mujoco.MjvScene(model, _MOST_SHAPES)
+        self._scene = self._mujoco.MjvScene(model, model.ngeom + _MORE_SHAPES)
         self._context = self._mujoco.MjrContext(
             model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value
         )
@@ -116,7 +116,7 @@ class MujocoCamera(Camera):
         for shape in self._scene.geoms[: self._scene.ngeom]:
             if shape.segid >= 0 and shape.objtype == self._mujoco.mjtObj.mjOBJ_GEOM:
                 body_of[shape.segid + 1] = self._model.geom_bodyid[shape.objid]
-        # Red and green hold the number, of which there are fewer than _MOST_SHAPES.
+        # Red and green hold the number, of which there are fewer than 65,536.
         red, green = colours[..., 0].astype(np.int32), colours[..., 1].astype(np.int32)
         return body_of[red + (green << 8)]
 

@@ -32,6 +32,7 @@ SUFFIXES = (".urdf", ".xml", *MESH_SUFFIXES)
 # For files that state none. The density, kg/m3, is the median of 26 of the YCB household objects,
 # mass over the volume of their convex parts.
 DEFAULT_FRICTION, DEFAULT_DENSITY = 0.7, 700.0
+MOST_GEOMETRIES = 300  # of a URDF, which yourdfpy reads in some ten seconds
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,11 @@ def _resolve_mesh(filename: str, urdf: Path) -> str:
 
 def _read_urdf(path: Path) -> ObjectSource:
     xml = parse_xml(path)
+    count = sum(1 for _ in xml.iter("geometry"))
+    if count > MOST_GEOMETRIES:
+        raise ObjectError(
+            f"URDF {path} has {count:,} geometries, expected at most {MOST_GEOMETRIES}; simplify it"
+        )
     for element in xml.iter("mesh"):
         # Reading the mesh first gives an error that names it, which yourdfpy's error may not.
         load_mesh(_resolve_mesh(element.get("filename", ""), path))
@@ -201,7 +207,7 @@ def _read_urdf(path: Path) -> ObjectSource:
         inertial=inertial,
         color=_urdf_color(shown, robot),
         visual=_single_visual(shown, robot, path),
-        visual_mesh=visual if len(visual.faces) else None,
+        visual_mesh=visual if len(visual.faces) else mesh,
     )
 
 
@@ -232,6 +238,8 @@ def combined(stated: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> Inertial
     for mass, at, own in stated:  # the parallel axis theorem
         off = at - centre
         inertia += own + mass * (off @ off * np.eye(3) - np.outer(off, off))
+    if not (np.isfinite(centre).all() and np.isfinite(inertia).all()):
+        raise ValueError("its centre of mass or its inertia is not finite")
     return Inertial(total, centre, inertia)
 
 

@@ -26,7 +26,7 @@ from utils.errors import UserError
 from utils.runs import write_atomic
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".dae")
-MOST_FACES = 2_000_000
+MOST_FACES, MOST_PIECES = 2_000_000, 2_000
 SMALLEST_SIDE, LARGEST_SIDE = (
     1e-9,
     1e9,
@@ -73,11 +73,26 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         parse_xml(path)
     try:
         # Materials name other files, which nothing here needs.
-        mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
+        scene = trimesh.load_scene(path, process=False, skip_materials=True)
+        _check_size(scene)
+        mesh = scene.to_mesh()
     except Exception as error:  # each of trimesh's readers raises errors of its own kind
         reason = f"mesh {path} cannot be read ({error}); re-export or remove it"
         raise ObjectError(reason) from error
     return checked_mesh(mesh, str(path))
+
+
+def _check_size(scene: trimesh.Scene) -> None:
+    """Raise ValueError for a scene that is too large as one mesh: a small file may say of a shape
+    that it stands in many places."""
+    places = {name: len(nodes) for name, nodes in scene.graph.geometry_nodes.items()}
+    if sum(places.values()) > MOST_PIECES:
+        raise ValueError(f"it has more than {MOST_PIECES:,} pieces")
+    faces = (
+        count * len(getattr(scene.geometry[name], "faces", ())) for name, count in places.items()
+    )
+    if sum(faces) > MOST_FACES:
+        raise ValueError(f"it has more than {MOST_FACES:,} triangles")
 
 
 def parse_xml(path: Path) -> ElementTree.Element:

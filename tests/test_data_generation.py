@@ -51,10 +51,16 @@ def folder_of(*overrides: str) -> Path:
         "seed=1", "sim.frequency=120", "camera.width=128", "camera.fov_deg=30",
         "workspace.size=0.25", "objects.density=500", "data.object_sets=box",
         "data.max_objects=3", "data.randomise=false", "data.executed_share=0.5",
+        "robot.grip_force=2", "execution.approach_speed=0.02", "safety.contact_stop=5",
     ],
 )  # fmt: skip
 def test_what_matters_to_an_image_changes_the_folder(override):
     assert folder_of(override) != folder_of()
+
+
+def test_where_no_grasp_is_executed_the_robot_does_not_matter():
+    seen_only = "data.executed_share=0"
+    assert folder_of(seen_only, "robot.grip_force=2") == folder_of(seen_only)
 
 
 @pytest.mark.parametrize(

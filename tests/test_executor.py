@@ -174,20 +174,38 @@ def test_a_process_that_freezes_is_replaced(tmp_path, monkeypatch):
 def test_a_process_that_starts_late_and_freezes_is_ended(monkeypatch):
     """A busy machine needs longer to start it than a call may take; only then does it freeze."""
     monkeypatch.setattr(executor, "FREEZE_SECONDS", 0.05)
-    number, call, ended = Future(), Future(), []
+    began, call, ended = Future(), Future(), []
+    process = process_of_futures(began, call, ended)
+    Timer(0.4, began.set_result, [4711]).start()
+    with pytest.raises(BrokenProcessPool):
+        process.run(executor.Job("late", 0.05), print)
+    assert ended[0] > 0.4
 
-    def end(pid, signal):
-        ended.append(pid)
+
+def test_a_process_that_never_starts_is_ended(monkeypatch):
+    monkeypatch.setattr(executor, "START_SECONDS", 0.2)
+    ended = []
+    process = process_of_futures(Future(), Future(), ended)
+    with pytest.raises(BrokenProcessPool):
+        process.run(executor.Job("never", 60.0), print)
+    assert 0.2 < ended[0] < 10.0
+
+
+def process_of_futures(began, call, ended):
+    """A process that has started once `began` has a result; when it is killed, `call` is lost, and
+    `ended` is told after how many seconds."""
+    start = time.monotonic()
+
+    def kill():
+        ended.append(time.monotonic() - start)
         if not call.done():
             call.set_exception(BrokenProcessPool())
 
-    monkeypatch.setattr(executor.os, "kill", end)
     process = object.__new__(executor._Process)
-    process._pool, process._number = SimpleNamespace(submit=lambda *_: call), number
-    Timer(0.4, number.set_result, [4711]).start()
-    with pytest.raises(BrokenProcessPool):
-        process.run(executor.Job("late", 0.05), print)
-    assert set(ended) == {4711}
+    children = {4711: SimpleNamespace(kill=kill)}
+    process._pool = SimpleNamespace(submit=lambda *_: call, _processes=children)
+    process._began = began
+    return process
 
 
 def test_a_call_that_ends_every_worker_is_an_error(compute):
@@ -296,8 +314,10 @@ def collected():
     gc.collect()
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "tls://127.0.0.1:1", "no address"])
-def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch, collected):
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:1", "tls://127.0.0.1:1", "no address", "127.0.0.1"]
+)
+def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch, collected, capfd):
     pytest.importorskip("distributed", reason="pip install distributed")
     monkeypatch.setattr(executor, "CONNECT_SECONDS", 3.0)
     compute = load_config(None, [f"compute.scheduler={address}"]).compute
@@ -306,6 +326,8 @@ def test_an_unreachable_scheduler_is_one_sentence(address, monkeypatch, collecte
         open_executor(compute),
     ):
         pass
+    gc.collect()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_workers_with_several_threads_are_refused():

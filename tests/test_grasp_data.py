@@ -213,6 +213,18 @@ def ask_for_frames_without_end(file, folder):
     file.create_dataset("depth", shape, "u2", chunks=(1, *shape[1:]))
 
 
+def ask_for_images_of_gigabytes(file, folder):
+    """In chunks that were never written."""
+    side, bins = 4096, 4096
+    image, labels = (side, side), (bins, side, side)
+    shapes = dict.fromkeys(("depth", "valid", "instance"), image) | {"rgb": (*image, 3)}
+    for name, shape in (shapes | {"quality": labels, "width": labels}).items():
+        kind, attributes = file[name].dtype, dict(file[name].attrs)
+        del file[name]
+        data = file.create_dataset(name, (2, *shape), kind, chunks=(1,) * (1 + len(shape)))
+        data.attrs.update(attributes)
+
+
 def change_the_type(file, folder):
     del file["valid"]
     file["valid"] = np.ones((2, *SHAPE), np.float64)
@@ -227,7 +239,7 @@ def change_the_shape(file, folder):
     "spoil",
     [
         link_elsewhere, store_elsewhere, ask_for_terabytes, ask_for_frames_without_end,
-        change_the_type, change_the_shape,
+        ask_for_images_of_gigabytes, change_the_type, change_the_shape,
     ],
 )  # fmt: skip
 def test_what_no_shard_has_is_refused(stored, spoil):
@@ -239,6 +251,16 @@ def test_what_no_shard_has_is_refused(stored, spoil):
         spoil(file, folder)
     with pytest.raises(UserError, match="00000.h5: not a readable data shard"):
         SimulatedDataset(folder, "train")
+
+
+def test_an_object_without_a_centre_is_noticed(stored):
+    folder, *_ = stored
+    with h5py.File(shard_path(folder, "train", 0), "a") as file:
+        file["instance"][1] = 100
+    images = SimulatedDataset(folder, "train")
+    images[0]
+    with pytest.raises(UserError, match="not a readable data shard .instance names objects"):
+        images[1]
 
 
 def test_a_flipped_bit_is_noticed(stored):

@@ -11,7 +11,7 @@ import pytest
 from utils.installation import PACKAGES, problem
 
 ROOT = Path(__file__).resolve().parent.parent
-SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl")
+SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl", "envs.studio")
 
 
 def test_an_old_python_and_a_missing_package_are_named():

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Intrinsics
-from envs.mujoco_camera import camera_of
+from envs.mujoco_camera import MujocoCamera, add_view, camera_of
 from utils.transforms import look_at
 
 
@@ -98,6 +98,20 @@ def test_pictures_of_several_sizes(cells, pile):
         image = mujoco.image(Intrinsics(width, height, 28.0), mujoco.camera_pose("overhead"))
         assert image.rgb.shape == (height, width, 3) and image.depth.shape == (height, width)
         assert image.depth[0, 0] == pytest.approx(0.8, abs=1e-4)
+
+
+def test_every_shape_of_a_large_scene_is_seen():
+    mujoco = pytest.importorskip("mujoco")
+    spec = mujoco.MjSpec()
+    for x in range(2500):
+        body = spec.worldbody.add_body(name=f"ball{x}", pos=[x, 0, 0])
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    add_view(spec)
+    model = spec.compile()
+    camera = MujocoCamera(model, mujoco.MjData(model))
+    image = camera.render(Intrinsics(32, 32, 28.0), look_at((2499, 0, 1), (2499, 0, 0), (1, 0, 0)))
+    camera.close()
+    assert image.bodies[16, 16] == model.body("ball2499").id
 
 
 TRAIN_AFTER_AN_IMAGE = """

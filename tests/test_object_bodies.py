@@ -1,5 +1,7 @@
 """One object from a file: known masses and inertias, units, and what no body can have."""
 
+import math
+
 import numpy as np
 import pytest
 import trimesh
@@ -59,6 +61,13 @@ def test_of_an_impossible_inertia_the_mass_alone_counts(tmp_path, inertia, origi
     assert model.mass == pytest.approx(0.4) and "inertia" in model.remarks[0]
     assert model.inertia == pytest.approx(box_moments(0.4))
     assert np.concatenate(model.parts).mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+@pytest.mark.parametrize("moment", [math.nan, math.inf])
+def test_an_inertia_that_is_no_number_is_refused(tmp_path, moment):
+    path = urdf_box(tmp_path, "0.4", urdf_inertia((moment, 1e-4, 1e-4)))
+    with pytest.raises(ObjectError, match="inertia is not finite"):
+        load_object(path, cache_dir=tmp_path)
 
 
 @pytest.mark.parametrize("mass", ["-0.1", "nan"])

@@ -110,6 +110,20 @@ def test_corners_that_make_no_body_are_one_sentence(tmp_path, corner):
         load_mesh(path)
 
 
+@pytest.mark.parametrize(("pieces", "message"), [(3, "2,000,000 triang"), (2001, "2,000 pieces")])
+def test_a_small_file_of_a_large_scene_is_refused(tmp_path, monkeypatch, pieces, message):
+    """Whose pieces are one shape that stands in many places."""
+    monkeypatch.setattr("envs.object_meshes.MOST_FACES", 2_000_000 if pieces > 3 else 25)
+    message = message if pieces > 3 else "25 triangles"
+    scene, box = trimesh.Scene(), trimesh.creation.box((0.1, 0.1, 0.1))
+    for number in range(pieces):
+        place = trimesh.transformations.translation_matrix((0.2 * number, 0, 0))
+        scene.add_geometry(box, geom_name="box", transform=place)
+    scene.export(tmp_path / "many.glb")
+    with pytest.raises(ObjectError, match=f"many.glb cannot be read .it has more than {message}"):
+        load_mesh(tmp_path / "many.glb")
+
+
 def test_triangles_without_corners_are_one_sentence():
     mesh = trimesh.Trimesh(np.eye(3), [[0, 1, 9]], process=False)
     with pytest.raises(ObjectError, match="bad has triangles without corners"):

@@ -23,6 +23,7 @@ from utils.runs import (
     environment,
     git_state,
     new_run_folder,
+    open_run,
     parse_args,
     plain_remarks,
     run_of_job,
@@ -99,7 +100,21 @@ def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, mo
     assert on_disk == [(path.stat().st_ino, 10, b"before")]
 
 
-def test_cpus_are_those_of_this_job_shared_by_the_processes_of_this_machine(monkeypatch):
+@pytest.mark.parametrize(
+    ("content", "count"), [("250000 100000", 3), ("10000 100000", 1), ("max 100000", 16), ("?", 16)]
+)
+def test_a_container_gets_no_more_processes_than_its_share_of_time(
+    tmp_path, monkeypatch, content, count
+):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(16)), raising=False)
+    monkeypatch.setattr("utils.runs.CPU_QUOTA", tmp_path / "cpu.max")
+    assert usable_cpus() == 16
+    (tmp_path / "cpu.max").write_text(f"{content}\n")
+    assert usable_cpus() == count
+
+
+def test_cpus_are_those_of_this_job_shared_by_the_processes_of_this_machine(monkeypatch, tmp_path):
+    monkeypatch.setattr("utils.runs.CPU_QUOTA", tmp_path / "none")
     monkeypatch.setattr(os, "cpu_count", lambda: 128)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(16)), raising=False)
     monkeypatch.setenv("WORLD_SIZE", "64")
@@ -160,6 +175,14 @@ def test_parse_args(tmp_path):
     )
     assert (config.seed, config.scene.count, config.evaluate.rounds) == (3, 2, 4)
     assert options.results == Path("r.json") and options.resume is None
+
+
+def test_what_changes_when_a_run_is_resumed_stays_changed(tmp_path):
+    run = open_run(None, "evaluate", None, load_config(), root=tmp_path)
+    config, _ = parse_args(["--resume", str(run), "evaluate.rounds=70"], "a script")
+    assert open_run(run, "evaluate", None, config, root=tmp_path) == run
+    again, _ = parse_args(["--resume", str(run)], "a script")
+    assert again.evaluate.rounds == 70 and again == config
 
 
 def test_resume_takes_the_run_s_config(tmp_path):

@@ -24,7 +24,7 @@ from torch import nn
 
 from utils.config import Config
 from utils.errors import UserError
-from utils.runs import new_run_folder, run_of_job
+from utils.runs import open_run, run_of_job
 
 MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
 
@@ -187,8 +187,9 @@ def run_folder(
     before `torchrun` started them again, because one was lost or others joined.
     """
     folder = resume
-    if folder is None and processes.is_main:
-        folder = run_of_job(script, config) or new_run_folder(script, name, config)
+    if processes.is_main:
+        again = run_of_job(script, config) if resume is None else None
+        folder = again or open_run(resume, script, name, config)
     return Path(processes.broadcast(str(folder)))
 
 

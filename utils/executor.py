@@ -15,7 +15,6 @@ import math
 import multiprocessing
 import os
 import pickle
-import signal
 import sys
 import time
 import uuid
@@ -32,7 +31,7 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache, partial
 from itertools import islice
 from threading import Event, Thread
@@ -54,8 +53,8 @@ from utils.worker_process import (
 
 MOST_LOSSES = 4  # worker processes that one call may lose; as many as Dask allows by default
 CONNECT_SECONDS = 10.0
+START_SECONDS = 300.0  # in which a process has to start, which a busy machine may delay
 FREEZE_SECONDS = 60.0  # after compute.timeout, by when a process that runs has ended itself
-KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has the latter, which ends as surely
 COUNT_SECONDS = 1.0  # between two looks at how many workers a cluster has
 WAIT_SECONDS = 60.0  # between two messages that it has none
 
@@ -189,13 +188,13 @@ class _Process:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_process)
-        self._number = self._pool.submit(os.getpid)
+        self._began = self._pool.submit(os.getpid)
 
     def run(self, job: Job, call: Call) -> Any:
         """The result of a call. Raises BrokenProcessPool where the process has died."""
         future = self._pool.submit(work, job, call)
-        wait([self._number])  # a busy machine may take long to start it, which does not count
-        if not wait([future], job.seconds + FREEZE_SECONDS).done:
+        started = wait([self._began], START_SECONDS).done  # which does not count
+        if not started or not wait([future], job.seconds + FREEZE_SECONDS).done:
             self._kill()
         try:
             return future.result()
@@ -204,9 +203,9 @@ class _Process:
             raise
 
     def _kill(self) -> None:
-        if self._number.done():
-            with suppress(ProcessLookupError):
-                os.kill(self._number.result(), KILL)
+        # Before Python 3.14 a pool has no public way to end a process that does not answer.
+        for process in list((self._pool._processes or {}).values()):
+            process.kill()
 
     def shutdown(self, wait: bool = True) -> None:
         self._pool.shutdown(wait)
@@ -320,13 +319,14 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
     where = f"compute.scheduler={address}"
     try:
         from distributed import Client, KilledWorker
-        from distributed.comm import CommClosedError
+        from distributed.comm import CommClosedError, get_address_host_port
     except ModuleNotFoundError as error:
         install = 'pip install "distributed>=2025.1"'
         raise UserError(f"{where}: a cluster needs Dask: {install}") from error
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are raised here
     facts = facts_of((*SOURCES, *loaded_modules()))
     try:
+        get_address_host_port(address)  # a client that fails at it prints a traceback
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False, loop=event_loop())
     except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without a certificate
         raise UserError(
@@ -340,7 +340,8 @@ def _cluster(address: str, most: int | None, job: Job) -> Iterator[Workers]:
         raise _lost(job) from error
     except (CancelledError, CommClosedError) as error:
         raise UserError(
-            f"{where}: the scheduler or a worker was lost; start it again and go on"
+            f"{where}: the scheduler or a worker was lost; start it again and go on, or go on with "
+            "compute.scheduler=null on this machine"
         ) from error
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in SOURCES:

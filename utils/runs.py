@@ -12,6 +12,7 @@ import argparse
 import errno
 import io
 import json
+import math
 import os
 import platform
 import re
@@ -23,6 +24,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -42,6 +44,7 @@ PACKAGES = (  # whose versions may change a result
     "h5py",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of the container, where it has one
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
 NO_MEMORY = re.compile("can't allocate memory|CUDA out of memory")  # torch's RuntimeErrors
 # What a full disk, a folder that may not be written and a damaged disk give.
@@ -222,6 +225,17 @@ def save_figure(path: Path, figure: Figure) -> None:
 # --- Run folders ---------------------------------------------------------------------------
 
 
+def open_run(
+    resumed: Path | None, script: str, name: str | None, config: Config, root: Path = Path("runs")
+) -> Path:
+    """The folder of a run: a new one, or the one that is `resumed`, whose config.yaml gets the keys
+    that have changed, so that it can be resumed again as it is."""
+    if resumed is None:
+        return new_run_folder(script, name, config, root)
+    write_atomic(resumed / "config.yaml", dump_config(config))
+    return resumed
+
+
 def new_run_folder(
     script: str, name: str | None, config: Config, root: Path = Path("runs")
 ) -> Path:
@@ -337,10 +351,13 @@ def environment() -> dict[str, Any]:
 
 def usable_cpus() -> int:
     """The CPUs for the workers of this process: those that the system lets it use, as a scheduler's
-    job or `taskset` may limit them, shared with the other processes of `torchrun` on this machine;
-    at least 1."""
+    job, a container or `taskset` may limit them, shared with the other processes of `torchrun` on
+    this machine; at least 1."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux alone has it
     count = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # Linux has it: "250000 100000", or "max 100000"
+        quota, period = CPU_QUOTA.read_text().split()
+        count = min(count, math.ceil(int(quota) / int(period)))
     return max(1, count // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
