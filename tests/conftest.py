@@ -58,7 +58,7 @@ def tiny_data(tmp_path_factory):
     overrides = [
         "sim.renderer=tiny", "camera.width=64", "camera.height=64", f"data.root={folder}",
         "data.frames=32", "data.validation_frames=32", "data.object_sets=primitives",
-        "data.max_objects=2", "data.executed_share=0.01", "data.workers=1",
+        "data.max_objects=2", "data.executed_share=0.007", "data.workers=1",
     ]  # fmt: skip
     with FileLock(shared / "tiny_data.lock"):
         generate(load_config(None, overrides))
