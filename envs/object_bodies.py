@@ -54,6 +54,7 @@ def load_object(
     naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
+    name = path.parent.name if path.stem == "model" else path.stem  # many sets have NAME/model.xml
     source = read_object(path, density)
     side = float(np.ptp(source.mesh.vertices, axis=0).max())
     if fit is not None:
@@ -72,12 +73,12 @@ def load_object(
     if stated is not None and inertial is not stated:
         remarks.append(IMPOSSIBLE_INERTIA)
     return ObjectModel(
-        name=path.stem,
+        name=name,
         parts=parts,
         mass=mass,
         inertia=np.diag(inertial.inertia) * scale**2 * (mass / inertial.mass),
         friction=source.friction,
-        color=source.color or random_color(np.random.default_rng(list(path.stem.encode()))),
+        color=source.color or random_color(np.random.default_rng(list(name.encode()))),
         collision=write_parts_obj(parts, cache_dir),
         fine_visual=fine_visual(path, source, scale, inertial.centre_of_mass, cache_dir),
         extents=np.ptp(np.concatenate(parts), axis=0),

@@ -24,6 +24,13 @@ def test_mass_and_inertia_of_a_mesh_box_are_the_closed_form(tmp_path):
     assert model.extents == pytest.approx([0.04, 0.05, 0.06], abs=1e-6)
 
 
+def test_a_file_called_model_has_the_name_of_its_folder(tmp_path):
+    folder = tmp_path / "blue_mug"
+    folder.mkdir()
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(folder / "model.stl")
+    assert load_object(folder / "model.stl", cache_dir=tmp_path).name == "blue_mug"
+
+
 def test_a_light_object_is_given_the_least_mass_and_the_inertia_that_goes_with_it(tmp_path):
     trimesh.creation.box((0.01, 0.01, 0.01)).export(tmp_path / "dice.stl")
     model = load_object(tmp_path / "dice.stl", cache_dir=tmp_path)

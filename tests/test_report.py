@@ -10,7 +10,9 @@ import pytest
 from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, attempt
 from utils.errors import UserError
 from utils.report import GalleryItem, balanced, write_report
+from utils.result_records import FAILURES
 from utils.results import compare, summarise
+from utils.runs import REPOSITORY
 
 
 def report(tmp_path, rounds=ROUNDS, **more) -> str:
@@ -37,6 +39,12 @@ def test_report_is_self_contained(tmp_path):
     assert "evaluate.rounds=2" in page and "python evaluate.py" in page
     assert "heuristic: 3 of 6" in page and "1 collision on approach" in page
     assert "few rounds" in page  # two rounds give no verdict
+
+
+def test_each_reason_has_a_colour_in_light_and_dark():
+    layout = (REPOSITORY / "utils" / "report.html.j2").read_text()
+    for reason in ("success", *FAILURES):
+        assert len(re.findall(rf"--{reason}: #[0-9a-f]{{6}};", layout)) == 2, reason
 
 
 def test_report_of_an_interrupted_run(tmp_path):
