@@ -9,7 +9,7 @@ CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Pyth
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 
 # pip leaves compiling to the first import. With this variable set, every process would compile torch
-# again, which takes 5 s.
+# again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run quick cluster test test-fast test-mujoco test-oldest lint typecheck bench results soak lock clean
