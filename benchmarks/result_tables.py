@@ -20,7 +20,8 @@ from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
 PAGES = (
-    "README.md", "README.zh-CN.md", "docs/results.md", "docs/scaling.md", "docs/reliability.md",
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/six_dof.md", "docs/scaling.md",
+    "docs/reliability.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
@@ -239,9 +240,9 @@ def published(say: Say) -> str:
 
 def scoreboard(say: Say, part: Figures) -> str:
     header = ["objects", "scenario", "planner", "success", "cleared", "picks an hour"]
-    lines = [[f"`{row['objects']}`", row["scenario"], *_planner_cells(row)]
-             for row in rows_of(part)]  # fmt: skip
-    return "\n\n".join([with_depths(header, lines, _noises(rows_of(part)), 2), origin(say, part)])
+    rows = [row for command in part["commands"].values() for row in command["rows"]]
+    lines = [[f"`{row['objects']}`", row["scenario"], *_planner_cells(row)] for row in rows]
+    return "\n\n".join([with_depths(header, lines, _noises(rows), 2), origin(say, part)])
 
 
 def differences(say: Say, part: Figures) -> str:
@@ -258,6 +259,25 @@ def differences(say: Say, part: Figures) -> str:
     ]
     header = ["objects", "scenario", "success, points", "cleared, points"]
     return "\n\n".join([with_depths(header, lines, _noises(pairs), 2), origin(say, part)])
+
+
+def six_dof(say: Say, part: Figures) -> str:
+    """Planners that grasp from any side beside those from straight above, and the differences of
+    each pair on the same scenes."""
+    pairs = [
+        pair
+        for command in part["commands"].values()
+        for pair in command["comparisons"]
+        if pair["first"] == f"{pair['second']}6d"
+    ]
+    lines = [
+        [f"`{pair['objects']}`", pair["scenario"], f"`{pair['first']}` - `{pair['second']}`",
+         points(pair["success"]), points(pair["cleared"])]
+        for pair in pairs
+    ]  # fmt: skip
+    header = ["objects", "scenario", "difference", "success, points", "cleared, points"]
+    beside = with_depths(header, lines, _noises(pairs), 2)
+    return "\n\n".join([scoreboard(say, part), beside])
 
 
 def clutter15(say: Say, part: Figures) -> str:
@@ -396,6 +416,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "published": ((), published),
     "scoreboard": (("scoreboard",), scoreboard),
     "differences": (("scoreboard",), differences),
+    "six_dof": (("six_dof",), six_dof),
     "clutter15": (("clutter15",), clutter15),
     "differences15": (("clutter15",), differences),
     "noise": (("noise", "scoreboard"), noise),

@@ -51,7 +51,7 @@ RUNS = Path("runs/results")
 # Files on which a figure depends: a commit that touches none of them changes no table.
 CODE = ("envs", "models", "utils", "configs", "checkpoints", ":(glob)*.py",
         "benchmarks/bench_*.py",
-        "benchmarks/metrics.py", "requirements.txt")  # fmt: skip
+        "benchmarks/bowls.py", "benchmarks/metrics.py", "requirements.txt")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ class Part:
 
 
 EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
+ANY_SIDE = "graspnet,graspnet6d,oracle,oracle6d"
 NOISY_FIRST = "realsense,none"
 
 
@@ -121,6 +122,13 @@ PARTS = (
         _evaluation("clutter15", 30, f"scene.count=15 evaluate.policies={ALL} "
                     "evaluate.scenarios=pile evaluate.object_sets=random_urdfs",
                     noises=NOISY_FIRST),
+    )),
+    Part("six_dof", "planners that grasp from any side beside those from straight above", 40, (
+        _evaluation("six_dof", 30, f"evaluate.policies={ANY_SIDE} "
+                    "evaluate.scenarios=packed,pile,bin "
+                    "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST, kept=3),
+        _evaluation("bowls", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=isolated "
+                    "evaluate.object_sets=benchmarks.bowls:bowls", noises=NOISY_FIRST, kept=3),
     )),
     Part("noise", "other depth noises than the scoreboard's", 20, tuple(
         _evaluation(noise, 50, "evaluate.policies=heuristic,graspnet evaluate.scenarios=pile "

@@ -25,14 +25,15 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
-from models.planners import Planner, make_planner, needs_truth
+from models.planners import Planner, make_planner, needs_truth, tilts
 from utils.config import Config
+from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
 from utils.geometry import Workspace
 from utils.report import picture
 from utils.result_formats import depth_in_words
-from utils.result_records import CLEAN, policy_name
+from utils.result_records import CLEAN, OPEN_LOOP, policy_name
 from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
@@ -47,11 +48,14 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     one before any work is done.
     """
     for name in config.evaluate.policies:
+        controllers = [controller for _, controller in policies_of(config)]
         if is_learned(name):
-            controllers = [controller for _, controller in policies_of(config)]
             check_learned(name, config.evaluate.scenarios, controllers, config)
-        else:
-            new_planner(name, config, key)
+        elif tilts(new_planner(name, config, key)) and {*controllers} != {OPEN_LOOP}:
+            raise UserError(
+                f"evaluate.controllers: {name} plans grasps from any side, and closed loops follow "
+                f"those from straight above alone; use {OPEN_LOOP} with it"
+            )
     make_cell(config).close()
     check_bin(config)
     sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}

@@ -99,16 +99,16 @@ class GraspOutcome:
     sim_seconds: simulated time from home and back to home, at legal joint speeds.
     object_index: the object that the hand held, even if it lost the object or stopped later; None
     if it held nothing.
-    detail: one more sentence on the failure, or empty. palm_stopped_at: metres, the height of E at
-    which something under the palm stopped the approach. motion: of the object in the hand; None if
-    it held nothing.
+    detail: one more sentence on the failure, or empty. palm_stopped_at: (3,) metres in W, where
+    E was when something under the palm stopped the approach. motion: of the object in the hand;
+    None if it held nothing.
     """
 
     reason: str
     sim_seconds: float
     object_index: int | None = None
     detail: str = ""
-    palm_stopped_at: float | None = None
+    palm_stopped_at: np.ndarray | None = None
     motion: InHandMotion | None = None
 
     @property
@@ -141,14 +141,9 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     Raises UnreachableError before the arm has moved, and ArmStoppedError on a collision.
     """
     settings = cell.config.execution
-    pregrasp = grasp.pose.copy()
-    pregrasp[2, 3] += settings.pregrasp_height
-    q_pregrasp = choose_posture(pregrasp, cell.home)
-    target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
     start = cell.robot.q  # all is planned before anything moves
-    reach = cell.robot.joint_move(start, q_pregrasp, **_scales(cell))
-    down = _descent(cell, q_pregrasp, target)
-    corner = _higher_than(target[2, 3] + settings.pregrasp_height - _CORNER, down)
+    reach, down, target = _planned(cell, grasp)
+    corner = _farther_than(settings.pregrasp_height - _CORNER, target, down)
     way = cell.robot.blended_moves(start, reach, down, corner, **_scales(cell))
 
     cell.robot.command_gripper(grasp.width)
@@ -158,20 +153,57 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     return ApproachResult(cell.step, target)
 
 
+def reaches(cell: Cell, grasp: Grasp) -> bool:
+    """Whether the arm can go to a grasp as `open_loop` does, and lift what it grips; nothing
+    moves."""
+    try:
+        _, down, target = _planned(cell, grasp)
+        _line(cell, down.positions[-1], _raised(cell, target, grasp.position[2]))
+    except UnreachableError:
+        return False
+    return True
+
+
+def _planned(cell: Cell, grasp: Grasp) -> tuple[Trajectory, Trajectory, np.ndarray]:
+    """The way to the pregrasp, from there straight to the grasp, and the grasp's pose (4, 4), which
+    may be flipped. Raises UnreachableError."""
+    pregrasp = _backed(grasp.pose, cell.config.execution.pregrasp_height)
+    q_pregrasp = choose_posture(pregrasp, cell.home)
+    target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
+    reach = cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell))
+    return reach, _descent(cell, q_pregrasp, target), target
+
+
+def _backed(T_WE: np.ndarray, distance: float) -> np.ndarray:
+    """The pose (4, 4), `distance` m back against the approach."""
+    back = T_WE.copy()
+    back[:3, 3] -= distance * T_WE[:3, 2]
+    return back
+
+
 def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
     """From joint positions q (7,) straight to `target` (4, 4): quickly, and slowly at the end."""
     settings = cell.config.execution
     if settings.pregrasp_height <= _SLOW_HEIGHT:
         return _line(cell, q, target, settings.approach_speed)
-    near = target.copy()
-    near[2, 3] += _SLOW_HEIGHT
-    quick = _line(cell, q, near)
+    quick = _line(cell, q, _backed(target, _SLOW_HEIGHT))
     slow = _line(cell, quick.positions[-1], target, settings.approach_speed)
     # Both are parts of one line, so that no corner is cut. The second one has half of its speed
     # when the first one ends, so that both together are no faster than the approach.
-    heights = np.array([tip_position(q)[2] for q in slow.positions.tolist()])
-    speeding = int(np.argmax(-np.diff(heights) > settings.approach_speed * cell.dt / 2))
+    left = _distances(target, slow)
+    speeding = int(np.argmax(-np.diff(left) > settings.approach_speed * cell.dt / 2))
     return cell.robot.blended_moves(q, quick, slow, speeding, **_scales(cell))
+
+
+def _distances(target: np.ndarray, trajectory: Trajectory) -> np.ndarray:
+    """(N,) metres that E is back from `target` (4, 4) at each reference, along the approach."""
+    tips = np.array([tip_position(q) for q in trajectory.positions.tolist()])
+    return (target[:3, 3] - tips) @ target[:3, 2]
+
+
+def _farther_than(distance: float, target: np.ndarray, trajectory: Trajectory) -> int:
+    """The number of references at which E is more than `distance` m back from the target."""
+    return int((_distances(target, trajectory) > distance).sum())
 
 
 def _higher_than(height: float, trajectory: Trajectory) -> int:
@@ -222,7 +254,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
         reason, detail = "collision" if stop.contact else "stopped", f"stopped: {stop}"
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
-        stopped_at = float(cell.robot.tip_pose()[2, 3])
+        stopped_at = cell.robot.tip_pose()[:3, 3].copy()
     detail = "; ".join(filter(None, [detail, _go_home(cell)]))
     if reason == "success":
         cell.retire(held)  # in the bin, into which it has fallen meanwhile
@@ -239,10 +271,15 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
     cell.robot.hold()  # a closed loop sends nothing from here on
     if not cell.robot.grips():
         raise GraspFailure("missed")
-    lifted = (forward_kinematics(cell.robot.q) if result.pose is None else result.pose).copy()
+    closed = forward_kinematics(cell.robot.q) if result.pose is None else result.pose
     # A learned policy plans no grasp: the height at which its hand has closed counts.
-    height = max(grasp.position[2], lifted[2, 3], 0.0)
-    lifted[2, 3] = height + cell.config.execution.lift_height + 0.05
+    return _raised(cell, closed, max(grasp.position[2], closed[2, 3]))
+
+
+def _raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
+    """The pose (4, 4) at which an object is lifted high enough that the hand gripped at T_WE."""
+    lifted = T_WE.copy()
+    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + 0.05
     return lifted
 
 

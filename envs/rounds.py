@@ -9,9 +9,10 @@ offers another one: often nothing has moved, and a deterministic planner would r
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -20,7 +21,7 @@ import numpy as np
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
-from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop
+from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop, reaches
 from envs.objects import fits
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
@@ -34,11 +35,12 @@ from utils.result_records import (
     RoundRecord,
     policy_name,
 )
-from utils.transforms import Grasp, RGBDFrame, angle_difference, grasp_to_image
+from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
+PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
 
@@ -91,7 +93,7 @@ def run_round(
     }
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
-    stops: list[float | None] = []  # heights at which these met something under the palm
+    stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
     plan_seconds, ended = 0.0, "cleared"
     try:
         with planner_errors(policy):
@@ -101,14 +103,17 @@ def run_round(
             start = time.perf_counter()
             try:
                 with planner_errors(policy):
-                    grasps = checked_grasps(plan(frame if privileged else frame.without_truth()))
+                    grasps = checked_grasps(
+                        plan(frame if privileged else frame.without_truth()),
+                        planar=controller != OPEN_LOOP,
+                    )
             finally:
                 plan_seconds = time.perf_counter() - start
             if not grasps:
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
                 ended = NO_PLAN
                 break
-            grasp = no_deeper(first_untried(grasps, failed), failed, stops)
+            grasp = no_deeper(first_untried(within_reach(cell, grasps), failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -135,6 +140,7 @@ def run_round(
                     turned=None if outcome.motion is None else outcome.motion.turned,
                     slid=None if outcome.motion is None else outcome.motion.slid,
                     graspable=(aim if held is None else held) not in too_large,
+                    tilt=grasp.tilt,
                     **_turn_ms(approach),
                 )
             )
@@ -172,10 +178,16 @@ def planner_errors(name: str) -> Iterator[None]:
         raise PlannerError(f"{name} raised {type(error).__name__}: {message} ({place})") from error
 
 
-def checked_grasps(grasps: object) -> Sequence[Grasp]:
-    """What a planner returned. Raises TypeError for anything but a list or tuple of grasps."""
+def checked_grasps(grasps: object, planar: bool = False) -> Sequence[Grasp]:
+    """What a planner returned. Raises TypeError for anything but a list or tuple of grasps, and
+    ValueError where they have to be `planar` and one is tilted."""
     if not isinstance(grasps, list | tuple) or not all(isinstance(g, Grasp) for g in grasps):
         raise TypeError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
+    if planar and any(grasp.tilt > PLANAR for grasp in grasps):
+        raise ValueError(
+            "a closed loop follows grasps from straight above, this planner tilted one; use "
+            f"closed_loop.controller={OPEN_LOOP}"
+        )
     return grasps
 
 
@@ -214,36 +226,53 @@ def _turn_ms(approach: Approach) -> dict[str, float]:
     }
 
 
-def first_untried(grasps: Sequence[Grasp], failed: Sequence[Grasp]) -> Grasp:
+def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
+    """The grasps that the arm can go to, in their order; those from straight above are not asked,
+    because nearly all are. The first of all where the arm reaches none."""
+    nothing = True
+    for grasp in grasps:
+        if grasp.tilt < PLANAR or reaches(cell, grasp):
+            nothing = False
+            yield grasp
+    if nothing:
+        yield grasps[0]
+
+
+def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp:
     """The first grasp that is not near one of those that failed; the first of all if there is
     none."""
-    untried = (
-        grasp
-        for grasp in grasps
-        if all(
-            np.linalg.norm(grasp.position[:2] - other.position[:2]) > TRIED_DISTANCE
-            or angle_difference(grasp.angle, other.angle) > TRIED_ANGLE
-            for other in failed
-        )
-    )
-    return next(untried, grasps[0])
+    others = iter(grasps)
+    first = next(others)
+    for grasp in itertools.chain([first], others):
+        if not any(_alike(grasp, other) for other in failed):
+            return grasp
+    return first
 
 
-def no_deeper(grasp: Grasp, failed: Sequence[Grasp], stops: Sequence[float | None]) -> Grasp:
-    """The grasp, raised above the heights `stops` (m, of E) at which the palm met something there.
+def _alike(grasp: Grasp, other: Grasp) -> bool:
+    """Whether two grasps are so near each other that one of them is enough to try."""
+    along = grasp.approach
+    apart = grasp.position - other.position
+    beside = apart - (apart @ along) * along  # a deeper grasp is the same one
+    cosines = abs(grasp.closing_direction @ other.closing_direction), along @ other.approach
+    return bool(np.linalg.norm(beside) <= TRIED_DISTANCE and min(cosines) >= np.cos(TRIED_ANGLE))
+
+
+def no_deeper(grasp: Grasp, failed: Sequence[Grasp], stops: Sequence[np.ndarray | None]) -> Grasp:
+    """The grasp, drawn back before the places `stops` (m, of E) at which the palm met something.
 
     A camera may miss a thin part that stands up from an object; the contact with the palm tells how
     high that part is.
     """
-    lowest = max(
+    deepest = min(
         (
-            stop + ROOM_OVER_TOUCH
+            stop @ grasp.approach - ROOM_OVER_TOUCH
             for other, stop in zip(failed, stops)
-            if stop is not None
-            and np.linalg.norm(grasp.position[:2] - other.position[:2]) < TRIED_DISTANCE
+            if stop is not None and _alike(replace(other, angle=grasp.angle), grasp)
         ),
-        default=-np.inf,
+        default=np.inf,
     )
-    if grasp.position[2] >= lowest:
+    too_deep = grasp.position @ grasp.approach - deepest
+    if too_deep <= 0:
         return grasp
-    return replace(grasp, position=np.array([*grasp.position[:2], lowest]))
+    return replace(grasp, position=grasp.position - too_deep * grasp.approach)

@@ -22,6 +22,8 @@ from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import WALL_LABEL, HeightMap
 from utils.transforms import Grasp
 
+_NOWHERE = -1e3  # m, under everything
+
 
 class SearchPlanner:
     """Base of the planners that search a height map.
@@ -67,14 +69,23 @@ def search(
     nothing meets the margins, a second search has relaxed ones: a poor attempt may clear an object,
     no attempt ends the round.
     """
-    found = _search_once(heights, gripper, workspace, settings, value)
+    found = search_once(heights, gripper, workspace, settings, value)
     if len(found) == 0:
-        found = _search_once(heights, gripper, workspace, settings.relaxed(), value)
+        found = search_once(heights, gripper, workspace, settings.relaxed(), value)
     return found
 
 
-def _search_once(heights, gripper, workspace, settings, value) -> Candidates:
-    found = _valued(dense_candidates(heights, gripper, workspace, settings), value)
+def search_once(
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    settings: SearchSettings,
+    value: Callable[[Candidates], np.ndarray] | None = None,
+    stride: int = 1,
+) -> Candidates:
+    """`search` with these margins alone. stride: of the cells that the dense stage looks at."""
+    dense = dense_candidates(heights.every(stride), gripper, workspace, settings)
+    found = _valued(dense, value)
     found = found.best(settings.shortlist)
     if len(found) == 0:
         return found
@@ -92,14 +103,12 @@ def dense_candidates(
 ) -> Candidates:
     """Runs of matter that may fit between the fingers, for every angle, fingertip height and row
     of the map."""
-    cell, lowest = heights.cell, heights.table_height + settings.table_clearance
-    no_wall = heights.label != WALL_LABEL
-    highest = heights.height.max(where=no_wall, initial=lowest)
-    levels = np.arange(lowest, highest - settings.min_engagement, settings.level_step)
-    if len(levels) == 0 or len(heights.centres) == 0:  # nothing but slivers stands on the table
+    cell, on_objects = heights.cell, heights.label >= 0
+    levels = _levels(heights, on_objects, gripper, settings)
+    if len(levels) == 0:
         return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
     # A square that holds all graspable matter, and fingers beside it, at any angle.
-    matter = np.argwhere((heights.height > lowest) & no_wall)[:, ::-1]
+    matter = np.argwhere(on_objects)[:, ::-1]
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
     beside = max(settings.rooms) + 2 * thickness
@@ -115,18 +124,24 @@ def dense_candidates(
     )
     palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
+    # Only what stands on the table is gripped; the table itself is in the way of a tilted hand.
+    standing = np.where(heights.label == -1, _NOWHERE, heights.height).astype(np.float32)
+    ground = float(heights.height.min())
     parts = []
     for angle in np.arange(settings.angles) * np.pi / settings.angles:
         along = np.array([np.cos(angle), np.sin(angle)])
         across = np.array([-along[1], along[0]])
         axes = np.column_stack([along, across])
         warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
-        turned = cv2.warpAffine(
-            heights.height, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-            borderValue=heights.table_height,
+        turned, objects = (
+            cv2.warpAffine(
+                image, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+                borderValue=outside,
+            )
+            for image, outside in ((heights.height, ground), (standing, _NOWHERE))
         )  # fmt: skip
         level, row, first, last = _runs(
-            turned, levels, gripper.max_opening - 2 * settings.rooms[0], cell
+            objects, levels, gripper.max_opening - 2 * settings.rooms[0], cell
         )
         tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
@@ -159,7 +174,7 @@ def dense_candidates(
         score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
         score *= (
             reach
-            * (inside != WALL_LABEL)
+            * (inside >= 0)
             * (facing > settings.min_facing)
             * np.clip(rise / settings.good_engagement, 0.2, 1)
         )
@@ -169,6 +184,20 @@ def dense_candidates(
     return Candidates(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates))
     )
+
+
+def _levels(
+    heights: HeightMap, on_objects: np.ndarray, gripper: GripperGeometry, settings: SearchSettings
+) -> np.ndarray:
+    """(L,) heights of the fingertips to try: over the table, and no deeper below the lowest matter
+    than the palm lets them reach; may be empty. on_objects: (R, C) bool."""
+    if not on_objects.any() or len(heights.centres) == 0:
+        return np.empty(0)
+    lowest = float(heights.table()[on_objects].min()) + settings.table_clearance
+    height = heights.height[on_objects]
+    useless = height.min() - gripper.palm_height - lowest  # the palm would meet the matter
+    first = lowest + settings.level_step * max(np.floor(useless / settings.level_step), 0.0)
+    return np.arange(first, height.max() - settings.min_engagement, settings.level_step)
 
 
 def _runs(
@@ -249,7 +278,8 @@ def measure(
     rise = upper - tip - 0.001
     tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
     tilt_right = np.arctan2(np.maximum(right - high_right, 0), rise)
-    tilt = np.where(touched, (tilt_left + tilt_right) / 2, np.pi / 2)
+    # The steeper face counts: of a thin sloping wall the other one, which is hidden, is as steep.
+    tilt = np.where(touched, np.maximum(tilt_left, tilt_right), np.pi / 2)
 
     # The object between the fingers, and the lever arms to its centre of mass.
     xy = candidates.xy + shift[:, None] * along
@@ -259,7 +289,7 @@ def measure(
         for end in (left + inner, right - inner)
     ]
     label = np.maximum(*ends)
-    centre = heights.centres[label]
+    centre = heights.centres[np.maximum(label, 0)]  # walls and table have none
     arm_across = np.abs(((centre[:, :2] - xy) * across).sum(axis=1))
     arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
     arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
@@ -285,9 +315,10 @@ def measure(
     score *= 0.4 + 0.6 * cover
     score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
-    score *= np.exp(-4 * covered)
+    score *= np.exp(-settings.covered_weight * covered)
     score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
-    score *= 1 + 2 * np.clip(top - heights.table_height, 0, 0.15)  # prefers the top of a pile
+    rise = heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)]))
+    score *= 1 + 2 * np.clip(rise, 0, 0.15)  # prefers the top of a pile
     feasible = np.zeros(N, bool)
     feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)

@@ -100,6 +100,7 @@ class SearchSettings:
     good_engagement: float = 0.022  # and gains nothing beyond this
     max_wedge: float = np.deg2rad(28)  # half the angle between the two faces, mu = 0.5
     min_facing: float = 0.75  # cosine of an edge's gradient against the closing line, dense stage
+    covered_weight: float = 4.0  # exp(-w x) where hidden matter may be under a share x of the hand
     reach: float = 0.04  # how far outside the workspace a grasp's centre may lie
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -27,11 +28,18 @@ from models.graspnet_inference import scaled_maps
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import Candidates, SearchSettings
+from models.planner_fan import FanPlanner
 from utils.depth import surfaces_in_holes, table_in_holes
 from utils.geometry import GripperGeometry, Workspace
-from utils.height_map import HeightMap, height_map_from_frame, local_maxima
+from utils.height_map import (
+    HeightMap,
+    height_map_from_frame,
+    local_maxima,
+    tilted_height_map,
+    without_holes,
+)
 from utils.images import PixelScaling
-from utils.transforms import Grasp, RGBDFrame, deproject, project
+from utils.transforms import Grasp, RGBDFrame, deproject, project, transform_points
 
 
 @dataclass(frozen=True)
@@ -116,6 +124,11 @@ BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
 
+def loaded(checkpoint: Path) -> SavedGraspNet:
+    """The network of a file, read once as long as the file does not change. Raises UserError."""
+    return _loaded(checkpoint, checkpoint.stat().st_mtime if checkpoint.exists() else 0.0)
+
+
 @functools.cache
 def _loaded(path: Path, changed: float) -> SavedGraspNet:
     saved = load_graspnet(path)
@@ -139,26 +152,63 @@ class GraspNetPlanner(SearchPlanner):
         settings: SearchSettings = SETTINGS,
     ):
         super().__init__(gripper, workspace, seed, settings)
-        changed = checkpoint.stat().st_mtime if checkpoint.exists() else 0.0
-        self.network = network or _loaded(checkpoint, changed)
+        self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        model, metres_per_pixel, *_ = self.network
-        frame = surfaces_in_holes(table_in_holes(frame, self.workspace.table_height))
+        seen = NetworkView(self.network, frame, self.workspace)
+        return self.grasps(self.search(seen.heights, partial(seen.value, seen.heights)))
+
+
+class GraspNetFanPlanner(FanPlanner):
+    """A fan of views, its grasps ranked by what a network predicts for the image that was taken."""
+
+    def __init__(
+        self,
+        gripper: GripperGeometry,
+        workspace: Workspace,
+        seed: int = 0,
+        checkpoint: Path = SHIPPED,
+        network: SavedGraspNet | None = None,
+    ):
+        super().__init__(gripper, workspace, seed)
+        self.network = network or loaded(checkpoint)
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        seen = NetworkView(self.network, frame, self.workspace)
+        filled, hiding = without_holes(seen.frame)
+
+        def tilted(T_WV: np.ndarray) -> HeightMap:
+            return tilted_height_map(seen.heights, filled, hiding, T_WV)
+
+        return self.search_fan(tilted, seen.value)
+
+
+class NetworkView:
+    """What a network tells about a frame: heights with its objects, and the quality of candidates.
+
+    frame: with the holes of its depth filled where colours tell what is there. heights: the map
+    from above. Raises UserError for an image that the network cannot take.
+    """
+
+    def __init__(self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace):
+        model, metres_per_pixel, *_ = network
+        self.frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
         knows_centres = model.centre_head is not None
-        scaling, maps = scaled_maps(model, metres_per_pixel, frame, knows_centres)
-        heights = height_map_from_frame(frame, self.workspace)
-
-        def value(candidates: Candidates) -> np.ndarray:
-            xy, (along, _) = candidates.xy, candidates.axes()
-            surface = np.column_stack([xy, heights.height[heights.index(xy)]])
-            ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
-            pixels, _ = project(ends, frame.K, frame.T_WC)
-            return np.maximum(quality_between(maps, *scaling.pixels(pixels)), LEAST)
-
+        self._scaling, self._maps = scaled_maps(model, metres_per_pixel, self.frame, knows_centres)
+        self.heights = height_map_from_frame(self.frame, workspace)
         if knows_centres:
-            heights = labelled_by_centres(heights, frame, scaling, maps[3][0].numpy())
-        return self.grasps(self.search(heights, value))
+            offset = self._maps[3][0].numpy()
+            self.heights = labelled_by_centres(self.heights, self.frame, self._scaling, offset)
+
+    def value(self, heights: HeightMap, candidates: Candidates) -> np.ndarray:
+        """(N,) the network's quality of candidates on a height map of the scene."""
+        xy, (along, _) = candidates.xy, candidates.axes()
+        surface = np.column_stack([xy, heights.height[heights.index(xy)]])
+        ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
+        ends = transform_points(heights.T_WV, ends)
+        pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
+        quality = quality_between(self._maps, *self._scaling.pixels(pixels))
+        return np.maximum(quality, LEAST)
 
 
 def quality_between(

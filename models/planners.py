@@ -2,7 +2,8 @@
 
 The list is sorted, best first; an empty list means that there is nothing to grasp. `PLANNERS`
 names the planners of this project: `random` and `heuristic` see only the depth image, `graspnet`
-also the colours, `oracle` the true geometry. A planner of your own is named by its import path, see
+also the colours, `oracle` the true geometry; those that end in `6d` grasp from any side, the others
+from straight above. A planner of your own is named by its import path, see
 `make_planner` and docs/planner.md. This module knows no simulator.
 """
 
@@ -18,7 +19,8 @@ import numpy as np
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import SearchSettings
 from models.planner_contacts import buried_share, exact_quality
-from models.planner_graspnet import GraspNetPlanner
+from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
+from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
@@ -27,9 +29,10 @@ from utils.transforms import Grasp, RGBDFrame
 
 
 class Planner(Protocol):
-    """Any callable that plans grasps. Two attributes are optional.
+    """Any callable that plans grasps. Three attributes are optional.
 
     needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
+    tilts: True if grasps come from any side, and not from straight above alone.
     reset(seed): called before each scene, for planners that draw random numbers.
     """
 
@@ -39,6 +42,11 @@ class Planner(Protocol):
 def needs_truth(planner: Planner | type) -> bool:
     """Whether the planner's frames have to carry the scene's true geometry."""
     return bool(getattr(planner, "needs_truth", False))
+
+
+def tilts(planner: Planner | type) -> bool:
+    """Whether the planner's grasps come from any side."""
+    return bool(getattr(planner, "tilts", False))
 
 
 def reset_planner(planner: Planner, seed: int) -> None:
@@ -123,6 +131,9 @@ PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
     "heuristic": HeuristicPlanner,
     "graspnet": GraspNetPlanner,
     "oracle": OraclePlanner,
+    "heuristic6d": HeuristicFanPlanner,
+    "graspnet6d": GraspNetFanPlanner,
+    "oracle6d": OracleFanPlanner,
 }
 
 

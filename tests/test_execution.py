@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
-from envs.execution import execute_grasp
+from envs.execution import execute_grasp, reaches
 from envs.robot_kinematics import forward_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import needs_pybullet, pybullet
@@ -52,6 +52,35 @@ def test_the_hand_comes_down_straight_and_slowly_at_the_end(cell, box_set, monke
     settings = cell.config.execution
     assert settings.pregrasp_height == 0.12
     assert 0.9 * settings.approach_speed < speeds.max() < 1.01 * settings.approach_speed
+
+
+@pytest.mark.parametrize("turn", [-90, -30, 90, 150])
+def test_a_tilted_hand_comes_along_its_approach(cell, box_set, monkeypatch, turn):
+    """40 degrees from straight above, its fingers level, on two faces of a turned cube."""
+    tilt, turn = np.deg2rad(40), np.deg2rad(turn)
+    approach = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
+    cell.load(cube_scene(box_set, yaw=turn))
+    # At right angles to the tilt the closing line is level: its angle is the same in W.
+    grasp = Grasp(np.array([0.5, 0.0, 0.038]), turn + np.pi / 2, 0.08, 1.0, approach)
+    assert abs(grasp.closing_direction[2]) < 1e-12 and reaches(cell, grasp)
+    references, closing = [], []
+    command, close = cell.robot.command_arm, cell.robot.command_gripper
+    monkeypatch.setattr(
+        cell.robot, "command_arm", lambda q, v: (references.append(np.array(q)), command(q, v))
+    )
+    monkeypatch.setattr(
+        cell.robot, "command_gripper", lambda *args: (closing.append(len(references)), close(*args))
+    )
+    outcome = execute_grasp(cell, grasp)
+    assert outcome.reason == "success", outcome.detail
+    poses = np.array([forward_kinematics(q) for q in references[: closing[1]]])
+    back = (grasp.position - poses[:, :3, 3]) @ approach
+    assert back[-1] == pytest.approx(0.0, abs=1e-4)
+    line = poses[(back < 0.08) & (np.arange(len(back)) > back.argmax())]
+    beside = np.cross(line[:, :3, 3] - grasp.position, approach)
+    assert np.linalg.norm(beside, axis=1).max() < 5e-4
+    np.testing.assert_allclose(line[:, :3, 2] @ approach, 1.0, atol=1e-5)
+    assert cell.seconds < 6
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,8 @@ def planner(name: str, seed: int = 0):
 
 
 def test_unknown_planner_is_refused_with_the_allowed_names() -> None:
-    with pytest.raises(
-        ValueError, match="'grasp'.*heuristic, module:name, oracle, ppo, ppo:FILE.pt, random"
-    ):
+    allowed = "graspnet6d, heuristic, heuristic6d, module:name, oracle, oracle6d, ppo, ppo:FILE.pt"
+    with pytest.raises(ValueError, match=f"'grasp'.*{allowed}, random"):
         planner("grasp")
 
 

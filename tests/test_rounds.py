@@ -1,6 +1,7 @@
 """A round: when it ends, which grasps are tried, and planners that fail."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round
+from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round, within_reach
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.geometry import GripperGeometry, Workspace
@@ -74,12 +75,34 @@ def test_no_grasp_goes_as_deep_as_the_palm_was_stopped_there() -> None:
         Grasp(np.array([x, 0.0, z]), 0.0, 0.08, 1.0)
         for x, z in ((0.5, 0.01), (0.515, 0.01), (0.525, 0.01), (0.5, 0.06))
     )
-    raised = no_deeper(near, [above, here], [None, 0.04])
+    stop = np.array([0.5, 0.0, 0.04])
+    raised = no_deeper(near, [above, here], [None, stop])
     np.testing.assert_allclose(raised.position, [0.515, 0.0, 0.04 + ROOM_OVER_TOUCH])
-    assert no_deeper(far, [here], [0.04]) is far
-    assert no_deeper(above, [here], [0.04]) is above
+    assert no_deeper(far, [here], [stop]) is far
+    assert no_deeper(above, [here], [stop]) is above
     assert no_deeper(near, [here], [None]) is near
     assert no_deeper(near, [], []) is near
+
+
+def test_a_tilted_grasp_is_drawn_back_along_its_approach() -> None:
+    """The hand comes at 45 degrees and was stopped 2 cm before the grasp."""
+    slope = np.array([0.0, np.sqrt(0.5), -np.sqrt(0.5)])
+    grasp = Grasp(np.array([0.5, 0.0, 0.02]), 0.0, 0.08, 1.0, slope)
+    stop = grasp.position - 0.02 * slope
+    back = no_deeper(grasp, [grasp], [stop])
+    np.testing.assert_allclose(back.position, stop - ROOM_OVER_TOUCH * slope)
+    above = replace(grasp, approach=np.array([0.0, 0.0, -1.0]))
+    assert no_deeper(above, [grasp], [stop]) is above  # another way
+
+
+def test_what_the_arm_cannot_reach_is_passed_over(cell, box_set) -> None:
+    """A hand that comes back towards the robot, level with the table."""
+    cell.load(cube_scene(box_set))
+    away = Grasp(np.array([0.5, 0.0, 0.03]), 0.0, 0.08, 1.0, np.array([-1.0, 0.0, 0.0]))
+    tilted = replace(cube_grasp(), approach=np.array([0.0, 0.5, -np.sqrt(0.75)]))
+    far = cube_grasp(offset=(1.0, 0.0, 0.0))
+    assert [*map(id, within_reach(cell, [away, tilted, far]))] == [id(tilted), id(far)]
+    assert [*map(id, within_reach(cell, [away, away]))] == [id(away)]  # its failure has a name
 
 
 def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
@@ -95,8 +118,8 @@ def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
     )  # fmt: skip
     assert [attempt.reason for attempt in record.attempts] == ["collision", "success"]
     (first, stopped), (second, not_stopped) = heights
-    assert first == pytest.approx(0.012) and stopped == pytest.approx(0.021, abs=0.002)
-    assert second == stopped + ROOM_OVER_TOUCH and not_stopped is None
+    assert first == pytest.approx(0.012) and stopped[2] == pytest.approx(0.021, abs=0.002)
+    assert second == pytest.approx(stopped[2] + ROOM_OVER_TOUCH) and not_stopped is None
 
 
 def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -> None:

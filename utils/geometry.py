@@ -6,7 +6,7 @@ interval that is found in closed form. This module knows no simulator and no net
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -52,6 +52,20 @@ class SceneGeometry:
     objects: tuple[SolidObject, ...]
     table_height: float = 0.0
     walls: tuple[ConvexSolid, ...] = ()
+
+    def transformed(self, T: np.ndarray) -> SceneGeometry:
+        """The objects and walls in another frame, in which the table is no longer level; `T` (4, 4)
+        takes points of W there."""
+        objects = tuple(
+            replace(
+                item,
+                solids=tuple(solid.transformed(T) for solid in item.solids),
+                centre_of_mass=transform_points(T, item.centre_of_mass),
+            )
+            for item in self.objects
+        )
+        walls = tuple(wall.transformed(T) for wall in self.walls)
+        return SceneGeometry(objects, self.table_height, walls)
 
 
 @dataclass(frozen=True)

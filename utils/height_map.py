@@ -1,8 +1,9 @@
-"""Orthographic height maps in the world frame, from a depth image or from the true geometry.
+"""Orthographic height maps from a depth image or from the true geometry.
 
 A height map answers "how high is the scene above (x, y)?", which is all that a straight descent
-has to know. `local_maxima` finds the peaks of such a map, or of any image. This module knows no
-simulator and no network.
+has to know. Its frame V is the world, or the world turned so that a hand which comes from another
+side comes down along -z of V (`tilted_view`); the table is a slope there. `local_maxima` finds the
+peaks of such a map, or of any image. This module knows no simulator and no network.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,26 +25,39 @@ from utils.depth import (
     reach_in_pixels,
 )
 from utils.geometry import SceneGeometry, Workspace, intersect_lines
-from utils.transforms import RGBDFrame, deproject, known_depth
+from utils.transforms import (
+    RGBDFrame,
+    deproject,
+    inverse_pose,
+    known_depth,
+    tilt_rotation,
+    transform_points,
+)
 
 # Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole that is
 # not at an edge may be this much higher than the surface beside it.
 HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
+_LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
+STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
+FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Heights over a square grid; cell [row, col] is centred at origin + cell * (col, row) in W.
+    """Heights over a square grid; cell [row, col] is centred at origin + cell * (col, row) in V.
 
-    height: (R, C) metres in W, the highest surface known in the cell; hidden cells hold the lowest
+    height: (R, C) metres in V, the highest surface known in the cell; hidden cells hold the lowest
         height nearby, as if nothing were there.
-    ceiling: (R, C) metres in W, the highest that matter could reach which was hidden or not
+    ceiling: (R, C) metres in V, the highest that matter could reach which was hidden or not
         measured; equals `height` where the surface was measured.
     label: (R, C) int, which object the cell belongs to; -1 for the table, WALL_LABEL for walls
         around the workspace.
-    centres: (M, 3) each label's centre of mass in W, or an estimate of it.
+    centres: (M, 3) each label's centre of mass in V, or an estimate of it.
+    table_height: metres in W.
+    T_WV: (4, 4) the map's frame in W; the identity for a map from above.
     """
 
     height: np.ndarray
@@ -52,6 +67,7 @@ class HeightMap:
     origin: np.ndarray
     cell: float
     table_height: float
+    T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,6 +78,24 @@ class HeightMap:
             for k, count in enumerate((cols, rows))
         )
         return row.astype(np.intp), col.astype(np.intp)
+
+    def rise(self, points: np.ndarray) -> np.ndarray:
+        """(...) metres of points (..., 3) in V over the table."""
+        return points @ self.T_WV[2, :3] + (self.T_WV[2, 3] - self.table_height)
+
+    def table(self) -> np.ndarray:
+        """(R, C) float32 metres in V of the table."""
+        return table_slope(self.height.shape, self.origin, self.cell, self.table_height, self.T_WV)
+
+    def every(self, stride: int) -> HeightMap:
+        """A coarser map: every `stride`-th cell along rows and columns."""
+        if stride == 1:
+            return self
+        height, ceiling, label = (
+            np.ascontiguousarray(part[::stride, ::stride])
+            for part in (self.height, self.ceiling, self.label)
+        )
+        return replace(self, height=height, ceiling=ceiling, label=label, cell=stride * self.cell)
 
     def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
         """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
@@ -82,53 +116,143 @@ def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.nd
     return points, points[0, 0]
 
 
+def tilted_view(approach: np.ndarray, workspace: Workspace) -> np.ndarray:
+    """(4, 4) T_WV of the frame in which a hand that comes along `approach` (3,) comes straight
+    down: the world, turned about a point over the middle of the workspace."""
+    pivot = np.array([*workspace.centre, workspace.table_height + PIVOT_HEIGHT])
+    T = np.eye(4)
+    T[:3, :3] = tilt_rotation(approach)
+    T[:3, 3] = pivot - T[:3, :3] @ pivot
+    return T
+
+
+def table_slope(
+    shape: tuple[int, int], origin: np.ndarray, cell: float, table: float, T_WV: np.ndarray
+) -> np.ndarray:
+    """(R, C) float32 metres in V: the table, `table` m high in W, in each cell of a grid."""
+    steep_x, steep_y, up = T_WV[2, :3]
+    rows, columns = (np.arange(count) for count in shape)
+    # Where the hand comes along the table, the table is a wall on one side.
+    level = (table - T_WV[2, 3]) - steep_x * (origin[0] + cell * columns)
+    slope = (level - steep_y * (origin[1] + cell * rows)[:, None]) / max(up, STEEPEST)
+    return np.clip(slope, -FARTHEST, FARTHEST).astype(np.float32)
+
+
 def height_map_from_frame(
     frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = 0.08
 ) -> HeightMap:
-    """The height map of a depth image; uses nothing of the frame but depth, K and T_WC.
+    """The height map of a depth image from above; uses nothing of the frame but depth, K and T_WC.
 
     Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over those
     that are not `at_edges` is a little higher. Labels are the pieces between height
     discontinuities; their centres are volume centroids of the columns between the table and the
     visible surface.
     """
+    grid, origin = grid_points(workspace, margin, cell)
+    table = float(workspace.table_height)
+    seen = _seen(*without_holes(frame), np.eye(4), grid.shape[:2], origin, cell, table)
+    label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
+    centres = _column_centroids(seen.height - table, label, grid, table)
+    return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+
+
+def tilted_height_map(
+    overhead: HeightMap, filled: RGBDFrame, hiding: np.ndarray, T_WV: np.ndarray
+) -> HeightMap:
+    """The map of the same scene in another frame, on a grid like that of the map from above.
+
+    filled, hiding: the frame `without_holes`. Objects are those of the map from above: a surface
+    belongs to the object over its place on the table.
+    """
+    shape, origin, cell = overhead.height.shape, overhead.origin, overhead.cell
+    seen = _seen(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
+    row, column = np.indices(shape, sparse=True)
+    surface = np.broadcast_arrays(origin[0] + cell * column, origin[1] + cell * row, seen.height)
+    points = transform_points(T_WV, np.stack(surface, axis=-1))
+    matter = points[..., 2] > overhead.table_height + _LABEL_FLOOR
+    label = np.where(matter, overhead.label[overhead.index(points[..., :2])], -1)
+    known = label != -1  # at the rim of an object its surface may lie beside its label
+    if known.any():
+        label = np.where(matter & ~known, nearest_values(label, known), label)
+    centres = transform_points(inverse_pose(T_WV), overhead.centres)
+    return HeightMap(*seen.walled(), label, centres, origin, cell, overhead.table_height, T_WV)
+
+
+class _Seen(NamedTuple):
+    """height, ceiling: as in `HeightMap`, without walls. unknown: (R, C) bool, cells of which not
+    even the surroundings are known."""
+
+    height: np.ndarray
+    ceiling: np.ndarray
+    unknown: np.ndarray
+
+    def walled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Height and ceiling, with walls where any matter is possible."""
+        height = np.where(self.unknown, self.height.max() + WALL, self.height)
+        return height, np.maximum(self.ceiling, height)
+
+
+def without_holes(frame: RGBDFrame) -> tuple[RGBDFrame, np.ndarray]:
+    """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
+    which of them (H, W) may hide matter: those that are not `at_edges`."""
     measured = known_depth(frame.depth)
     hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
         reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))
-    grid, origin = grid_points(workspace, margin, cell)
-    seen = _highest(_surface_points(frame, origin, cell), grid.shape[:2])
+    return frame, hiding
+
+
+def _seen(
+    frame: RGBDFrame,
+    hiding: np.ndarray,
+    T_WV: np.ndarray,
+    shape: tuple[int, int],
+    origin: np.ndarray,
+    cell: float,
+    table: float,
+) -> _Seen:
+    """What a frame without holes tells about the cells of a grid in V."""
+    slope = table_slope(shape, origin, cell, table, T_WV)
+    unknown = ~known_depth(frame.depth)
+    to_table = np.where(unknown, depth_of_plane(frame, table), 0) if unknown.any() else None
+    frame = replace(frame, T_WC=inverse_pose(T_WV) @ frame.T_WC)
+    seen = _highest(_surface_points(frame, origin, cell), shape)
     hidden = ~np.isfinite(seen)
-    table = float(workspace.table_height)
     # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
     # OpenCV pads with the largest float, which a cell far outside the view would inherit.
     lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
-    height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, table), seen), table)
+    height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
     # The rays that graze an edge bound the matter in its shadow.
-    ceiling = _highest(_grazing_points(frame, origin, cell), grid.shape[:2])
+    ceiling = _highest(_grazing_points(frame, origin, cell), shape)
     ceiling = np.where(hidden, np.maximum(ceiling, height), height)
     if hiding.any():
         nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
-        risen = _highest(_surface_points(nearer, origin, cell), grid.shape[:2])
+        risen = _highest(_surface_points(nearer, origin, cell), shape)
         ceiling = np.maximum(ceiling, risen)
-    label = label_walls(label_pieces(height, table, cell), grid, workspace, cell)
-    centres = _column_centroids(height - table, label, grid, table)
-    # Where even the surroundings are unknown any matter is possible: a wall, not an object.
-    unknown = hidden & np.isfinite(
-        _highest(_table_points(frame, table, origin, cell), height.shape)
-    )
-    height = np.where(unknown, height.max() + WALL, height)
-    return HeightMap(height, np.maximum(ceiling, height), label, centres, origin, cell, table)
+    if to_table is None:
+        return _Seen(height, ceiling, np.zeros(shape, bool))
+    below = _highest(_surface_points(replace(frame, depth=to_table), origin, cell), shape)
+    return _Seen(height, ceiling, hidden & np.isfinite(below))
 
 
 def height_map_from_scene(
-    scene: SceneGeometry, workspace: Workspace, cell: float = 0.0015, margin: float = 0.08
+    scene: SceneGeometry,
+    workspace: Workspace,
+    cell: float = 0.0015,
+    margin: float = 0.08,
+    T_WV: np.ndarray | None = None,
 ) -> HeightMap:
-    """Exact height map: vertical lines through the cells' centres against every convex solid."""
+    """Exact height map: vertical lines through the cells' centres against every convex solid.
+
+    T_WV: (4, 4) the map's frame, the world by default. The scene is in W.
+    """
+    T_WV = np.eye(4) if T_WV is None else T_WV
     grid, origin = grid_points(workspace, margin, cell)
-    height = np.full(grid.shape[:2], scene.table_height)
+    table = float(scene.table_height)
+    height = table_slope(grid.shape[:2], origin, cell, table, T_WV).astype(float)
     label = np.full(grid.shape[:2], -1)
+    scene = scene.transformed(inverse_pose(T_WV))
     bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
     for number, solids in [*bodies, (WALL_LABEL, scene.walls)]:
         for solid in solids:
@@ -147,11 +271,11 @@ def height_map_from_scene(
             height[window] = np.maximum(top, height[window])
     height = height.astype(np.float32)
     centres = np.array([item.centre_of_mass for item in scene.objects]).reshape(-1, 3)
-    return HeightMap(height, height, label, centres, origin, cell, scene.table_height)
+    return HeightMap(height, height, label, centres, origin, cell, table, T_WV)
 
 
 def label_pieces(
-    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = 0.004
+    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = _LABEL_FLOOR
 ) -> np.ndarray:
     """(R, C) labels of the pieces higher than `floor` over the table, cut where neighbouring cells
     differ by `step`, all in metres.
@@ -264,17 +388,6 @@ def _surface_points(
         )
         z[unknown] = -np.inf
         yield col, row, z
-
-
-def _table_points(
-    frame: RGBDFrame, table: float, origin: np.ndarray, cell: float
-) -> Iterator[tuple[np.ndarray, ...]]:
-    """As `_surface_points`, where the rays of pixels without a depth meet the table."""
-    unknown = ~known_depth(frame.depth)
-    if not unknown.any():
-        return iter(())
-    depth = np.where(unknown, depth_of_plane(frame, table), 0)
-    return _surface_points(replace(frame, depth=depth), origin, cell)
 
 
 def _grazing_points(

@@ -81,6 +81,7 @@ class AttemptRecord:
     held: name of the object that was in the hand, if any, however the attempt ended.
     turned, slid: rad and m by which it moved there; None without it.
     graspable: whether the object that was held, or at which the grasp aimed, fits the gripper.
+    tilt: rad of the executed grasp's approach from straight above.
     """
 
     success: bool
@@ -95,6 +96,7 @@ class AttemptRecord:
     turned: float | None = None
     slid: float | None = None
     graspable: bool = True
+    tilt: float = 0.0
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:

@@ -24,44 +24,87 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+DOWN = (0.0, 0.0, -1.0)  # the approach of a planar grasp
+
 
 @dataclass(frozen=True)
 class Grasp:
-    """A planar (top-down) grasp in the world frame.
+    """A grasp in the world frame: a planar one, from straight above, unless `approach` says else.
 
     position: (3,) metres in W, the origin of E at the moment of closing: the middle between the two
         finger pads, 7.2 mm above the lowest point of the fingertips.
-    angle: direction of the closing line about +z from the x axis, radians, modulo pi.
+    angle: direction of the closing line about +z from the x axis, radians, modulo pi; of a grasp
+        from another side, before the least rotation that takes DOWN to its approach.
     width: opening between the finger pads before closing, metres.
     quality: the planner's own score; higher is better. Only comparable within one planner.
+    approach: (3,) unit vector in W along which the hand comes, at most a right angle from DOWN.
     """
 
     position: np.ndarray
     angle: float
     width: float
     quality: float
+    approach: np.ndarray = DOWN  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         position = np.asarray(self.position, dtype=float)
         if position.shape != (3,):
             raise ValueError(f"Grasp.position must have shape (3,), got {position.shape}")
-        numbers = np.append(position, (self.angle, self.width, self.quality))
+        approach = np.asarray(self.approach, dtype=float)
+        if approach.shape != (3,):
+            raise ValueError(f"Grasp.approach must have shape (3,), got {approach.shape}")
+        numbers = np.concatenate([position, approach, (self.angle, self.width, self.quality)])
         if not np.isfinite(numbers).all():
             raise ValueError(f"Grasp holds a non-finite number: {self!r}")
         if self.width < 0:
             raise ValueError(f"Grasp.width must not be negative, got {self.width}")
+        if abs(np.linalg.norm(approach) - 1.0) > 1e-6 or approach[2] > 1e-6:
+            raise ValueError(
+                "Grasp.approach must be a unit vector that does not point up, got "
+                f"{approach.round(3).tolist()}"
+            )
         object.__setattr__(self, "position", position)
+        object.__setattr__(self, "approach", approach)
         object.__setattr__(self, "angle", wrap_to_pi_range(self.angle))
+
+    @staticmethod
+    def from_pose(T_WE: np.ndarray, width: float, quality: float) -> Grasp:
+        """The grasp of a hand at T_WE (4, 4), which may be flipped: half a turn about the approach
+        makes the same grasp."""
+        approach = T_WE[:3, 2] / np.linalg.norm(T_WE[:3, 2])
+        closing = tilt_rotation(approach).T @ T_WE[:3, 1]
+        angle = np.arctan2(closing[1], closing[0])
+        return Grasp(T_WE[:3, 3].copy(), angle, width, quality, approach)
+
+    @property
+    def tilt(self) -> float:
+        """Radians between the approach and DOWN; 0 for a planar grasp."""
+        x, y, z = self.approach
+        return float(np.arctan2(np.hypot(x, y), -z))
 
     @property
     def closing_direction(self) -> np.ndarray:
         """(3,) unit vector in W along which the fingers close."""
-        return np.array([np.cos(self.angle), np.sin(self.angle), 0.0])
+        return tilt_rotation(self.approach) @ (np.cos(self.angle), np.sin(self.angle), 0.0)
 
     @property
     def pose(self) -> np.ndarray:
-        """(4, 4) T_WE at the moment of closing: z down, y along the closing line."""
-        return top_down_pose(self.position, self.angle)
+        """(4, 4) T_WE at the moment of closing: z along the approach, y along the closing line."""
+        T = top_down_pose(self.position, self.angle)
+        T[:3, :3] = tilt_rotation(self.approach) @ T[:3, :3]
+        return T
+
+
+def tilt_rotation(approach: ArrayLike) -> np.ndarray:
+    """(3, 3) least rotation that takes DOWN to a unit vector (3,), which may not point straight up.
+
+    Rodrigues' formula about the horizontal axis DOWN x approach, whose length is the sine.
+    """
+    x, y, z = np.asarray(approach, dtype=float).tolist()
+    k = 1.0 / (1.0 - z)
+    return np.array(
+        [[1.0 - k * x * x, -k * x * y, -x], [-k * x * y, 1.0 - k * y * y, -y], [x, y, -z]]
+    )
 
 
 @dataclass(frozen=True)

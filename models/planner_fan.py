@@ -1,0 +1,191 @@
+"""Grasps from any side: the antipodal search in a fan of tilted views of one scene.
+
+A parallel gripper that comes along a straight line sees the scene as a height map along that line.
+So a grasp with six degrees of freedom is a planar grasp in a tilted view (`utils.height_map`), and
+the planar search serves each direction of the fan. What the camera has not seen bounds the ceiling
+of every view; the table is a slope there. This module knows neither networks nor the arm, which
+decides later what it can reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.planner_antipodal import search_once
+from models.planner_candidates import Candidates, SearchSettings
+from models.planner_contacts import buried_share, exact_quality
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import (
+    HeightMap,
+    height_map_from_frame,
+    height_map_from_scene,
+    tilted_height_map,
+    tilted_view,
+    without_holes,
+)
+from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
+
+Value = Callable[[HeightMap, Candidates], np.ndarray]
+"""A factor (N,) on the scores of candidates that were found on a map."""
+
+
+@dataclass(frozen=True)
+class FanSettings:
+    """The directions of a fan, and what their grasps are worth; degrees unless said.
+
+    rings: tilt from the vertical and number of directions around it, for each ring of the fan.
+    tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
+    room. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
+    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside a tilted hand:
+    m across, and m above the fingertips.
+    """
+
+    rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8))
+    tilt_scale: float = 1.2
+    returned: int = 40
+    distinct_distance: float = 0.01
+    distinct_turn: float = np.deg2rad(20)
+    wrist: tuple[float, float] = (0.06, 0.13)
+
+    def directions(self) -> list[np.ndarray]:
+        """Approaches (3,), unit vectors in W, the vertical first."""
+        fan = [np.array(DOWN)]
+        for tilt, count in self.rings:
+            for turn in np.arange(count) * 2 * np.pi / count:
+                out = np.sin(np.deg2rad(tilt)) * np.array([np.cos(turn), np.sin(turn)])
+                fan.append(np.array([*out, -np.cos(np.deg2rad(tilt))]))
+        return fan
+
+
+# Fewer angles and candidates in each view than in one view alone: there are many views.
+SEARCH = SearchSettings(angles=9, shortlist=80, finalists=60, covered_weight=2.0)
+
+
+class FanPlanner:
+    """Base of the planners that search a fan of views.
+
+    gripper, workspace: the hand and the square of the table that it works on. seed: unused, as in
+    `SearchPlanner`.
+    """
+
+    tilts = True
+
+    def __init__(
+        self,
+        gripper: GripperGeometry,
+        workspace: Workspace,
+        seed: int = 0,
+        settings: SearchSettings = SEARCH,
+        fan: FanSettings = FanSettings(),
+    ):
+        self.gripper, self.workspace = gripper, workspace
+        self.settings, self.fan = settings, fan
+        self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
+
+    def search_fan(
+        self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
+    ) -> list[Grasp]:
+        """The grasps of all views, best first; may be empty.
+
+        maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
+        margins, relaxed ones serve.
+        """
+        for settings in (self.settings, self.settings.relaxed()):
+            grasps = []
+            for approach in self.fan.directions():
+                heights = maps(tilted_view(approach, self.workspace))
+                grasps += self._search_view(heights, settings, value)
+            if grasps:
+                return distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
+        return []
+
+    def _search_view(
+        self, heights: HeightMap, settings: SearchSettings, value: Value | None
+    ) -> list[Grasp]:
+        tilt = np.arccos(np.clip(heights.T_WV[2, 2], -1.0, 1.0))
+        hand = self._tilted_gripper if tilt > 0 else self.gripper
+        on_map = None if value is None else lambda candidates: value(heights, candidates)
+        found = search_once(
+            heights, hand, self.workspace, settings, on_map, stride=2 if tilt > 0 else 1
+        )
+        found = self.judged(heights, found).distinct(
+            settings.returned, settings.distinct_distance, settings.distinct_turn
+        )
+        factor = np.exp(-((tilt / self.fan.tilt_scale) ** 2))
+        return [
+            Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
+            for grasp in found.grasps(self.gripper)
+        ]
+
+    def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
+        """The candidates of one view, best first, perhaps with other scores."""
+        return found
+
+
+def distinct(grasps: Sequence[Grasp], fan: FanSettings) -> list[Grasp]:
+    """Non-maximum suppression of grasps, best first: at most `fan.returned`."""
+    kept: list[Grasp] = []
+    for grasp in grasps:
+        if len(kept) == fan.returned:
+            break
+        near = (
+            np.linalg.norm(grasp.position - other.position) < fan.distinct_distance
+            and turn_between(grasp, other) < fan.distinct_turn
+            for other in kept
+        )
+        if not any(near):
+            kept.append(grasp)
+    return kept
+
+
+def turn_between(first: Grasp, second: Grasp) -> float:
+    """Radians of the least turn that takes one grasp's hand to the other's, which may be flipped.
+
+    For rotations R and S: trace(R^T S) = 1 + 2 cos(turn).
+    """
+    relative = first.pose[:3, :3].T @ second.pose[:3, :3]
+    x, y, z = np.diag(relative)
+    return float(np.arccos(np.clip((max(x + y, -x - y) + z - 1) / 2, -1, 1)))
+
+
+class HeuristicFanPlanner(FanPlanner):
+    """The fan on the depth image alone."""
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        overhead = height_map_from_frame(frame, self.workspace)
+        filled, hiding = without_holes(frame)
+
+        def seen(T_WV: np.ndarray) -> HeightMap:
+            return tilted_height_map(overhead, filled, hiding, T_WV)
+
+        return self.search_fan(seen)
+
+
+class OracleFanPlanner(FanPlanner):
+    """The fan on exact height maps, then exact contacts under perturbed poses.
+
+    count: candidates of a view whose contacts are computed.
+    """
+
+    needs_truth = True
+    count = 20
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        if frame.truth is None:
+            raise ValueError("The oracle planner needs frame.truth; this frame holds none")
+        self._truth = truth = frame.truth
+        self._buried = buried_share(truth, height_map_from_scene(truth, self.workspace))
+        return self.search_fan(lambda T_WV: height_map_from_scene(truth, self.workspace, T_WV=T_WV))
+
+    def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
+        found = found.distinct(self.count, 0.004, np.deg2rad(8))
+        if len(found) == 0:
+            return found
+        scene = self._truth.transformed(inverse_pose(heights.T_WV))
+        quality = exact_quality(found, scene, self.gripper)
+        buried = self._buried[found.label]
+        found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried)
+        return found.best(len(found))

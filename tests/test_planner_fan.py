@@ -1,0 +1,235 @@
+"""Grasps from any side: tilted views, their maps, and planners that search a fan of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from envs.evaluation_worker import check_everything
+from envs.objects import load_object_set
+from envs.rounds import checked_grasps
+from models.planner_antipodal import measure
+from models.planner_candidates import Candidates, SearchSettings
+from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
+from models.planners import make_planner
+from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame
+from utils.config import DEFAULTS, load_config
+from utils.errors import UserError
+from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
+from utils.height_map import (
+    WALL_LABEL,
+    height_map_from_frame,
+    height_map_from_scene,
+    table_slope,
+    tilted_height_map,
+    tilted_view,
+    without_holes,
+)
+from utils.transforms import DOWN, Grasp, tilt_rotation, transform_points
+
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def approaches(most: float = 89.0):
+    """Unit vectors up to `most` degrees from straight down."""
+    degrees = st.tuples(st.floats(0, most), st.floats(0, 360))
+    return degrees.map(lambda both: approach(*both))
+
+
+def approach(tilt: float, turn: float) -> np.ndarray:
+    """The direction `tilt` degrees from straight down, towards `turn` degrees from W's x."""
+    out = np.sin(np.deg2rad(tilt)) * np.array([np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))])
+    return np.array([*out, -np.cos(np.deg2rad(tilt))])
+
+
+# --- Poses ------------------------------------------------------------------------------------
+
+
+@given(approaches())
+def test_the_tilt_is_the_least_rotation_from_straight_down(direction) -> None:
+    """SciPy's rotation about the axis DOWN x direction by the angle between the two."""
+    axis = np.cross(DOWN, direction)
+    sine = np.linalg.norm(axis)
+    angle = np.arctan2(sine, np.dot(DOWN, direction))
+    expected = Rotation.from_rotvec(axis / sine * angle if sine > 1e-12 else axis).as_matrix()
+    np.testing.assert_allclose(tilt_rotation(direction), expected, atol=1e-9)
+
+
+@given(approaches(), st.floats(0, 3.14), st.booleans())
+def test_a_grasp_is_its_pose_whichever_finger_is_left(direction, angle, flipped) -> None:
+    grasp = Grasp(np.array([0.4, 0.1, 0.05]), angle, 0.06, 0.5, direction)
+    np.testing.assert_allclose(grasp.pose[:3, 2], direction, atol=1e-12)
+    np.testing.assert_allclose(grasp.pose[:3, 1], grasp.closing_direction, atol=1e-12)
+    again = Grasp.from_pose(grasp.pose @ FLIP if flipped else grasp.pose, 0.06, 0.5)
+    assert turn_between(grasp, again) < 1e-6
+    np.testing.assert_allclose(again.approach, direction, atol=1e-9)
+    assert grasp.tilt == pytest.approx(np.arccos(-direction[2]), abs=1e-7)
+
+
+@given(approaches(), st.floats(0, 3.14), st.floats(0, 1.5), st.integers(0, 2))
+def test_the_turn_between_grasps_is_that_of_their_hands(direction, angle, turn, axis) -> None:
+    """By up to 85 degrees about an axis of the hand; beyond a right angle a flip is nearer."""
+    T = Grasp(np.zeros(3), angle, 0.06, 0.5, direction).pose
+    turned = T.copy()
+    turned[:3, :3] = T[:3, :3] @ Rotation.from_euler("xyz"[axis], turn).as_matrix()
+    if turned[2, 2] < 0:  # not from below
+        other = Grasp.from_pose(turned @ FLIP, 0.06, 0.5)
+        grasp = Grasp.from_pose(T, 0.06, 0.5)
+        assert turn_between(grasp, other) == pytest.approx(turn, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("direction", "message"),
+    [((0, 0, 1.0), "does not point up"), ((0, 0, -2.0), "unit vector"), ((0, -1.0), "shape"),
+     ((0, np.nan, -1.0), "non-finite")],
+)  # fmt: skip
+def test_an_approach_that_is_none_is_refused(direction, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        Grasp(np.zeros(3), 0.0, 0.05, 1.0, np.array(direction))
+
+
+# --- Maps -------------------------------------------------------------------------------------
+
+
+@given(approaches(85.0), st.floats(-0.1, 0.1))
+def test_the_table_is_a_slope_in_a_tilted_view(direction, table) -> None:
+    workspace = Workspace(table_height=table)
+    T_WV = tilted_view(direction, workspace)
+    origin, cell = np.array([0.45, -0.05]), 0.01
+    slope = table_slope((7, 11), origin, cell, table, T_WV)
+    row, column = np.mgrid[0:7, 0:11]
+    points = np.stack([origin[0] + cell * column, origin[1] + cell * row, slope], axis=-1)
+    near = abs(slope) < 0.9  # farther off, it ends
+    np.testing.assert_allclose(transform_points(T_WV, points)[near, 2], table, atol=1e-6)
+
+
+def test_a_table_seen_along_itself_is_a_wall_on_one_side() -> None:
+    """A hand that comes along W's x: V's x points up in W, or down."""
+    T_WV = tilted_view(np.array([1.0, 0.0, 0.0]), Workspace())
+    slope = table_slope((3, 40), np.array([0.4, 0.0]), 0.005, 0.0, T_WV)
+    column = np.arange(40) * 0.005 + 0.4
+    height = transform_points(T_WV, np.column_stack([column, 0 * column, 0 * column]))[:, 2]
+    assert (slope[1, height < -0.03] > 0.9).all() and (slope[1, height > 0.03] < -0.9).all()
+
+
+@pytest.mark.parametrize("tilt", [0, 20, 40])
+def test_a_tilted_map_of_an_image_is_that_of_the_solids(tilt) -> None:
+    """A box under a camera straight above, which does not see its flanks: where the view meets its
+    top, the two maps agree; the rest of the box is below the ceiling."""
+    workspace = Workspace()
+    frame = boxes_frame([((0.06, 0.08, 0.05), 0.4, (0.5, 0.0))])
+    T_WV = tilted_view(approach(tilt, 30), workspace)
+    overhead = height_map_from_frame(frame, workspace)
+    seen = tilted_height_map(overhead, *without_holes(frame), T_WV)
+    exact = height_map_from_scene(frame.truth, workspace, cell=0.002, T_WV=T_WV)
+    row, column = np.indices(exact.height.shape)
+    place = exact.origin + exact.cell * np.stack([column, row], axis=-1)
+    rise = exact.rise(np.dstack([place, exact.height]))
+    on_top = rise > 0.0495
+    assert on_top.sum() > 700
+    # Cells at the edge may hold the table beside it, and none more than a cell's slope is off.
+    close = abs(seen.height - exact.height)[on_top] < 0.002
+    assert close.mean() > 0.95
+    assert (seen.label[on_top] == 0).mean() > 0.97
+    assert (seen.ceiling > exact.height - 0.004).mean() > 0.995
+    np.testing.assert_allclose(
+        transform_points(T_WV, seen.centres), [[0.5, 0.0, 0.025]], atol=0.0015
+    )
+
+
+# --- Planners ---------------------------------------------------------------------------------
+
+
+def leaning_plate(lean: float) -> SceneGeometry:
+    """A plate of 120 x 100 x 12 mm that leans by `lean` degrees: its longest side points to W's x
+    at 0 and upwards at 90; its lowest corner touches the table."""
+    turn = Rotation.from_euler("y", -lean, degrees=True).as_matrix()
+    corners = (CORNERS * (0.06, 0.05, 0.006)) @ turn.T
+    corners += (0.5, 0.0, -corners[:, 2].min())
+    solid = ConvexSolid.from_vertices(corners)
+    return SceneGeometry((SolidObject((solid,), corners.mean(axis=0), 0.5),))
+
+
+@pytest.mark.parametrize("lean", [45, 60])
+def test_a_leaning_plate_is_gripped_flat_on_its_faces(lean) -> None:
+    """From straight above, vertical pads meet faces that are 45 or 30 degrees off; the hand that
+    comes along the plate meets them squarely. Friction of 0.5 holds to 27 degrees."""
+    scene = leaning_plate(lean)
+    normal = np.array([-np.sin(np.deg2rad(lean)), 0.0, np.cos(np.deg2rad(lean))])
+    frame = replace(boxes_frame([]), truth=scene)
+    workspace = Workspace()
+
+    def off_the_normal(grasp):
+        return np.degrees(np.arccos(min(abs(grasp.closing_direction @ normal), 1.0)))
+
+    best = OracleFanPlanner(GripperGeometry(), workspace)(frame)[0]
+    assert off_the_normal(best) < 16  # half the step between two rings
+    planar = make_planner("oracle", GripperGeometry(), workspace, 0)(frame)
+    assert all(off_the_normal(grasp) > 27 for grasp in planar)
+
+
+def test_the_fan_is_even_and_holds_the_vertical() -> None:
+    fan = np.array(FanSettings().directions())
+    np.testing.assert_allclose(np.linalg.norm(fan, axis=1), 1.0)
+    np.testing.assert_allclose(fan[0], DOWN)
+    np.testing.assert_allclose(fan[:, :2].sum(axis=0), 0.0, atol=1e-12)
+    assert (fan[:, 2] < 0).all()
+
+
+def test_the_same_frame_gives_the_same_grasps_and_none_are_alike() -> None:
+    boxes = [((0.05, 0.05, 0.05), 0.4, (0.47, 0.03)), ((0.03, 0.1, 0.06), 1.0, (0.56, -0.05))]
+    frame = boxes_frame(boxes)
+    planner = HeuristicFanPlanner(GripperGeometry(), Workspace())
+    first, second = planner(frame), planner(frame)
+    assert [g.quality for g in first] == [g.quality for g in second] and len(first) > 10
+    assert [g.quality for g in first] == sorted((g.quality for g in first), reverse=True)
+    for i, grasp in enumerate(first):
+        assert 0 < grasp.width <= GripperGeometry().max_opening + 1e-9
+        for other in first[:i]:
+            apart = np.linalg.norm(grasp.position - other.position)
+            assert apart >= 0.01 or turn_between(grasp, other) >= np.deg2rad(20) - 1e-9
+
+
+def test_an_empty_table_has_no_grasp() -> None:
+    frame = boxes_frame([])
+    for name in ("heuristic6d", "oracle6d"):
+        assert make_planner(name, GripperGeometry(), Workspace(), 0)(frame) == []
+
+
+def test_the_oracle_needs_the_truth() -> None:
+    with pytest.raises(ValueError, match="frame.truth"):
+        OracleFanPlanner(GripperGeometry(), Workspace())(boxes_frame([]).without_truth())
+
+
+def test_bowls_are_the_bowls_of_a_split(tmp_path) -> None:
+    found = load_object_set("benchmarks.bowls:bowls", split="sealed", cache_dir=tmp_path)
+    assert len(found) == 9 and all(found[i].name.startswith("bowl_10") for i in range(9))
+    with pytest.raises(UserError, match="unseen_families: has no bowls"):
+        load_object_set("benchmarks.bowls:bowls", split="unseen_families", cache_dir=tmp_path)
+
+
+def test_closed_loops_refuse_planners_that_tilt(config) -> None:
+    closed = load_config(
+        DEFAULTS, ["evaluate.policies=[heuristic6d]", "closed_loop.controller=ibvs"]
+    )
+    with pytest.raises(UserError, match="heuristic6d plans grasps from any side.*use open_loop"):
+        check_everything(closed)
+    with pytest.raises(ValueError, match="straight above"):
+        checked_grasps([Grasp(np.zeros(3), 0, 0.05, 1.0, approach(30, 0))], planar=True)
+
+
+def test_a_wall_beside_one_object_is_measured_and_infeasible() -> None:
+    """Walls have a label of their own, below those of objects, and no centre of mass."""
+    frame = boxes_frame([((0.05, 0.05, 0.05), 0.0, (0.5, 0.0)), *bin_walls()], walls=4)
+    heights = height_map_from_scene(frame.truth, Workspace())
+    assert len(heights.centres) == 1
+    on_wall = Candidates.rough(
+        np.array([[0.655, 0.0]]), np.zeros(1), np.array([0.08]), np.array([0.01]), np.ones(1)
+    )
+    found = measure(on_wall, heights, GripperGeometry(), SearchSettings())
+    assert found.label == [WALL_LABEL] and found.score == [0]
