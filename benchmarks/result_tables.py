@@ -20,8 +20,8 @@ from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
 PAGES = (
-    "README.md", "README.zh-CN.md", "docs/results.md", "docs/six_dof.md", "docs/scaling.md",
-    "docs/reliability.md",
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/six_dof.md",
+    "docs/scaling.md", "docs/reliability.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
@@ -280,6 +280,19 @@ def six_dof(say: Say, part: Figures) -> str:
     return "\n\n".join([scoreboard(say, part), beside])
 
 
+def calibration(say: Say, part: Figures) -> str:
+    """What each planner stated, what came of it, and how far both are apart in ten bins."""
+    lines = [
+        [f"`{one['policy']}`", simulator, _noise(one), one["grasps"], f"{one['chance']:.3f}",
+         f"{one['success']:.3f}", f"{one['error']:.3f}"]
+        for simulator, command in part["commands"].items()
+        for one in command["calibration"]
+    ]  # fmt: skip
+    header = ["planner", "simulator", "depth", "grasps", "mean quality", "share of successes",
+              "calibration error"]  # fmt: skip
+    return "\n\n".join([table(header, lines), origin(say, part)])
+
+
 def clutter15(say: Say, part: Figures) -> str:
     header = ["planner", "success", "cleared", "picks an hour"]
     lines = [_planner_cells(row) for row in rows_of(part)]
@@ -417,6 +430,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "scoreboard": (("scoreboard",), scoreboard),
     "differences": (("scoreboard",), differences),
     "six_dof": (("six_dof",), six_dof),
+    "calibration": (("calibration",), calibration),
     "clutter15": (("clutter15",), clutter15),
     "differences15": (("clutter15",), differences),
     "noise": (("noise", "scoreboard"), noise),

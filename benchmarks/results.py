@@ -35,11 +35,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.result_tables import write_tables
+from utils.calibration import calibration_error
 from utils.config import load_config
 from utils.errors import UserError
 from utils.evaluation import in_order
-from utils.result_records import read_rounds, write_sample
-from utils.results import compare
+from utils.result_records import RoundRecord, read_rounds, write_sample
+from utils.results import compare, stated_chances
 from utils.runs import environment, run_script, write_json_atomic
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -96,6 +97,7 @@ class Part:
 
 EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
 ANY_SIDE = "graspnet,graspnet6d,oracle,oracle6d"
+JUDGED = "heuristic,graspnet,graspnet6d,oracle"
 NOISY_FIRST = "realsense,none"
 
 
@@ -129,6 +131,13 @@ PARTS = (
                     "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST, kept=3),
         _evaluation("bowls", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=isolated "
                     "evaluate.object_sets=benchmarks.bowls:bowls", noises=NOISY_FIRST, kept=3),
+    )),
+    Part("calibration", "how well the planners know their chances, in both simulators", 10, (
+        _evaluation("pybullet", 10, f"evaluate.policies={JUDGED} evaluate.scenarios=packed,pile "
+                    "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST, kept=1),
+        _evaluation("mujoco", 10, f"simulator=mujoco evaluate.policies={JUDGED} "
+                    "evaluate.scenarios=packed,pile evaluate.object_sets=random_urdfs,primitives",
+                    kept=1),
     )),
     Part("noise", "other depth noises than the scoreboard's", 20, tuple(
         _evaluation(noise, 50, "evaluate.policies=heuristic,graspnet evaluate.scenarios=pile "
@@ -366,7 +375,25 @@ def figures_of(run: Path) -> dict[str, Any]:
         rounds = in_order(read_rounds(run / "rounds.jsonl", config.camera.depth_noise), config)
         comparisons = compare(rounds, SEED)
         figures |= {"comparisons": [asdict(pair) for pair in comparisons], "run": str(run)}
+        figures["calibration"] = calibration_of(rounds)
     return figures
+
+
+def calibration_of(rounds: Sequence[RoundRecord]) -> list[dict[str, Any]]:
+    """The calibration error of each policy with each depth noise, over all its rounds."""
+    found = []
+    for policy, noise in dict.fromkeys((one.policy, one.depth_noise) for one in rounds):
+        stated = stated_chances(
+            one for one in rounds if (one.policy, one.depth_noise) == (policy, noise)
+        )
+        if stated is not None:
+            chances, successes = stated
+            found.append({
+                "policy": policy, "depth_noise": noise, "grasps": len(chances),
+                "chance": sum(chances) / len(chances), "success": sum(successes) / len(successes),
+                "error": calibration_error(chances, successes),
+            })  # fmt: skip
+    return found
 
 
 def keep_rounds(part: Part, command: Command, run: Path) -> None:

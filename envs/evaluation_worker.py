@@ -25,7 +25,14 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
-from models.planners import Planner, make_planner, needs_truth, tilts
+from models.planners import (
+    Planner,
+    calibration_of,
+    calibrations,
+    make_planner,
+    needs_truth,
+    tilts,
+)
 from utils.config import Config
 from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
@@ -48,13 +55,19 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     one before any work is done.
     """
     for name in config.evaluate.policies:
-        controllers = [controller for _, controller in policies_of(config)]
-        if is_learned(name):
-            check_learned(name, config.evaluate.scenarios, controllers, config)
-        elif tilts(new_planner(name, config, key)) and {*controllers} != {OPEN_LOOP}:
+        controllers = {controller for _, controller in policies_of(config)}
+        planner = None if is_learned(name) else new_planner(name, config, key)
+        if planner is None:
+            check_learned(name, config.evaluate.scenarios, sorted(controllers), config)
+        elif tilts(planner) and controllers != {OPEN_LOOP}:
             raise UserError(
-                f"evaluate.controllers: {name} plans grasps from any side, and closed loops follow "
-                f"those from straight above alone; use {OPEN_LOOP} with it"
+                f"{key}: {name} plans grasps from any side, and closed loops follow those from "
+                f"straight above alone; score it with {OPEN_LOOP} alone"
+            )
+        if config.evaluate.abstain > 0 and (planner is None or calibration_of(planner) is None):
+            raise UserError(
+                f"evaluate.abstain: {name} states no chances of success; allowed with it are "
+                f"{', '.join(calibrations())}, or evaluate.abstain=0"
             )
     make_cell(config).close()
     check_bin(config)
@@ -122,7 +135,8 @@ def work(config: Config, task: Task) -> TaskResult:
         result.rounds.append(
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
-                max_failures=config.evaluate.max_failures, scenario=task.scenario,
+                max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
+                scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )
         )  # fmt: skip

@@ -25,7 +25,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.objects import fits
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
-from models.planners import Planner, needs_truth, reset_planner
+from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.errors import TargetLostError, one_line
 from utils.result_records import (
     NO_PLAN,
@@ -70,6 +70,7 @@ def run_round(
     controller: str = OPEN_LOOP,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
     approach_by: GraspFinder | None = None,
+    abstain: float = 0.0,
 ) -> RoundRecord:
     """Load a scene, let a planner work on it, and return the record.
 
@@ -79,10 +80,12 @@ def run_round(
     controller: how the arm reaches the grasps.
     on_attempt: called after every executed grasp with the frame that it was planned on.
     approach_by: a policy that finds its own grasps on the way; the planned ones are ignored.
+    abstain: grasps of less quality are not tried; where there are no others, the round ends as if
+        the planner had found none.
     """
     scenario = scenario or scene.layout
     conditions = SCENARIOS[scenario]
-    privileged = needs_truth(plan)
+    privileged, chances = needs_truth(plan), calibration_of(plan)
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
     calibration = conditions.calibration(cell)
@@ -109,11 +112,13 @@ def run_round(
                     )
             finally:
                 plan_seconds = time.perf_counter() - start
-            if not grasps:
-                attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0))
+            worth = [grasp for grasp in grasps if grasp.quality >= abstain]
+            if not worth:
+                detail = _abstained(grasps, abstain)
+                attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0, detail=detail))
                 ended = NO_PLAN
                 break
-            grasp = no_deeper(first_untried(within_reach(cell, grasps), failed), failed, stops)
+            grasp = no_deeper(first_untried(within_reach(cell, worth), failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -163,6 +168,7 @@ def run_round(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
         cell.config.camera.depth_noise,
+        None if chances is None else (chances.slope, chances.offset),
     )  # fmt: skip
 
 
@@ -224,6 +230,12 @@ def _turn_ms(approach: Approach) -> dict[str, float]:
         "turn_ms": 1000 * float(np.percentile(turns, 95)),
         "turn_ms_mean": 1000 * float(np.mean(turns)),
     }
+
+
+def _abstained(grasps: Sequence[Grasp], least: float) -> str:
+    """Why none of the grasps is tried; empty where there are none."""
+    best = max((grasp.quality for grasp in grasps), default=None)
+    return "" if best is None else f"abstained: the best quality is {best:.2f}, under {least:g}"
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:

@@ -23,7 +23,7 @@ from models.graspnet_decoding import find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
 from models.planner_candidates import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
-from models.planners import Planner, make_planner, needs_truth
+from models.planners import Planner, make_planner, needs_truth, tilts
 from models.rectangle_examples import HIGHEST_PEAK, Judged, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
@@ -78,7 +78,7 @@ def judge_photographs(
     attribute `needs_truth` that is true: a photograph has no true scene.
     """
     planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
-    if needs_truth(planned):
+    if needs_truth(planned) or tilts(planned):
         return None
     found: list[Judged | None] = []
     for sample in samples:

@@ -16,11 +16,12 @@ from dataclasses import fields, replace
 import cv2
 import numpy as np
 
-from models.planner_candidates import Candidates, SearchSettings
+from models.planner_candidates import Candidates, SearchSettings, with_chances
+from utils.calibration import Calibration
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import WALL_LABEL, HeightMap
-from utils.transforms import Grasp
+from utils.transforms import Grasp, transform_points
 
 _NOWHERE = -1e3  # m, under everything
 
@@ -29,8 +30,11 @@ class SearchPlanner:
     """Base of the planners that search a height map.
 
     gripper, workspace: the hand and the square of the table that it works on. seed: unused, for
-    the search draws nothing at random; all planners are made with the same arguments.
+    the search draws nothing at random; all planners are made with the same arguments. calibration:
+    by which qualities are chances of success; None leaves scores.
     """
+
+    calibration: Calibration | None = None
 
     def __init__(
         self,
@@ -51,9 +55,8 @@ class SearchPlanner:
     def grasps(self, found: Candidates) -> list[Grasp]:
         """The best of the candidates as grasps, no two of them nearly alike."""
         settings = self.settings
-        return found.distinct(
-            settings.returned, settings.distinct_distance, settings.distinct_turn
-        ).grasps(self.gripper)
+        kept = found.distinct(settings.returned, settings.distinct_distance, settings.distinct_turn)
+        return with_chances(kept.grasps(self.gripper), self.calibration)
 
 
 def search(
@@ -163,7 +166,8 @@ def dense_candidates(
             base + cell * (column - half)[:, None] * along
             for column in (first, first + 1.5, (first + last) / 2, last)
         )
-        reach = np.abs(xy - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
+        place = transform_points(heights.T_WV, np.column_stack([xy, tip]))[:, :2]
+        reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
         # Outward normals are minus the gradient: cosines against the closing line on both sides.
         facing = np.minimum(
             slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
@@ -317,8 +321,8 @@ def measure(
     score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
     score *= np.exp(-settings.covered_weight * covered)
     score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
-    rise = heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)]))
-    score *= 1 + 2 * np.clip(rise, 0, 0.15)  # prefers the top of a pile
+    over_table = heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)]))
+    score *= 1 + 2 * np.clip(over_table, 0, 0.15)  # prefers the top of a pile
     feasible = np.zeros(N, bool)
     feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)

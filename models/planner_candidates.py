@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from utils.calibration import Calibration
 from utils.geometry import GripperGeometry
 from utils.grasp_quality import RELAXED
 from utils.transforms import Grasp, angle_difference
@@ -84,6 +85,14 @@ class Candidates:
                 self.xy, height, self.angle, self.opening.tolist(), self.score.tolist()
             )
         ]
+
+
+def with_chances(grasps: list[Grasp], calibration: Calibration | None) -> list[Grasp]:
+    """The grasps in the same order, with chances of success in place of scores."""
+    if calibration is None:
+        return grasps
+    chances = calibration([grasp.quality for grasp in grasps]).tolist()
+    return [replace(grasp, quality=chance) for grasp, chance in zip(grasps, chances)]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.planner_antipodal import search_once
-from models.planner_candidates import Candidates, SearchSettings
+from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
+from utils.calibration import Calibration
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -68,10 +69,11 @@ class FanPlanner:
     """Base of the planners that search a fan of views.
 
     gripper, workspace: the hand and the square of the table that it works on. seed: unused, as in
-    `SearchPlanner`.
+    `SearchPlanner`. calibration: as there.
     """
 
     tilts = True
+    calibration: Calibration | None = None
 
     def __init__(
         self,
@@ -93,13 +95,14 @@ class FanPlanner:
         maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
         margins, relaxed ones serve.
         """
+        views = [maps(tilted_view(approach, self.workspace)) for approach in self.fan.directions()]
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
-            for approach in self.fan.directions():
-                heights = maps(tilted_view(approach, self.workspace))
+            for heights in views:
                 grasps += self._search_view(heights, settings, value)
             if grasps:
-                return distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
+                best = distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
+                return with_chances(best, self.calibration)
         return []
 
     def _search_view(

@@ -9,6 +9,7 @@ from straight above. A planner of your own is named by its import path, see
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +17,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from models.graspnet_io import SHIPPED
 from models.planner_antipodal import SearchPlanner
-from models.planner_candidates import SearchSettings
+from models.planner_candidates import SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
 from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
 from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
+from utils.calibration import Calibration, load_calibrations
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
@@ -29,10 +32,12 @@ from utils.transforms import Grasp, RGBDFrame
 
 
 class Planner(Protocol):
-    """Any callable that plans grasps. Three attributes are optional.
+    """Any callable that plans grasps. Four attributes are optional.
 
     needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
     tilts: True if grasps come from any side, and not from straight above alone.
+    calibration: by which qualities are chances of success (`utils.calibration.Calibration`);
+        without the attribute, or with None, they are scores.
     reset(seed): called before each scene, for planners that draw random numbers.
     """
 
@@ -49,6 +54,11 @@ def tilts(planner: Planner | type) -> bool:
     return bool(getattr(planner, "tilts", False))
 
 
+def calibration_of(planner: Planner) -> Calibration | None:
+    """By which the planner's qualities are chances of success; None where they are scores."""
+    return getattr(planner, "calibration", None)
+
+
 def reset_planner(planner: Planner, seed: int) -> None:
     """Prepare the planner for a new scene: `planner.reset(seed)`, where it has that method."""
     reset = getattr(planner, "reset", None)
@@ -58,6 +68,8 @@ def reset_planner(planner: Planner, seed: int) -> None:
 
 class RandomPlanner:
     """Grasps uniform over the pixels above the table, at random angles, with the hand wide open."""
+
+    calibration: Calibration | None = None
 
     def __init__(self, gripper: GripperGeometry, workspace: Workspace, seed: int, count: int = 20):
         self.gripper, self.workspace, self.count = gripper, workspace, count
@@ -82,7 +94,7 @@ class RandomPlanner:
             height = max(top - 0.02, lowest)  # the fingers reach 2 cm below the surface
             angle = self._random.uniform(0, np.pi)
             grasps.append(Grasp(np.array([x, y, height]), angle, self.gripper.max_opening, quality))
-        return grasps
+        return with_chances(grasps, self.calibration)
 
 
 class HeuristicPlanner(SearchPlanner):
@@ -126,7 +138,7 @@ class OraclePlanner(SearchPlanner):
 
 
 # A planner is made by a call with the gripper, the workspace and a seed.
-PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
+PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Any]] = {
     "random": RandomPlanner,
     "heuristic": HeuristicPlanner,
     "graspnet": GraspNetPlanner,
@@ -135,6 +147,16 @@ PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Planner]] = {
     "graspnet6d": GraspNetFanPlanner,
     "oracle6d": OracleFanPlanner,
 }
+
+
+# Fitted to executed grasps of training objects by `python -m benchmarks.calibrate`.
+CALIBRATIONS = SHIPPED.parent / "calibration.json"
+
+
+@functools.cache
+def calibrations() -> dict[str, Calibration]:
+    """By planner, those that are shipped."""
+    return load_calibrations(CALIBRATIONS)
 
 
 def make_planner(
@@ -150,10 +172,15 @@ def make_planner(
     `plugin_planner`. seed: starts the planner's own random generator. key: of the
     config, where the name stands; for errors.
 
+    The qualities of the project's own planners, with the shipped weights, are chances of success
+    (`CALIBRATIONS`); those of others are scores of their own.
+
     Raises UserError for any other name, and for a file or module that cannot be loaded.
     """
     if name in PLANNERS:
-        return PLANNERS[name](gripper, workspace, seed)
+        planner = PLANNERS[name](gripper, workspace, seed)
+        planner.calibration = calibrations().get(name)
+        return planner
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
     if is_import_path(name):

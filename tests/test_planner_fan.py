@@ -85,12 +85,17 @@ def test_the_turn_between_grasps_is_that_of_their_hands(direction, angle, turn, 
 
 @pytest.mark.parametrize(
     ("direction", "message"),
-    [((0, 0, 1.0), "does not point up"), ((0, 0, -2.0), "unit vector"), ((0, -1.0), "shape"),
+    [((0, 0, 1.0), "not point up"), ((0, 0, -2.0), "unit vector"), ((0, -1.0), "shape"),
      ((0, np.nan, -1.0), "non-finite")],
 )  # fmt: skip
 def test_an_approach_that_is_none_is_refused(direction, message) -> None:
     with pytest.raises(ValueError, match=message):
         Grasp(np.zeros(3), 0.0, 0.05, 1.0, np.array(direction))
+
+
+def test_a_hand_that_points_up_makes_no_grasp() -> None:
+    with pytest.raises(ValueError, match="not point up"):
+        Grasp.from_pose(np.eye(4), 0.05, 1.0)
 
 
 # --- Maps -------------------------------------------------------------------------------------
@@ -140,6 +145,31 @@ def test_a_tilted_map_of_an_image_is_that_of_the_solids(tilt) -> None:
     np.testing.assert_allclose(
         transform_points(T_WV, seen.centres), [[0.5, 0.0, 0.025]], atol=0.0015
     )
+
+
+@pytest.mark.parametrize(("tilt", "height"), [(30, 0.05), (60, 0.06), (60, 0.12)])
+def test_no_matter_reaches_above_the_ceiling(tilt, height) -> None:
+    """The flanks of a box, which a camera above does not see, and the table behind it, which it
+    does: a hand from the side meets the flank first."""
+    workspace = Workspace()
+    frame = boxes_frame([((0.06, 0.06, height), 0.0, (0.5, 0.0))])
+    T_WV = tilted_view(approach(tilt, 90), workspace)
+    overhead = height_map_from_frame(frame, workspace)
+    seen = tilted_height_map(overhead, *without_holes(frame), T_WV)
+    exact = height_map_from_scene(frame.truth, workspace, cell=0.002, T_WV=T_WV)
+    box = exact.label == 0
+    assert (seen.ceiling[box] > exact.height[box] - 0.006).mean() > 0.99
+
+
+def test_what_lies_outside_the_map_from_above_is_no_object() -> None:
+    """Seen by a camera with a wide view: a box 29 cm beside the one in the workspace."""
+    boxes = [((0.05, 0.05, 0.05), 0.0, (0.5, 0.0)), ((0.05, 0.05, 0.12), 0.0, (0.5, 0.29))]
+    frame, workspace = boxes_frame(boxes), Workspace()
+    for planner in (OracleFanPlanner, HeuristicFanPlanner):
+        for grasp in planner(GripperGeometry(), workspace)(frame):
+            assert abs(grasp.position[:2] - workspace.centre).max() < 0.2
+    only = boxes_frame(boxes[1:])
+    assert OracleFanPlanner(GripperGeometry(), workspace)(only) == []
 
 
 # --- Planners ---------------------------------------------------------------------------------
@@ -217,7 +247,7 @@ def test_closed_loops_refuse_planners_that_tilt(config) -> None:
     closed = load_config(
         DEFAULTS, ["evaluate.policies=[heuristic6d]", "closed_loop.controller=ibvs"]
     )
-    with pytest.raises(UserError, match="heuristic6d plans grasps from any side.*use open_loop"):
+    with pytest.raises(UserError, match="heuristic6d plans .* any side.*with open_loop alone"):
         check_everything(closed)
     with pytest.raises(ValueError, match="straight above"):
         checked_grasps([Grasp(np.zeros(3), 0, 0.05, 1.0, approach(30, 0))], planar=True)

@@ -40,6 +40,7 @@ HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+_RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
 FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
@@ -169,11 +170,16 @@ def tilted_height_map(
     row, column = np.indices(shape, sparse=True)
     surface = np.broadcast_arrays(origin[0] + cell * column, origin[1] + cell * row, seen.height)
     points = transform_points(T_WV, np.stack(surface, axis=-1))
+    place = (points[..., :2] - origin) / cell
     matter = points[..., 2] > overhead.table_height + _LABEL_FLOOR
+    matter &= ((place >= 0) & (place <= (shape[1] - 1, shape[0] - 1))).all(axis=-1)
     label = np.where(matter, overhead.label[overhead.index(points[..., :2])], -1)
-    known = label != -1  # at the rim of an object its surface may lie beside its label
-    if known.any():
-        label = np.where(matter & ~known, nearest_values(label, known), label)
+    # At the rim of an object its surface may lie beside its label.
+    known = label != -1
+    rim = cv2.dilate(known.astype(np.uint8), np.ones((2 * _RIM + 1, 2 * _RIM + 1))) > 0
+    rim &= matter & ~known
+    if rim.any():
+        label = np.where(rim, nearest_values(label, known), label)
     centres = transform_points(inverse_pose(T_WV), overhead.centres)
     return HeightMap(*seen.walled(), label, centres, origin, cell, overhead.table_height, T_WV)
 
@@ -225,7 +231,9 @@ def _seen(
     height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
     # The rays that graze an edge bound the matter in its shadow.
     ceiling = _highest(_grazing_points(frame, origin, cell), shape)
-    ceiling = np.where(hidden, np.maximum(ceiling, height), height)
+    ceiling = np.maximum(ceiling, height)
+    if T_WV[2, 2] == 1.0:  # a camera above has seen what is over a surface that it sees
+        ceiling = np.where(hidden, ceiling, height)
     if hiding.any():
         nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
         risen = _highest(_surface_points(nearer, origin, cell), shape)

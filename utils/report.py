@@ -11,7 +11,7 @@ import base64
 import shlex
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,16 @@ import imageio.v3 as iio
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
 from utils.image_overlay import contact_sheet, draw_grasp
 from utils.result_formats import columns_of, depth_in_words, failures_in_words
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
-from utils.results import Comparison, Row, stop_reasons
-from utils.runs import git_state, write_atomic
+from utils.results import Comparison, Row, stated_chances, stop_reasons
+from utils.runs import figure_bytes, git_state, write_atomic
 from utils.statistics import Difference
-from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+from utils.transforms import Grasp, RGBDFrame, grasp_to_image, project
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
@@ -80,6 +81,7 @@ def write_report(
         failures_in_words=failures_in_words,
         depth_in_words=depth_in_words,
         stops=stop_reasons(rounds),
+        reliability=_reliability(rounds),
         turns_known=any(row.turn_ms_p95 is not None for row in rows),
         rows=rows,
         columns=columns_of(rows),
@@ -183,6 +185,20 @@ def _verdict(difference: Difference | None) -> str:
     return "worse" if difference.high < 0 else "undecided"
 
 
+def _reliability(rounds: Sequence[RoundRecord]) -> str | None:
+    """The reliability diagram of the policies whose qualities are chances, over all their rounds;
+    None where there is none."""
+    policies = _in_order(record.policy for record in rounds)
+    stated = {
+        policy: stated_chances(record for record in rounds if record.policy == policy)
+        for policy in policies
+    }
+    known = {policy: chances for policy, chances in stated.items() if chances is not None}
+    if not known:
+        return None
+    return _data_url(figure_bytes(draw_reliability(known)), "image/png")
+
+
 def _png(image: np.ndarray) -> str:
     return _data_url(iio.imwrite("<bytes>", image, extension=".png"), "image/png")
 
@@ -223,6 +239,11 @@ def picture(frame: RGBDFrame, grasp: Grasp, policy: str, caption: str, reason: s
     """Draw a grasp on its frame; caption: begins the picture's, which ends with the reason,
     "success" or a key of FAILURES."""
     on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
+    # A closing line that leans appears shorter; of a level one this is the width itself, nearly.
+    half = grasp.closing_direction * grasp.width / 2
+    ends, _ = project([grasp.position - half, grasp.position + half], frame.K, frame.T_WC)
+    seen = float(np.linalg.norm(ends[1] - ends[0])) * on_image.depth / frame.K[0, 0]
+    on_image = replace(on_image, width=seen)
     image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
     return GalleryItem(image, f"{caption}: {reason}", success, policy)
 

@@ -185,6 +185,13 @@ COLUMNS = (
         "s per pick", lambda row: _decimal(row.sim_seconds_per_pick, 1), number=True, printed=False
     ),
     TableColumn("picks/h", lambda row: _decimal(row.picks_per_hour, 0), number=True),
+    TableColumn(
+        "calibration error",
+        lambda row: _decimal(row.calibration_error, 3),
+        number=True,
+        printed=False,
+        known=lambda row: row.calibration_error is not None,
+    ),
     TableColumn("turn ms, 95 %", turn_ms_in_words, known=lambda row: row.turn_ms_p95 is not None),
     TableColumn("failed", failures_in_words),
 )

@@ -121,6 +121,8 @@ class RoundRecord:
     randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
     ungraspable: how many of the scene's objects do not fit the gripper.
     depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
+    calibration: slope and offset by which the grasps' qualities are chances of success
+        (`utils.calibration`); None where they are scores.
     """
 
     policy: str
@@ -135,6 +137,7 @@ class RoundRecord:
     randomization: dict[str, Any] | None = None
     ungraspable: int = 0
     depth_noise: str = CLEAN
+    calibration: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:
@@ -236,6 +239,11 @@ def _round(content: dict[str, Any]) -> RoundRecord:
             if len(numbers) != 2 + len(_GRASP_NUMBERS) or not all(map(_is_number, numbers)):
                 raise ValueError("a grasp does not consist of numbers")
             attempt["grasp"] = ImageGrasp(**grasp)
+    if content.get("calibration") is not None:
+        slope, offset = content["calibration"]
+        if not (_is_number(slope) and _is_number(offset)):
+            raise ValueError("a calibration does not consist of two numbers")
+        content["calibration"] = (slope, offset)
     return RoundRecord(**content, attempts=tuple(AttemptRecord(**one) for one in attempts))
 
 

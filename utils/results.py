@@ -15,6 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from utils.calibration import calibration_error
 from utils.config import read_config
 from utils.errors import UserError
 from utils.result_records import CLEAN, FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
@@ -37,6 +38,8 @@ class Row:
         firm: successes in which it did neither.
     graspable_*: of objects that fit the gripper (`envs.objects.fits`) alone. An attempt belongs to
         the object that it held, or at which it aimed.
+    calibration_error: expected calibration error of the grasps' qualities (`utils.calibration`);
+        None where they are no chances.
     turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
         which the median over the attempts.
     """
@@ -68,6 +71,7 @@ class Row:
     graspable_attempts: int = 0
     graspable_successes: int = 0
     graspable_total: int = 0
+    calibration_error: float | None = None
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -90,6 +94,7 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
     moved = [loose(call.turned, call.slid) for call in calls if call.success]
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
+    stated = stated_chances(rounds)
     turns = [call.turn_ms for call in calls if call.turn_ms is not None]
     means = [call.turn_ms_mean for call in calls if call.turn_ms_mean is not None]
     return Row(
@@ -117,7 +122,23 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
         graspable_attempts=sum(call.executed for call in fitting),
         graspable_successes=sum(call.success for call in fitting),
         graspable_total=total - sum(record.ungraspable for record in rounds),
+        calibration_error=None if stated is None else calibration_error(*stated),
     )
+
+
+def stated_chances(rounds: Iterable[RoundRecord]) -> tuple[list[float], list[bool]] | None:
+    """The qualities of the executed grasps, and whether they succeeded, of the rounds whose
+    qualities are chances; None where there are none."""
+    stated = [
+        (attempt.grasp.quality, attempt.success)
+        for record in rounds
+        for attempt in record.attempts
+        if record.calibration is not None and attempt.executed and attempt.grasp is not None
+    ]
+    if not stated:
+        return None
+    qualities, successes = zip(*stated)
+    return list(qualities), list(successes)
 
 
 # --- Why attempts failed ------------------------------------------------------------------------

@@ -214,12 +214,17 @@ def write_json_atomic(path: Path, content: Mapping) -> None:
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a matplotlib figure as a PNG file and close it."""
+    write_atomic(path, figure_bytes(figure))
+
+
+def figure_bytes(figure: Figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG file; the figure is closed."""
     import matplotlib.pyplot as plt  # slow to import, and few callers need it
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     plt.close(figure)
-    write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 # --- Run folders ---------------------------------------------------------------------------

@@ -58,11 +58,7 @@ class Grasp:
             raise ValueError(f"Grasp holds a non-finite number: {self!r}")
         if self.width < 0:
             raise ValueError(f"Grasp.width must not be negative, got {self.width}")
-        if abs(np.linalg.norm(approach) - 1.0) > 1e-6 or approach[2] > 1e-6:
-            raise ValueError(
-                "Grasp.approach must be a unit vector that does not point up, got "
-                f"{approach.round(3).tolist()}"
-            )
+        check_approach(approach)
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "approach", approach)
         object.__setattr__(self, "angle", wrap_to_pi_range(self.angle))
@@ -72,6 +68,7 @@ class Grasp:
         """The grasp of a hand at T_WE (4, 4), which may be flipped: half a turn about the approach
         makes the same grasp."""
         approach = T_WE[:3, 2] / np.linalg.norm(T_WE[:3, 2])
+        check_approach(approach)
         closing = tilt_rotation(approach).T @ T_WE[:3, 1]
         angle = np.arctan2(closing[1], closing[0])
         return Grasp(T_WE[:3, 3].copy(), angle, width, quality, approach)
@@ -93,6 +90,15 @@ class Grasp:
         T = top_down_pose(self.position, self.angle)
         T[:3, :3] = tilt_rotation(self.approach) @ T[:3, :3]
         return T
+
+
+def check_approach(approach: np.ndarray) -> None:
+    """Raise ValueError for anything but a unit vector (3,) that does not point up."""
+    if abs(np.linalg.norm(approach) - 1.0) > 1e-6 or approach[2] > 1e-6:
+        raise ValueError(
+            "the approach of a grasp, the hand's z axis, must be a unit vector that does not point "
+            f"up in the world, got {approach.round(3).tolist()}"
+        )
 
 
 def tilt_rotation(approach: ArrayLike) -> np.ndarray:

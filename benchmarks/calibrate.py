@@ -1,0 +1,114 @@
+"""Chances of success from scores: python -m benchmarks.calibrate RUN... [--output FILE.json]
+
+Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
+(`utils.calibration`) and prints the expected calibration error before and after, in each scenario
+and with each depth noise. With --output the fits are written: into checkpoints/calibration.json,
+they are what the planners state from then on. configs/calibration.yaml plays all planners on
+training objects:
+
+    python evaluate.py --config configs/calibration.yaml
+    python -m benchmarks.calibrate runs/evaluate/<time>-calibration --output FILE.json
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from models.planners import PLANNERS
+from utils.calibration import Calibration, calibration_error
+from utils.config import load_config
+from utils.errors import UserError
+from utils.result_formats import aligned
+from utils.result_records import RoundRecord, read_rounds
+from utils.runs import git_state, run_script, write_json_atomic
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Fit chances of success to executed grasps.")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders of evaluate.py")
+    parser.add_argument("--output", type=Path, help="JSON file for the fits")
+    options = parser.parse_args(argv)
+    rounds = [record for run in options.runs for record in rounds_of(run, options.output)]
+    lines, found = [], {}
+    for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
+        own = [record for record in rounds if record.policy == name]
+        scores, _, successes = grasps_of(own)
+        if not 0 < successes.sum() < len(successes):
+            raise UserError(
+                f"{name}: {successes.sum()} of its {len(successes)} grasps succeeded, a fit needs "
+                "successes and failures; play more rounds"
+            )
+        fitted = Calibration.fit(scores, successes)
+        found[name] = {
+            **asdict(fitted),
+            "grasps": len(successes),
+            "successes": int(successes.sum()),
+        }
+        for kind in [None, *dict.fromkeys((one.scenario, one.depth_noise) for one in own)]:
+            some = [one for one in own if kind in (None, (one.scenario, one.depth_noise))]
+            if len(grasps_of(some)[0]) > 0:
+                lines.append([name, *(kind or ("all", "all")), *errors(fitted, some)])
+    header = ["planner", "scenario", "depth", "grasps", "success", "error before", "after"]
+    print(aligned(header, lines, range(3, 7)))
+    if options.output is not None:
+        content = {"runs": [run.name for run in options.runs], "commit": git_state().commit}
+        write_json_atomic(options.output, {**content, "planners": found})
+        print(f"wrote {options.output}")
+    return 0
+
+
+def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
+    """The rounds of a run folder. Raises UserError where there are none, and where fits would be
+    written that saw other objects than those of the training."""
+    if not (run / "rounds.jsonl").exists():
+        raise UserError(f"{run}: has no rounds.jsonl; give a run folder of evaluate.py")
+    config = load_config(run / "config.yaml")
+    if output is not None and config.objects.split != "train":
+        raise UserError(
+            f"{run}: its objects.split is {config.objects.split}; what planners state is fitted to "
+            "training objects alone: play it with objects.split=train, or omit --output"
+        )
+    if output is not None and config.evaluate.abstain > 0:
+        raise UserError(
+            f"{run}: evaluate.abstain is {config.evaluate.abstain}, so that only the surest grasps "
+            "were tried; play it with evaluate.abstain=0, or omit --output"
+        )
+    return read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
+
+
+def grasps_of(rounds: Iterable[RoundRecord]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The executed grasps of some rounds: scores, qualities as stated and successes, (N,) each.
+
+    Where qualities are chances, the round's own calibration leads back to the scores.
+    """
+    scores: list[float] = []
+    stated: list[float] = []
+    successes: list[bool] = []
+    for record in rounds:
+        executed = [one for one in record.attempts if one.executed and one.grasp is not None]
+        qualities = [attempt.grasp.quality for attempt in executed]
+        stated += qualities
+        successes += [attempt.success for attempt in executed]
+        if record.calibration is not None:
+            qualities = Calibration(*record.calibration).scores(qualities).tolist()
+        scores += qualities
+    return np.array(scores), np.array(stated), np.array(successes, dtype=bool)
+
+
+def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
+    """Cells: grasps, their share of successes, the calibration error as stated and as fitted."""
+    scores, stated, successes = grasps_of(rounds)
+    return [
+        str(len(stated)), f"{100 * successes.mean():.0f} %",
+        f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
+        f"{calibration_error(fitted(scores), successes):.3f}",
+    ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,236 @@
+"""Chances of success against hand computations, a peer's logistic regression and known chances."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.calibrate import grasps_of, main
+from envs.evaluation_worker import check_everything
+from envs.rounds import run_round
+from models.graspnet_io import SHIPPED
+from models.planners import PLANNERS, calibration_of, calibrations, make_planner
+from tests.helpers.box_frames import boxes_frame
+from tests.helpers.cubes import cube_grasp, cube_scene
+from utils.calibration import (
+    Calibration,
+    calibration_error,
+    draw_reliability,
+    reliability,
+    risk_coverage,
+)
+from utils.config import DEFAULTS, dump_config, load_config
+from utils.errors import UserError
+from utils.geometry import GripperGeometry, Workspace
+from utils.result_records import AttemptRecord, RoundRecord, append_round, read_rounds
+from utils.results import stated_chances, summarise
+from utils.transforms import ImageGrasp
+
+CHANCES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
+
+
+def test_the_error_is_the_mean_distance_of_the_bins() -> None:
+    """By hand: 0.8 and 0.9 are bins 8 and 9. (2 |0.5 - 0.8| + 1 |1 - 0.95|) / 3."""
+    chances, successes = [0.8, 0.8, 0.95], [True, False, True]
+    assert calibration_error(chances, successes) == pytest.approx((2 * 0.3 + 0.05) / 3)
+    bins = reliability(chances, successes)
+    assert [one.count for one in bins] == [2, 1]
+    np.testing.assert_allclose(bins, [(2, 0.8, 0.5), (1, 0.95, 1.0)])
+    assert calibration_error([1.0, 0.0], [True, False]) == 0  # the ends belong to a bin
+
+
+def test_risk_grows_with_the_grasps_that_are_tried() -> None:
+    """The surest first: won, lost, won."""
+    coverage, risk = risk_coverage([0.2, 0.9, 0.5], [True, True, False])
+    np.testing.assert_allclose(coverage, [1 / 3, 2 / 3, 1])
+    np.testing.assert_allclose(risk, [0, 1 / 2, 1 / 3])
+
+
+@given(CHANCES)
+def test_counts_add_up_and_the_error_is_a_share(grasps) -> None:
+    chances, successes = zip(*grasps)
+    assert sum(one.count for one in reliability(chances, successes)) == len(grasps)
+    assert 0 <= calibration_error(chances, successes) <= 1
+    coverage, risk = risk_coverage(chances, successes)
+    assert coverage[-1] == 1 and risk[-1] == pytest.approx(1 - np.mean(successes))
+
+
+def test_a_fit_finds_the_chances_that_the_grasps_were_drawn_with() -> None:
+    rng = np.random.default_rng(0)
+    scores, truth = rng.uniform(0.05, 1.2, 20_000), Calibration(1.5, 2.0)
+    fitted = Calibration.fit(scores, rng.uniform(size=len(scores)) < truth(scores))
+    assert fitted.slope == pytest.approx(1.5, abs=0.08)
+    assert fitted.offset == pytest.approx(2.0, abs=0.08)
+
+
+def test_a_fit_is_torchs_logistic_regression_with_platts_targets() -> None:
+    scores = np.array([0.1, 0.2, 0.4, 0.5, 0.7, 0.9])
+    successes = np.array([False, True, False, True, True, True])
+    target = torch.tensor([1 / 4, 5 / 6, 1 / 4, 5 / 6, 5 / 6, 5 / 6], dtype=torch.float64)
+    line = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True)
+    x = torch.log(torch.tensor(scores))
+    optimizer = torch.optim.LBFGS([line], max_iter=200, tolerance_grad=1e-12)
+
+    def loss() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = torch.nn.functional.binary_cross_entropy_with_logits(line[0] * x + line[1], target)
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    fitted = Calibration.fit(scores, successes)
+    np.testing.assert_allclose(
+        [fitted.slope, fitted.offset], line.detach().numpy(), rtol=1e-3, atol=1e-3
+    )
+
+
+@given(st.floats(0.01, 5), st.floats(-5, 5), st.floats(0.05, 3), st.floats(0.05, 3))
+def test_chances_keep_the_order_of_scores_and_lead_back_to_them(slope, offset, one, other) -> None:
+    calibration = Calibration(slope, offset)
+    chances = calibration([one, other])
+    assert ((chances > 0) & (chances < 1)).all()
+    assert (chances[0] - chances[1]) * (one - other) >= 0
+    if slope > 0.1 and abs(offset) + slope < 6:
+        np.testing.assert_allclose(calibration.scores(chances), [one, other], rtol=1e-6)
+
+
+def test_scores_that_say_nothing_keep_their_order() -> None:
+    fitted = Calibration.fit([0.1, 0.5, 0.9, 0.95], [True, True, False, False])
+    assert fitted.slope == pytest.approx(0.01) and np.diff(fitted([0.1, 0.5, 0.9])).min() > 0
+
+
+def test_planners_state_chances_in_the_order_of_their_scores() -> None:
+    frame = boxes_frame([((0.05, 0.05, 0.05), 0.4, (0.47, 0.03))])
+    gripper, workspace = GripperGeometry(), Workspace()
+    assert {*calibrations()} == {*PLANNERS}
+    for name in PLANNERS:
+        stated = make_planner(name, gripper, workspace, 0)(frame)
+        scored = PLANNERS[name](gripper, workspace, 0)(frame)
+        qualities = [grasp.quality for grasp in stated]
+        assert qualities == sorted(qualities, reverse=True) and 0 < qualities[-1] < 1
+        calibration = calibrations()[name]
+        np.testing.assert_allclose(qualities, calibration([grasp.quality for grasp in scored]))
+        np.testing.assert_array_equal(
+            [grasp.position for grasp in stated], [grasp.position for grasp in scored]
+        )
+    assert calibration_of(make_planner(str(SHIPPED), gripper, workspace, 0)) is None
+
+
+def test_grasps_of_less_quality_are_not_tried(bullet_cell, box_set) -> None:
+    """Two grasps, neither of which closes on the cube; the surer one is tried twice."""
+    grasps = [
+        replace(cube_grasp(offset=(x, 0, 0)), quality=quality)
+        for x, quality in ((0.13, 0.6), (-0.13, 0.4))
+    ]
+    settings = {"policy": "x", "objects": "box", "max_failures": 2}
+    tried = []
+
+    def play(abstain: float) -> RoundRecord:
+        tried.clear()
+        return run_round(
+            bullet_cell, cube_scene(box_set), lambda frame: list(grasps), **settings,
+            abstain=abstain,
+            on_attempt=lambda frame, grasp, outcome: tried.append(grasp.quality),
+        )  # fmt: skip
+
+    assert play(0.4).ended == "failures" and tried == [0.6, 0.4]
+    assert play(0.5).ended == "failures" and tried == [0.6, 0.6]
+    none = play(0.7)
+    assert none.ended == "no_plan" and tried == []
+    assert none.attempts[0].detail == "abstained: the best quality is 0.60, under 0.7"
+
+
+@pytest.mark.parametrize("policy", ["checkpoints/graspnet.pt", "ppo"])
+def test_what_states_no_chances_cannot_abstain(policy) -> None:
+    words = [f"evaluate.policies=[{policy}]", "evaluate.abstain=0.5", "evaluate.scenarios=isolated"]
+    with pytest.raises(UserError, match="evaluate.abstain: .* states no chances of success"):
+        check_everything(load_config(DEFAULTS, words))
+
+
+# --- Runs -------------------------------------------------------------------------------------
+
+
+def played(
+    policy: str, grasps: list[tuple[float, bool]], line: tuple[float, float] | None = None
+) -> RoundRecord:
+    attempts = tuple(
+        AttemptRecord(won, "success" if won else "missed", 0.01, 3.0,
+                      ImageGrasp(np.zeros(2), 0.0, 0.7, 0.05, quality))
+        for quality, won in grasps
+    )  # fmt: skip
+    cleared = sum(won for _, won in grasps)
+    return RoundRecord(
+        policy, "pile", "box", 1, len(grasps), cleared, attempts, "failures", calibration=line
+    )
+
+
+def test_a_row_has_the_error_of_what_was_stated() -> None:
+    grasps = [(0.8, True), (0.8, False), (0.95, True)]
+    (row,) = summarise([played("heuristic", grasps, (1.0, 2.0))], 0)
+    assert row.calibration_error == pytest.approx(0.65 / 3)
+    (row,) = summarise([played("mine", grasps)], 0)
+    assert row.calibration_error is None  # scores
+    assert stated_chances([played("mine", grasps)]) is None
+
+
+def test_the_journal_leads_back_to_the_scores(tmp_path) -> None:
+    line = Calibration(1.5, 2.0)
+    scores = np.array([0.2, 0.5, 0.9, 1.1])
+    raw = played("heuristic", [*zip(scores.tolist(), [True, False, True, True])])
+    stated = played(
+        "heuristic", [*zip(line(scores).tolist(), [True, False, True, True])], (1.5, 2.0)
+    )
+    append_round(tmp_path / "rounds.jsonl", stated)
+    (read,) = read_rounds(tmp_path / "rounds.jsonl")
+    assert read.calibration == (1.5, 2.0)
+    for record in (raw, read):
+        np.testing.assert_allclose(grasps_of([record])[0], scores)
+
+
+def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path, capsys) -> None:
+    for split in ("train", "test"):
+        (tmp_path / split).mkdir()
+        config = load_config(None, [f"objects.split={split}"])
+        (tmp_path / split / "config.yaml").write_text(dump_config(config))
+        grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
+        append_round(tmp_path / split / "rounds.jsonl", played("heuristic", grasps))
+        nothing = RoundRecord(
+            "heuristic",
+            "bin",
+            "box",
+            2,
+            1,
+            0,
+            (AttemptRecord(False, "no_plan", 0.1, 0.0),),
+            "no_plan",
+        )
+        append_round(tmp_path / split / "rounds.jsonl", nothing)
+    file = tmp_path / "fits.json"
+    assert main([str(tmp_path / "train"), "--output", str(file)]) == 0
+    assert "heuristic  pile" in capsys.readouterr().out
+    content = json.loads(file.read_text())
+    assert content["runs"] == ["train"] and content["planners"]["heuristic"]["successes"] == 3
+    with pytest.raises(UserError, match="split is test.*training objects alone"):
+        main([str(tmp_path / "test"), "--output", str(file)])
+    assert main([str(tmp_path / "test")]) == 0
+    surest = load_config(None, ["objects.split=train", "evaluate.abstain=0.5"])
+    (tmp_path / "train" / "config.yaml").write_text(dump_config(surest))
+    with pytest.raises(UserError, match="only the surest grasps"):
+        main([str(tmp_path / "train"), "--output", str(file)])
+    with pytest.raises(UserError, match=r"no rounds.jsonl"):
+        main([str(tmp_path / "nothing")])
+
+
+def test_the_diagram_has_a_line_for_each_name() -> None:
+    figure = draw_reliability({"a": ([0.8, 0.9], [True, False]), "b": ([0.5, 0.6], [True, True])})
+    diagram, risks = figure.axes
+    assert [text.get_text() for text in diagram.get_legend().get_texts()] == [
+        "a: error 0.550", "b: error 0.450",
+    ]  # fmt: skip
+    assert len(risks.lines) == 2

@@ -1,0 +1,137 @@
+"""From a planner's score to the chance that executing the grasp succeeds, and how good that is.
+
+Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm:
+P = 1 / (1 + exp(-(slope * log(score) + offset))), fitted to executed grasps. The chance rises with
+the score, so that a planner's order of grasps stays. How far chances and frequencies are apart is
+the expected calibration error (Guo et al., "On calibration of modern neural networks", ICML 2017).
+
+This module knows neither planners nor simulators.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.special import expit, log_expit, logit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LEAST_SCORE = 1e-6  # scores below it count as it
+LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
+BINS = 10  # of equal width in [0, 1]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Chance of success of a score: slope, offset as in the module's formula; slope > 0."""
+
+    slope: float
+    offset: float
+
+    def __call__(self, score: ArrayLike) -> np.ndarray:
+        """(...) chances in (0, 1) of scores (...)."""
+        return expit(self.slope * np.log(np.maximum(score, LEAST_SCORE)) + self.offset)
+
+    def scores(self, chances: ArrayLike) -> np.ndarray:
+        """(...) scores that have these chances (...)."""
+        return np.exp((logit(np.clip(chances, 1e-12, 1 - 1e-12)) - self.offset) / self.slope)
+
+    @staticmethod
+    def fit(scores: ArrayLike, successes: ArrayLike) -> Calibration:
+        """The most likely calibration of executed grasps: scores (N,), successes (N,) bool."""
+        return Calibration(*_fit(np.log(np.maximum(scores, LEAST_SCORE)), successes))
+
+
+def _fit(x: np.ndarray, successes: ArrayLike) -> tuple[float, float]:
+    """Slope and offset of a logistic regression on x (N,), with Platt's targets, which are nearer
+    to each other than 0 and 1 where there are few grasps."""
+    won = np.asarray(successes, dtype=bool)
+    target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
+
+    def loss(line: np.ndarray) -> float:
+        z = line[0] * x + line[1]
+        return -float(np.mean(target * log_expit(z) + (1 - target) * log_expit(-z)))
+
+    found = minimize(
+        loss, (1.0, 0.0), method="L-BFGS-B", bounds=((LEAST_SLOPE, None), (None, None))
+    )
+    return float(found.x[0]), float(found.x[1])
+
+
+def load_calibrations(path: Path) -> dict[str, Calibration]:
+    """Those of a file by planner; none where there is no file."""
+    if not path.exists():
+        return {}
+    planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
+    return {name: Calibration(one["slope"], one["offset"]) for name, one in planners.items()}
+
+
+class ReliabilityBin(NamedTuple):
+    """The grasps whose chances lie in one bin: their number, mean chance, share of successes."""
+
+    count: int
+    chance: float
+    success: float
+
+
+def reliability(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> list[ReliabilityBin]:
+    """The bins of [0, 1] that hold grasps, lowest first; a chance of 1 belongs to the last."""
+    chances, successes = np.asarray(chances, dtype=float), np.asarray(successes, dtype=float)
+    place = np.minimum((chances * bins).astype(int), bins - 1)
+    return [
+        ReliabilityBin(int(here.sum()), float(chances[here].mean()), float(successes[here].mean()))
+        for here in (place == number for number in range(bins))
+        if here.any()
+    ]
+
+
+def calibration_error(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> float:
+    """The expected calibration error: the mean over the grasps of |share of successes - mean
+    chance| of their bin."""
+    found = reliability(chances, successes, bins)
+    total = sum(one.count for one in found)
+    return sum(one.count * abs(one.success - one.chance) for one in found) / total
+
+
+def risk_coverage(chances: ArrayLike, successes: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) share of the grasps that are tried, and (N,) share of failures among them, when the
+    surest 1, 2, ..., N are."""
+    order = np.argsort(-np.asarray(chances, dtype=float), kind="stable")
+    tried = np.arange(1, len(order) + 1)
+    failures = np.cumsum(~np.asarray(successes, dtype=bool)[order])
+    return tried / len(order), failures / tried
+
+
+def draw_reliability(grasps: dict[str, tuple[Sequence[float], Sequence[bool]]]) -> Figure:
+    """Reliability diagram, and risk against coverage, of each name's chances and successes."""
+    from matplotlib.figure import Figure  # slow to import, and few callers need it
+
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    diagram, risks = figure.subplots(1, 2)
+    diagram.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    for name, (chances, successes) in grasps.items():
+        bins = reliability(chances, successes)
+        error = calibration_error(chances, successes)
+        diagram.plot(
+            [one.chance for one in bins], [one.success for one in bins], marker="o",
+            label=f"{name}: error {error:.3f}",
+        )  # fmt: skip
+        risks.plot(*risk_coverage(chances, successes), label=name)
+    diagram.set(
+        xlim=(0, 1), ylim=(0, 1.02), xlabel="quality: chance that the planner states",
+        ylabel="share of grasps that succeeded",
+    )  # fmt: skip
+    risks.set(xlim=(0, 1), xlabel="coverage: share of grasps tried, the surest first",
+              ylabel="risk: share of failures among them")  # fmt: skip
+    risks.set_ylim(bottom=0)
+    diagram.legend(fontsize=8)
+    risks.legend(fontsize=8)
+    return figure
