@@ -38,11 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
         own = [record for record in rounds if record.policy == name]
         scores, _, successes = grasps_of(own)
-        if not 0 < successes.sum() < len(successes):
-            raise UserError(
-                f"{name}: {successes.sum()} of its {len(successes)} grasps succeeded, a fit needs "
-                "successes and failures; play more rounds"
-            )
+        if len(successes) == 0:
+            raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
         fitted = Calibration.fit(scores, successes)
         found[name] = {
             **asdict(fitted),

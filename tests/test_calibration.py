@@ -105,6 +105,12 @@ def test_scores_that_say_nothing_keep_their_order() -> None:
     assert fitted.slope == pytest.approx(0.01) and np.diff(fitted([0.1, 0.5, 0.9])).min() > 0
 
 
+def test_where_every_grasp_succeeded_the_chance_is_laplaces() -> None:
+    """(N + 1) / (N + 2), whatever the score."""
+    fitted = Calibration.fit(np.linspace(0.1, 1.0, 98), np.ones(98, bool))
+    np.testing.assert_allclose(fitted([0.1, 0.5, 1.0]), 99 / 100, atol=2e-3)
+
+
 def test_planners_state_chances_in_the_order_of_their_scores() -> None:
     frame = boxes_frame([((0.05, 0.05, 0.05), 0.4, (0.47, 0.03))])
     gripper, workspace = GripperGeometry(), Workspace()
