@@ -104,7 +104,7 @@ def at_grasp(cell: Cell, grasp: Grasp) -> np.ndarray:
     beside = np.cross(grasp.approach, (0.0, 0.0, 1.0))
     if grasp.tilt < 0.01:
         beside = grasp.closing_direction
-    beside = beside / np.linalg.norm(beside)
+    beside = beside / np.linalg.norm(beside) * (1 if beside[0] > 0 else -1)  # not inside the arm
     eye = grasp.position + 0.55 * beside + (0.0, 0.0, 0.2)
     return cell.image(_VIEW, look_at(eye, grasp.position + (0.0, 0.0, 0.05))).rgb
 
