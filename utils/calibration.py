@@ -120,10 +120,10 @@ def draw_reliability(grasps: dict[str, tuple[Sequence[float], Sequence[bool]]]) 
     for name, (chances, successes) in grasps.items():
         bins = reliability(chances, successes)
         error = calibration_error(chances, successes)
-        diagram.plot(
-            [one.chance for one in bins], [one.success for one in bins], marker="o",
-            label=f"{name}: error {error:.3f}",
-        )  # fmt: skip
+        chance, success = [one.chance for one in bins], [one.success for one in bins]
+        (line,) = diagram.plot(chance, success, linewidth=1, label=f"{name}: error {error:.3f}")
+        area = [20 + 300 * one.count / len(chances) for one in bins]  # bins of few grasps are small
+        diagram.scatter(chance, success, s=area, color=line.get_color(), alpha=0.7)
         risks.plot(*risk_coverage(chances, successes), label=name)
     diagram.set(
         xlim=(0, 1), ylim=(0, 1.02), xlabel="quality: chance that the planner states",
