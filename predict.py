@@ -18,8 +18,9 @@ OUT/grasps.json with a picture in OUT/grasps.png; OUT is runs/predict/<name of t
 number where another image of that name was first. Each grasp has `pixel` (u, v) and `image_angle`
 (from right towards down) on the image, `width` between the finger pads, and in `camera` and `world`
 the pose of the middle between the pads, 7.2 mm above the lowest point of the fingertips: z along
-the approach, y along the closing line. Units are metres and radians; quaternions are x, y, z, w. If
-there is nothing to grasp the list is empty. Bad input ends with one sentence and status 2.
+the approach, y along the closing line. `quality` is the network's own score, and not a chance of
+success, as planners state it (docs/planner.md). Units are metres and radians; quaternions are x, y,
+z, w. If there is nothing to grasp the list is empty. Bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations

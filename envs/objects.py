@@ -237,8 +237,8 @@ def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> N
         names = ", ".join(too_large[index] for index in sorted(too_large))
         warnings.warn(
             f"{len(too_large)} of {len(objects)} objects of {objects.name} do not fit a hand that "
-            f"opens {gripper.max_opening} m, however they lie: {names}; tables count the others "
-            "apart, too",
+            f"opens {gripper.max_opening} m and comes from straight above, however they lie: "
+            f"{names}; tables count the others apart, too",
             stacklevel=2,
         )
 

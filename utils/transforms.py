@@ -36,7 +36,8 @@ class Grasp:
     angle: direction of the closing line about +z from the x axis, radians, modulo pi; of a grasp
         from another side, before the least rotation that takes DOWN to its approach.
     width: opening between the finger pads before closing, metres.
-    quality: the planner's own score; higher is better. Only comparable within one planner.
+    quality: of the project's planners the chance that executing the grasp succeeds; of others a
+        score, higher is better, which is only comparable within one planner.
     approach: (3,) unit vector in W along which the hand comes, at most a right angle from DOWN.
     """
 
