@@ -119,13 +119,15 @@ def test_a_bar_gripped_off_its_centre(cell, box_set, kind, force, off, holds):
     assert tilt(cell, axis) < 1.0 if holds else tilt(cell, axis) > 5.0
 
 
-@pytest.mark.parametrize("off", [0.03, 0.05, 0.06])
+@pytest.mark.parametrize("off", [0.03, 0.065, 0.08])
 def test_a_bar_gripped_off_its_centre_tilts_alike_in_both_simulators(cells, box_set, off):
-    """Held at 3 cm, and turned by more than 50 degrees from 5 cm on, after 0.6 s at 10 N."""
+    """Held at 3 cm, and on its way down from 6.5 cm on, 0.2 s after it was let go at 10 N. Between
+    them, PyBullet's friction depends on the processor (docs/physics.md); later the bar meets the
+    palm."""
     tilts = []
     for cell in cells:
         grip(cell, bar(box_set[0]), 10.0, off)
-        cell.step(144)
+        cell.step(48)
         tilts.append(tilt(cell))
     assert tilts[0] == pytest.approx(tilts[1], abs=5.0)
-    assert (min(tilts) > 50.0) == (off > 0.04)
+    assert (min(tilts) > 20.0) == (off > 0.04)

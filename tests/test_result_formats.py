@@ -44,7 +44,8 @@ def test_results_json_is_strict_and_complete(tmp_path):
     loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
     held = {"turned", "slid", "firm"}
     fitting = {"graspable_attempts", "graspable_successes", "graspable_total"}
-    assert set(content["rows"][0]) == {*fields.split(), "failures"} | loops | held | fitting
+    others = {"failures", "calibration_error"}
+    assert set(content["rows"][0]) == {*fields.split()} | others | loops | held | fitting
     assert content["rows"][1]["picks_per_hour"] is None
     (pair,) = content["comparisons"]
     assert (pair["first"], pair["second"]) == ("random", "heuristic")

@@ -48,9 +48,13 @@ def test_a_written_file_that_is_not_whole_is_lost(tmp_path, name):
     whole = path.read_bytes()
     assert _try_to_write(kind, path, whole, whole) == (True, 0, True)
 
+    cut = len(whole) * 4 // 5
+    if path.suffix == ".yaml":  # in a key: a cut number may be a number
+        cut = whole.rfind(b"\n", 0, cut) + 4
+
     def write_most(path):
         with path.open("ab" if name == JOURNAL else "wb") as file:
-            file.write(whole[: len(whole) * 4 // 5])
+            file.write(whole[:cut])
 
     path.write_bytes(whole)
     most = Kind(name, write_most, kind.read)
