@@ -1,7 +1,8 @@
 """Time from a frame to ranked grasps: python -m benchmarks.bench_planning [--json FILE]
 
-The median over frames of fresh piles for each of the four planners of the scoreboard, with all
-cores of this machine and nothing else running. An unmeasured pass over all frames comes first.
+The median over frames of fresh piles for the planners of the scoreboard and for those that grasp
+from any side, with all cores of this machine and nothing else running. An unmeasured pass over all
+frames comes first.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from utils.config import Config, load_config
 from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
-PLANNERS = ("random", "heuristic", "graspnet", "oracle")
+PLANNERS = ("random", "heuristic", "graspnet", "oracle", "heuristic6d", "graspnet6d")
 COUNTS = (5, 15)  # objects in a pile
 FIRST_SEED = 710_000  # of the scenes
 FRAMES = 20
