@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.planner_antipodal import search_once
+from models.planner_antipodal import SearchPlanner, search_once
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
-from utils.calibration import Calibration
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -65,15 +64,13 @@ class FanSettings:
 SEARCH = SearchSettings(angles=9, shortlist=80, finalists=60, covered_weight=2.0)
 
 
-class FanPlanner:
+class FanPlanner(SearchPlanner):
     """Base of the planners that search a fan of views.
 
-    gripper, workspace: the hand and the square of the table that it works on. seed: unused, as in
-    `SearchPlanner`. calibration: as there.
+    Arguments as in `SearchPlanner`; fan: the views.
     """
 
     tilts = True
-    calibration: Calibration | None = None
 
     def __init__(
         self,
@@ -83,8 +80,8 @@ class FanPlanner:
         settings: SearchSettings = SEARCH,
         fan: FanSettings = FanSettings(),
     ):
-        self.gripper, self.workspace = gripper, workspace
-        self.settings, self.fan = settings, fan
+        super().__init__(gripper, workspace, seed, settings)
+        self.fan = fan
         self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
 
     def search_fan(

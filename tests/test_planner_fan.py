@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from envs.evaluation_worker import check_everything
+from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import load_object_set
 from envs.rounds import checked_grasps
 from models.planner_antipodal import measure
@@ -241,6 +242,20 @@ def test_bowls_are_the_bowls_of_a_split(tmp_path) -> None:
     assert len(found) == 9 and all(found[i].name.startswith("bowl_10") for i in range(9))
     with pytest.raises(UserError, match="unseen_families: has no bowls"):
         load_object_set("benchmarks.bowls:bowls", split="unseen_families", cache_dir=tmp_path)
+
+
+def test_a_third_of_the_bowls_lean_more_than_friction_holds() -> None:
+    """The figures of benchmarks/bowls.py and docs/six_dof.md, over all splits."""
+    lean, cone = [], []
+    for index in range(FAMILIES.index("bowl"), 1100, len(FAMILIES)):
+        bowl = make_primitive(index)
+        base, walls = bowl.parts[0], np.concatenate(bowl.parts[1:])
+        out = np.linalg.norm(walls[:, :2], axis=1).max() - np.linalg.norm(base[0, :2])
+        lean.append(np.degrees(np.arctan2(out, walls[:, 2].max() - base[:, 2].max())))
+        cone.append(np.degrees(np.arctan(bowl.friction)))
+    assert (round(min(lean)), round(max(lean))) == (15, 49)
+    assert (round(min(cone)), round(max(cone))) == (22, 45)
+    assert np.mean(np.array(lean) > cone) == pytest.approx(1 / 3, abs=0.02)
 
 
 def test_closed_loops_refuse_planners_that_tilt(config) -> None:
