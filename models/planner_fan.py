@@ -17,6 +17,7 @@ import numpy as np
 from models.planner_antipodal import SearchPlanner, search_once
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
+from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -152,9 +153,10 @@ def turn_between(first: Grasp, second: Grasp) -> float:
 
 
 class HeuristicFanPlanner(FanPlanner):
-    """The fan on the depth image alone."""
+    """The fan on the depth image; colours only smooth a rough one."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        frame = corrected(frame, self.workspace.table_height)
         overhead = height_map_from_frame(frame, self.workspace)
         filled, hiding = without_holes(frame)
 

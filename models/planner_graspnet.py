@@ -30,6 +30,7 @@ from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanPlanner
 from utils.depth import surfaces_in_holes, table_in_holes
+from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -186,12 +187,13 @@ class GraspNetFanPlanner(FanPlanner):
 class NetworkView:
     """What a network tells about a frame: heights with its objects, and the quality of candidates.
 
-    frame: with the holes of its depth filled where colours tell what is there. heights: the map
-    from above. Raises UserError for an image that the network cannot take.
+    frame: corrected by its table, holes of its depth filled where colours tell what is there.
+    heights: the map from above. Raises UserError for an image that the network cannot take.
     """
 
     def __init__(self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace):
         model, metres_per_pixel, *_ = network
+        frame = corrected(frame, workspace.table_height)
         self.frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
         knows_centres = model.centre_head is not None
         self._scaling, self._maps = scaled_maps(model, metres_per_pixel, self.frame, knows_centres)

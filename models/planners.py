@@ -24,6 +24,7 @@ from models.planner_contacts import buried_share, exact_quality
 from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
 from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
 from utils.calibration import Calibration, load_calibrations
+from utils.depth_correction import corrected
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import height_map_from_frame, height_map_from_scene
@@ -98,9 +99,10 @@ class RandomPlanner:
 
 
 class HeuristicPlanner(SearchPlanner):
-    """Antipodal search on the height map of the depth image, which is all that it sees."""
+    """Antipodal search on the height map of the depth image; colours only smooth a rough one."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        frame = corrected(frame, self.workspace.table_height)
         return self.grasps(self.search(height_map_from_frame(frame, self.workspace)))
 
 
