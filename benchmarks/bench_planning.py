@@ -21,7 +21,9 @@ from utils.config import Config, load_config
 from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
-PLANNERS = ("random", "heuristic", "graspnet", "oracle", "heuristic6d", "graspnet6d")
+PLANNERS = (
+    "random", "heuristic", "graspnet_direct", "graspnet", "oracle", "heuristic6d", "graspnet6d",
+)  # fmt: skip
 COUNTS = (5, 15)  # objects in a pile
 FIRST_SEED = 710_000  # of the scenes
 FRAMES = 20

@@ -20,7 +20,8 @@ from utils.runs import write_atomic
 from utils.statistics import wilson_interval
 
 PAGES = (
-    "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/six_dof.md",
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/graspnet.md",
+    "docs/six_dof.md",
     "docs/scaling.md", "docs/reliability.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
@@ -261,14 +262,14 @@ def differences(say: Say, part: Figures) -> str:
     return "\n\n".join([with_depths(header, lines, _noises(pairs), 2), origin(say, part)])
 
 
-def six_dof(say: Say, part: Figures) -> str:
-    """Planners that grasp from any side beside those from straight above, and the differences of
-    each pair on the same scenes."""
+def variants(say: Say, part: Figures) -> str:
+    """Planners beside the ones that they vary (`...6d`, `..._direct`), and the differences of each
+    pair on the same scenes."""
     pairs = [
         pair
         for command in part["commands"].values()
         for pair in command["comparisons"]
-        if pair["first"] == f"{pair['second']}6d"
+        if pair["first"] in (f"{pair['second']}6d", f"{pair['second']}_direct")
     ]
     lines = [
         [f"`{pair['objects']}`", pair["scenario"], f"`{pair['first']}` - `{pair['second']}`",
@@ -429,7 +430,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "published": ((), published),
     "scoreboard": (("scoreboard",), scoreboard),
     "differences": (("scoreboard",), differences),
-    "six_dof": (("six_dof",), six_dof),
+    "six_dof": (("six_dof",), variants),
+    "direct": (("direct",), variants),
     "calibration": (("calibration",), calibration),
     "clutter15": (("clutter15",), clutter15),
     "differences15": (("clutter15",), differences),

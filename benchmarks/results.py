@@ -97,7 +97,7 @@ class Part:
 
 EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
 ANY_SIDE = "graspnet,graspnet6d,oracle,oracle6d"
-JUDGED = "heuristic,graspnet,graspnet6d,oracle"
+JUDGED = "heuristic,graspnet,graspnet_direct,graspnet6d,oracle"
 NOISY_FIRST = "realsense,none"
 
 
@@ -131,6 +131,14 @@ PARTS = (
                     "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST, kept=3),
         _evaluation("bowls", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=isolated "
                     "evaluate.object_sets=benchmarks.bowls:bowls", noises=NOISY_FIRST, kept=3),
+    )),
+    Part("direct", "the network's own peaks beside the search that it ranks", 20, (
+        _evaluation("direct", 30, "evaluate.policies=graspnet,graspnet_direct "
+                    "evaluate.scenarios=packed,pile,dense evaluate.object_sets=random_urdfs",
+                    noises=NOISY_FIRST, kept=3),
+        _evaluation("primitives", 30, "evaluate.policies=graspnet,graspnet_direct "
+                    "evaluate.scenarios=packed,pile evaluate.object_sets=primitives",
+                    noises=NOISY_FIRST, kept=3),
     )),
     Part("calibration", "how well the planners know their chances, in both simulators", 10, (
         _evaluation("pybullet", 10, f"evaluate.policies={JUDGED} evaluate.scenarios=packed,pile "

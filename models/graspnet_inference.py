@@ -92,11 +92,6 @@ def scaled_maps(
 ) -> tuple[PixelScaling, tuple[torch.Tensor, ...]]:
     """Return the scaling to the training's pixels and the network's three maps there; with
     `centres` also the map of the centre head."""
-    if model.input_channels != INPUT_CHANNELS:
-        raise UserError(
-            f"the network takes {model.input_channels} channels; an RGB-D image has "
-            f"{INPUT_CHANNELS}"
-        )
     scaling = training_scale(frame, metres_per_pixel)
     return scaling, run_network(model, frame, scaling, centres)
 
@@ -156,7 +151,15 @@ def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
 def run_network(
     model: GraspNet, frame: RGBDFrame, scaling: PixelScaling, centres: bool = False
 ) -> tuple[torch.Tensor, ...]:
-    """Return GraspNet's three maps of the scaled image, with `centres` four, on the CPU."""
+    """Return GraspNet's three maps of the scaled image, with `centres` four, on the CPU.
+
+    Raises UserError for a network that takes other images.
+    """
+    if model.input_channels != INPUT_CHANNELS:
+        raise UserError(
+            f"the network takes {model.input_channels} channels; an RGB-D image has "
+            f"{INPUT_CHANNELS}"
+        )
     depth = scaling.image(fill_holes(frame.depth))
     image = to_input(scaling.image(frame.rgb), depth)
     device = next(model.parameters()).device

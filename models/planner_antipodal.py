@@ -11,7 +11,7 @@ the image nor the solids behind them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -185,9 +185,7 @@ def dense_candidates(
         parts.append(
             Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
         )
-    return Candidates(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Candidates))
-    )
+    return Candidates.joined(parts)
 
 
 def _levels(

@@ -6,6 +6,7 @@ one array operation. This module knows neither images nor height maps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -41,6 +42,15 @@ class Candidates:
         return Candidates(
             xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
         )
+
+    @staticmethod
+    def joined(parts: Sequence[Candidates]) -> Candidates:
+        """All candidates of several lists."""
+        columns = (
+            np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(Candidates)
+        )
+        return Candidates(*columns)
 
     def __len__(self) -> int:
         return len(self.angle)

@@ -24,14 +24,22 @@ import cv2
 import numpy as np
 import torch
 
-from models.graspnet_inference import scaled_maps
+from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
+from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
-from models.planner_antipodal import SearchPlanner
+from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanPlanner
-from utils.depth import surfaces_in_holes, table_in_holes
+from utils.depth import (
+    TABLE_FLATNESS,
+    depth_of_plane,
+    reach_in_pixels,
+    surfaces_in_holes,
+    table_in_holes,
+)
 from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
+from utils.grasp_quality import grasp_depth
 from utils.height_map import (
     HeightMap,
     height_map_from_frame,
@@ -121,7 +129,11 @@ def vote_centres(
 # Half the heuristic's angles: turning onto the faces and the network make up for it. The split
 # factor is strict because the votes separate objects better than height alone.
 SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0.1)
+# Of the planner without a search: many peaks, because the height map decides which of them fit.
+PEAKS = PeakSettings(threshold=0.02, count=80, radius=3)
+DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of the labels
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
+CROP_MARGIN = 0.04  # m around what stands on the table
 LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
 
@@ -160,6 +172,50 @@ class GraspNetPlanner(SearchPlanner):
         return self.grasps(self.search(seen.heights, partial(seen.value, seen.heights)))
 
 
+class GraspNetDirectPlanner(GraspNetPlanner):
+    """The network's own peaks instead of a search.
+
+    At each peak of the quality map, and at the angles that the network prefers there, a grasp is
+    posed on the height map: centred between its contacts, turned onto the faces, as deep as a label
+    is or a little more or less. Those whose fingers and palm find room are ranked as `graspnet`
+    ranks its own.
+    """
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        seen = NetworkView(self.network, frame, self.workspace, crop=True)
+        heights, value = seen.heights, partial(seen.value, seen.heights)
+        rough = self._at_peaks(seen.peaks(PEAKS), heights)
+        rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
+        for settings in (self.settings, self.settings.relaxed()):
+            found = measure(self._at_depths(rough, settings), heights, self.gripper, settings)
+            found = found.best(settings.finalists)
+            if len(found):
+                found = turn_onto_faces(found, heights, self.gripper, settings)
+                found = replace(found, score=found.score * value(found))
+                return self.grasps(found.best(len(found)))
+        return []
+
+    def _at_peaks(self, points: np.ndarray, heights: HeightMap) -> Candidates:
+        """Candidates at points (N, 3) at all angles, their fingertips at the surface."""
+        away = np.abs(points[:, :2] - self.workspace.centre).max(axis=1)
+        points = points[away < self.workspace.size / 2 + self.settings.reach]
+        count = self.settings.angles
+        angle = np.tile(np.arange(count) * np.pi / count, len(points))
+        xy = np.repeat(points[:, :2], count, axis=0)
+        surface = heights.height[heights.index(xy)]
+        width = self.gripper.max_opening - 2 * self.settings.rooms[0]
+        return Candidates.rough(xy, angle, surface, np.full(len(xy), width), np.ones(len(xy)))
+
+    def _at_depths(self, rough: Candidates, settings: SearchSettings) -> Candidates:
+        """Each candidate with its fingertips DEPTH_STEPS over the depth that a label has."""
+        table = self.workspace.table_height
+        tip = rough.tip - grasp_depth(rough.tip, table)
+        lowest = table + settings.table_clearance
+        return Candidates.joined(
+            [replace(rough, tip=np.maximum(tip + step, lowest)) for step in DEPTH_STEPS]
+        )
+
+
 class GraspNetFanPlanner(FanPlanner):
     """A fan of views, its grasps ranked by what a network predicts for the image that was taken."""
 
@@ -188,19 +244,32 @@ class NetworkView:
     """What a network tells about a frame: heights with its objects, and the quality of candidates.
 
     frame: corrected by its table, holes of its depth filled where colours tell what is there.
-    heights: the map from above. Raises UserError for an image that the network cannot take.
+    heights: the map from above. crop: whether only the part of the image is looked at in which
+    something stands. Raises UserError for an image that the network cannot take.
     """
 
-    def __init__(self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace):
+    def __init__(
+        self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace, crop: bool = False
+    ):
         model, metres_per_pixel, *_ = network
         frame = corrected(frame, workspace.table_height)
+        self._scaling = training_scale(frame, metres_per_pixel)
+        if crop:
+            frame = around_matter(frame, workspace.table_height)
         self.frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
         knows_centres = model.centre_head is not None
-        self._scaling, self._maps = scaled_maps(model, metres_per_pixel, self.frame, knows_centres)
+        self._maps = run_network(model, self.frame, self._scaling, knows_centres)
         self.heights = height_map_from_frame(self.frame, workspace)
         if knows_centres:
             offset = self._maps[3][0].numpy()
             self.heights = labelled_by_centres(self.heights, self.frame, self._scaling, offset)
+
+    def peaks(self, settings: PeakSettings) -> np.ndarray:
+        """(N, 3) points in W of the surface at the peaks of the quality, the highest peak first."""
+        pixels = self._scaling.original_pixels(find_peaks(*self._maps[:3], settings).pixel)
+        depth = surface_depth(self.frame.depth, pixels)
+        points = deproject(pixels, depth, self.frame.K, self.frame.T_WC)
+        return points[np.isfinite(depth)]
 
     def value(self, heights: HeightMap, candidates: Candidates) -> np.ndarray:
         """(N,) the network's quality of candidates on a height map of the scene."""
@@ -211,6 +280,25 @@ class NetworkView:
         pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
         quality = quality_between(self._maps, *self._scaling.pixels(pixels))
         return np.maximum(quality, LEAST)
+
+
+def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
+    """The part of a frame in which something stands on the table, or may stand unseen: all that is
+    left out is table. The whole frame where nothing does."""
+    high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)  # unknown is 0
+    # Single pixels are noise.
+    high = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    left, top, width, height = cv2.boundingRect(high)
+    if width == 0:
+        return frame
+    margin = reach_in_pixels(frame, CROP_MARGIN)
+    left, top, right, bottom = (
+        max(left - margin, 0), max(top - margin, 0), left + width + margin, top + height + margin
+    )  # fmt: skip
+    K = frame.K.copy()
+    K[:2, 2] -= left, top
+    window = np.s_[top:bottom, left:right]
+    return replace(frame, rgb=frame.rgb[window], depth=frame.depth[window], K=K)
 
 
 def quality_between(

@@ -22,7 +22,11 @@ from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
 from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
-from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
+from models.planner_graspnet import (
+    GraspNetDirectPlanner,
+    GraspNetFanPlanner,
+    GraspNetPlanner,
+)
 from utils.calibration import Calibration, load_calibrations
 from utils.depth_correction import corrected
 from utils.errors import UserError, unknown_choice
@@ -144,6 +148,7 @@ PLANNERS: dict[str, Callable[[GripperGeometry, Workspace, int], Any]] = {
     "random": RandomPlanner,
     "heuristic": HeuristicPlanner,
     "graspnet": GraspNetPlanner,
+    "graspnet_direct": GraspNetDirectPlanner,
     "oracle": OraclePlanner,
     "heuristic6d": HeuristicFanPlanner,
     "graspnet6d": GraspNetFanPlanner,

@@ -9,7 +9,10 @@ import torch
 
 from models.graspnet_io import SavedGraspNet
 from models.planner_graspnet import (
+    CROP_MARGIN,
+    GraspNetDirectPlanner,
     GraspNetPlanner,
+    around_matter,
     labelled_by_centres,
     quality_between,
     vote_centres,
@@ -28,11 +31,11 @@ TOUCHING = [((0.04, 0.03, 0.05), 0.0, (0.50, 0.015)), ((0.04, 0.03, 0.05), 0.0, 
 BOXES = [((0.04, 0.10, 0.05), np.deg2rad(25), (0.45, y)) for y in (-0.1, 0.1)]
 
 
-def plan(frame: RGBDFrame, network: torch.nn.Module):
+def plan(frame: RGBDFrame, network: torch.nn.Module, planner: type = GraspNetPlanner):
     # As many metres to a pixel as the frame has, so that no image is scaled.
     scale = float(np.median(frame.depth)) / frame.K[0, 0]
     saved = SavedGraspNet(network, scale, {}, {})
-    return GraspNetPlanner(GripperGeometry(), Workspace(), network=saved)(frame)
+    return planner(GripperGeometry(), Workspace(), network=saved)(frame)
 
 
 @pytest.mark.parametrize("chosen", [0, 1])
@@ -113,6 +116,66 @@ def test_two_objects_that_touch_are_not_grasped_as_one() -> None:
     assert abs(abs(found[0].position[1]) - 0.015) < 0.004
     for grasp in (g for g in found if g.quality > 0.3 * found[0].quality):
         assert np.rad2deg(angle_difference(grasp.angle, 0.0)) < 20, "along the line of contact"
+
+
+# --- The network's own peaks ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_without_a_search_the_peak_is_the_grasp(chosen: int) -> None:
+    """Where the network sees one grasp, there is no other, whatever else would fit."""
+    frame = boxes_frame(BOXES)
+    middle = np.array([*BOXES[chosen][2], 0.05])
+    seen = around_matter(frame, 0.0)
+    peak, _ = project(middle + [0.004, 0, 0], seen.K, seen.T_WC)
+    found = plan(frame, FixedMaps(peak, elsewhere=0.0), GraspNetDirectPlanner)
+    best = found[0]
+    assert all(abs(grasp.position[1] - middle[1]) < 0.05 for grasp in found)
+    # Centred between the faces and turned onto them, although the peak was beside the middle.
+    closing = np.array([np.cos(best.angle), np.sin(best.angle)])
+    assert abs((best.position[:2] - middle[:2]) @ closing) < 0.002
+    assert np.rad2deg(angle_difference(best.angle, np.deg2rad(25))) < 3
+    assert 0.04 < best.width <= 0.08
+
+
+def test_a_network_that_sees_no_grasp_plans_none_without_a_search() -> None:
+    frame = boxes_frame(BOXES)
+    assert plan(frame, FixedMaps(elsewhere=0.0, best=0.0), GraspNetDirectPlanner) == []
+
+
+def test_what_is_cut_off_is_table() -> None:
+    frame = boxes_frame(BOXES[:1])
+    part = around_matter(frame, 0.0)
+    shift = np.rint(frame.K[:2, 2] - part.K[:2, 2]).astype(int)
+    window = np.s_[
+        shift[1] : shift[1] + part.depth.shape[0], shift[0] : shift[0] + part.depth.shape[1]
+    ]
+    np.testing.assert_allclose(part.points(), frame.points()[window], atol=1e-9)
+    outside = np.ones(frame.depth.shape, bool)
+    outside[window] = False
+    assert np.abs(frame.points()[outside][:, 2]).max() < 1e-6
+    # The box, 4 cm x 10 cm and turned by 25 degrees, with a margin on all sides; its upper rim,
+    # 5 cm nearer to the camera, looks larger by a little.
+    c, s = np.cos(np.deg2rad(25)), np.sin(np.deg2rad(25))
+    sides = np.array([0.04 * c + 0.10 * s, 0.04 * s + 0.10 * c]) + 2 * CROP_MARGIN
+    across = np.ptp(part.points().reshape(-1, 3)[:, :2], axis=0)
+    np.testing.assert_allclose(across, sides, atol=0.015)
+
+
+def test_an_empty_table_stays_whole() -> None:
+    frame = boxes_frame([])
+    assert around_matter(frame, 0.0) is frame
+
+
+def test_what_was_not_measured_is_not_cut_off() -> None:
+    """A black box has no depth: it may stand there."""
+    frame = boxes_frame(BOXES)
+    depth = frame.depth.copy()
+    middle, _ = project(np.array([0.45, 0.1, 0.05]), frame.K, frame.T_WC)
+    u, v = np.rint(middle).astype(int)
+    depth[v - 10 : v + 10, u - 10 : u + 10] = 0
+    part = around_matter(replace(frame, depth=depth), 0.0)
+    assert part.depth.shape == around_matter(frame, 0.0).depth.shape
 
 
 # --- Votes for centres of mass -----------------------------------------------------------
