@@ -266,7 +266,9 @@ class NetworkView:
 
     def peaks(self, settings: PeakSettings) -> np.ndarray:
         """(N, 3) points in W of the surface at the peaks of the quality, the highest peak first."""
-        pixels = self._scaling.original_pixels(find_peaks(*self._maps[:3], settings).pixel)
+        quality, angle, width = self._maps[:3]
+        found = find_peaks(quality, angle, width, settings)
+        pixels = self._scaling.original_pixels(found.pixel)
         depth = surface_depth(self.frame.depth, pixels)
         points = deproject(pixels, depth, self.frame.K, self.frame.T_WC)
         return points[np.isfinite(depth)]
@@ -287,8 +289,8 @@ def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     left out is table. The whole frame where nothing does."""
     high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)  # unknown is 0
     # Single pixels are noise.
-    high = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    left, top, width, height = cv2.boundingRect(high)
+    pieces = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    left, top, width, height = cv2.boundingRect(pieces)
     if width == 0:
         return frame
     margin = reach_in_pixels(frame, CROP_MARGIN)
