@@ -2,7 +2,10 @@
 
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
 the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
-its planner raises an exception. A grasp that has just failed is not tried again while the planner
+its planner raises an exception. Where a scene has a target, the frames show its visible pixels, as a
+user's click or a segmenter would (the simulator gives them), `models.planner_target` moves aside
+what is in its way, and a round ends when the target is in the bin, or after as many grasps as there
+were objects. A grasp that has just failed is not tried again while the planner
 offers another one: often nothing has moved, and a deterministic planner would repeat itself.
 """
 
@@ -25,6 +28,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.objects import fits
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
+from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.errors import TargetLostError, one_line
 from utils.result_records import (
@@ -94,6 +98,9 @@ def run_round(
         for index, placed in enumerate(scene.placements)
         if not fits(placed.model, cell.gripper)
     }
+    wanted = scene.target
+    if wanted is not None:
+        plan = TargetPlanner(plan)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
@@ -103,6 +110,8 @@ def run_round(
             reset_planner(plan, scene.seed)
         while cell.remaining and len(failed) < max_failures:
             frame = calibrated(cell, calibration, cell.frame(privileged))
+            if wanted is not None:
+                frame = replace(frame, target=frame.segmentation == wanted)
             start = time.perf_counter()
             try:
                 with planner_errors(policy):
@@ -153,6 +162,13 @@ def run_round(
             stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
+            if wanted is not None:
+                if wanted not in cell.remaining:
+                    ended = "target" if outcome.success and held == wanted else "lost"
+                    break
+                if len(attempts) == len(scene.placements):
+                    ended = "picks"
+                    break
     except PlannerError as error:
         attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, 0.0, detail=str(error)))
         ended = PLANNER_ERROR
@@ -169,6 +185,7 @@ def run_round(
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
         cell.config.camera.depth_noise,
         None if chances is None else (chances.slope, chances.offset),
+        None if wanted is None else ended == "target",
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ from utils.height_map import (
     tilted_view,
     without_holes,
 )
+from utils.target import object_of_target, only_object, only_target
 from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
 
 Value = Callable[[HeightMap, Candidates], np.ndarray]
@@ -155,13 +156,16 @@ class HeuristicFanPlanner(FanPlanner):
     """The fan on the depth image alone."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        overhead = height_map_from_frame(frame, self.workspace)
+        overhead = only_target(self.heights(frame), frame)
         filled, hiding = without_holes(frame)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
         return self.search_fan(seen)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return height_map_from_frame(frame, self.workspace)
 
 
 class OracleFanPlanner(FanPlanner):
@@ -174,11 +178,21 @@ class OracleFanPlanner(FanPlanner):
     count = 20
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        overhead = self.heights(frame)
+        self._truth = truth = frame.truth
+        self._buried = buried_share(truth, overhead)
+        wanted = None if frame.target is None else object_of_target(overhead, frame)
+
+        def exact(T_WV: np.ndarray) -> HeightMap:
+            heights = height_map_from_scene(truth, self.workspace, T_WV=T_WV)
+            return heights if frame.target is None else only_object(heights, wanted)
+
+        return self.search_fan(exact)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
-        self._truth = truth = frame.truth
-        self._buried = buried_share(truth, height_map_from_scene(truth, self.workspace))
-        return self.search_fan(lambda T_WV: height_map_from_scene(truth, self.workspace, T_WV=T_WV))
+        return height_map_from_scene(frame.truth, self.workspace)
 
     def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
         found = found.distinct(self.count, 0.004, np.deg2rad(8))

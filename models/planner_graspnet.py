@@ -39,6 +39,7 @@ from utils.height_map import (
     without_holes,
 )
 from utils.images import PixelScaling
+from utils.target import only_target
 from utils.transforms import Grasp, RGBDFrame, deproject, project, transform_points
 
 
@@ -156,7 +157,11 @@ class GraspNetPlanner(SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
-        return self.grasps(self.search(seen.heights, partial(seen.value, seen.heights)))
+        heights = only_target(seen.heights, frame)
+        return self.grasps(self.search(heights, partial(seen.value, heights)))
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return NetworkView(self.network, frame, self.workspace).heights
 
 
 class GraspNetFanPlanner(FanPlanner):
@@ -175,12 +180,16 @@ class GraspNetFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
+        overhead = only_target(seen.heights, frame)
         filled, hiding = without_holes(seen.frame)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
-            return tilted_height_map(seen.heights, filled, hiding, T_WV)
+            return tilted_height_map(overhead, filled, hiding, T_WV)
 
         return self.search_fan(tilted, seen.value)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return NetworkView(self.network, frame, self.workspace).heights
 
 
 class NetworkView:
