@@ -85,8 +85,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     covering = " with one under others" if layout == "retrieve" else ""
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
-        f"inside the {config.workspace.size} m workspace{covering} in {_TRIES} tries; use smaller objects "
-        "(objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
+        f"inside the {config.workspace.size} m workspace{covering} in {_TRIES} tries; use smaller "
+        "objects (objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
 
 
@@ -107,7 +107,7 @@ def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:
 
 def _covered(placements: tuple[Placement, ...], config: Config) -> int | None:
     """The number of the object to retrieve: of those that the hand spans and that still show, the
-    one of which others cover the largest share, seen from above; None where they cover too little."""
+    one of which others cover the largest share, seen from above; None where that is too little."""
     bodies = tuple(
         SolidObject(
             tuple(solid.transformed(pose_matrix(one.position, one.quaternion))

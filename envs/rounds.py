@@ -2,11 +2,12 @@
 
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
 the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
-its planner raises an exception. Where a scene has a target, the frames show its visible pixels, as a
-user's click or a segmenter would (the simulator gives them), `models.planner_target` moves aside
-what is in its way, and a round ends when the target is in the bin, or after as many grasps as there
-were objects. A grasp that has just failed is not tried again while the planner
+its planner raises an exception. A grasp that has just failed is not tried again while the planner
 offers another one: often nothing has moved, and a deterministic planner would repeat itself.
+
+Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
+would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
+in its way, and the round ends when the target is in the bin, or after as many grasps as objects.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from utils.calibration import Calibration
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap
-from utils.target import only_target, pixel_labels
+from utils.target import pixel_labels
 from utils.transforms import Grasp, RGBDFrame, transform_points
 
 _NOWHERE = -1e3  # m, under everything
@@ -61,6 +61,11 @@ class SearchPlanner:
     ) -> Candidates:
         """Feasible candidates on a height map, best first; `value` as in `search`."""
         return search(heights, self.gripper, self.workspace, self.settings, value)
+
+    def return_at_least(self, count: int) -> None:
+        """Return up to `count` grasps, where the planner would return fewer."""
+        returned = max(count, self.settings.returned)
+        self.settings = replace(self.settings, returned=returned)
 
     def grasps(self, found: Candidates) -> list[Grasp]:
         """The best of the candidates as grasps, no two of them nearly alike."""

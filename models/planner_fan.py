@@ -85,6 +85,10 @@ class FanPlanner(SearchPlanner):
         self.fan = fan
         self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
 
+    def return_at_least(self, count: int) -> None:
+        super().return_at_least(count)
+        self.fan = replace(self.fan, returned=max(count, self.fan.returned))
+
     def search_fan(
         self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
     ) -> list[Grasp]:

@@ -1,9 +1,9 @@
 """One object among others: grasps of the target, or of what has to be moved aside first.
 
 `TargetPlanner` works on any planner that honours `RGBDFrame.target`. It asks for grasps of the
-target; where none is promising, for those of the neighbours, the one most in the way first. It knows
-the image and the planner's own segmentation only, and remembers where the target was last seen, so
-that it can uncover what is wholly hidden. This module knows no simulator and no arm.
+target; where none is promising, for those of the neighbours, the one most in the way first. It
+knows the image and the planner's own segmentation only, and remembers where the target was last
+seen, so that it can uncover what is wholly hidden. This module knows no simulator and no arm.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class ClearingSettings:
     """When to take the target, and what is in its way; metres unless said.
 
     promising: least chance of success with which the target is grasped while something else may be
-    moved aside. least: the same for a neighbour that is moved aside; worse grasps come last. near: a
-    neighbour's surface at this distance from the target, seen from above, counts exp(-1) of one
-    right beside it. over: height over the target at which it counts in full. beside: what a surface
-    counts that is not over the target. in_the_way: cm2 of such surface from which a neighbour is in
-    the way. points: of the target and of each neighbour that are looked at.
+    moved aside. least: the same for a neighbour that is moved aside; worse grasps come last.
+    near: a neighbour's surface at this distance from the target, seen from above, counts exp(-1) of
+    one right beside it. over: height over the target at which it counts in full. beside: what a
+    surface counts that is not over the target. in_the_way: cm2 of such surface from which a
+    neighbour is in the way. points: of the target and of each neighbour that are looked at.
     """
 
     promising: float = 0.8

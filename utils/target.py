@@ -8,6 +8,7 @@ planner and no file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -134,7 +135,7 @@ def pixel_labels(heights: HeightMap, frame: RGBDFrame) -> np.ndarray:
     return np.where(on_map, np.maximum(label, -1), -1).astype(np.int32)
 
 
-def target_at(labels: np.ndarray, frame: RGBDFrame, point: tuple[float, float]) -> np.ndarray:
+def target_at(labels: np.ndarray, frame: RGBDFrame, point: Sequence[float]) -> np.ndarray:
     """(H, W) bool: the pixels of the object on which a point (u, v) of the image lies.
 
     labels: (H, W) as of `pixel_labels`. Raises UserError where the point lies outside the image, on
@@ -147,11 +148,8 @@ def target_at(labels: np.ndarray, frame: RGBDFrame, point: tuple[float, float]) 
         raise UserError(f"{name}: outside the image of {width}x{height} pixels")
     label = labels[v, u]
     if label < 0 and not known_depth(frame.depth)[v, u]:
-        around = np.s_[
-            max(v - CLICK_REACH, 0) : v + CLICK_REACH + 1,
-            max(u - CLICK_REACH, 0) : u + CLICK_REACH + 1,
-        ]
-        near = labels[around][labels[around] >= 0]
+        near = labels[marked_pixels(labels.shape, (u, v), None, None)]
+        near = near[near >= 0]
         if len(near) == 0:
             raise UserError(
                 f"{name}: the depth is unknown there and around; choose a pixel of the object "
@@ -166,7 +164,7 @@ def target_at(labels: np.ndarray, frame: RGBDFrame, point: tuple[float, float]) 
     return labels == label
 
 
-def target_in_box(labels: np.ndarray, box: tuple[float, float, float, float]) -> np.ndarray:
+def target_in_box(labels: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """(H, W) bool: the pixels of the object that fills most of a box (u0, v0, u1, v1), its corners
     in any order: the one with most of its pixels inside, of those that fill at least a tenth of the
     raised pixels there. Raises UserError for a box that holds no object."""
@@ -174,10 +172,7 @@ def target_in_box(labels: np.ndarray, box: tuple[float, float, float, float]) ->
     height, width = labels.shape
     if not np.isfinite(box).all():
         raise UserError(f"{name}: expected pixels U0 V0 U1 V1")
-    (left, right), (top, bottom) = sorted(box[::2]), sorted(box[1::2])
-    rows = slice(max(int(np.ceil(top)), 0), max(int(np.floor(bottom)) + 1, 0))
-    columns = slice(max(int(np.ceil(left)), 0), max(int(np.floor(right)) + 1, 0))
-    within = labels[rows, columns]
+    within = labels[_within(box)]
     if within.size == 0:
         raise UserError(f"{name}: holds no pixel of the image of {width}x{height} pixels")
     inside = np.bincount(within[within >= 0], minlength=int(labels.max()) + 1)
@@ -190,23 +185,41 @@ def target_in_box(labels: np.ndarray, box: tuple[float, float, float, float]) ->
     return labels == best
 
 
-def check_target(target: np.ndarray, frame: RGBDFrame, workspace: Workspace, name: str) -> None:
-    """Raise UserError for a mask (H, W) that shows no object: it has another size than the image,
-    too few pixels, or nothing in the workspace above the table."""
-    if target.shape != frame.depth.shape:
-        sizes = (f"{w}x{h}" for h, w in (target.shape[:2], frame.depth.shape))
-        raise UserError(f"{name}: {next(sizes)} pixels, the image has {next(sizes)}")
-    if target.sum() < LEAST_PIXELS:
-        raise UserError(
-            f"{name}: {int(target.sum())} pixels of the target, expected {LEAST_PIXELS} at least"
-        )
+def check_target(target: np.ndarray, frame: RGBDFrame, workspace: Workspace) -> None:
+    """Raise UserError for a mask (H, W) in which next to nothing is above the table."""
     points = frame.points()[target]
     points = points[np.isfinite(points[:, 2])]
     if len(points) == 0:
-        raise UserError(f"{name}: the depth is unknown at all pixels of the target")
+        raise UserError("--mask: the depth is unknown at all pixels of the mask")
     beside = np.abs(points[:, :2] - workspace.centre).max(axis=1) > workspace.size / 2
     above = points[:, 2] > workspace.table_height + 0.004
     if (above & ~beside).sum() < LEAST_PIXELS:
         raise UserError(
-            f"{name}: shows only the table, or what is outside the workspace; choose an object"
+            "--mask: shows only the table, or what is outside the workspace; mark an object"
         )
+
+
+def marked_pixels(
+    shape: tuple[int, ...],
+    point: Sequence[float] | None,
+    box: Sequence[float] | None,
+    mask: np.ndarray | None,
+) -> np.ndarray | None:
+    """(H, W) bool, the pixels of an image of `shape` that a user has marked by a point, a box or a
+    mask; None without any."""
+    if point is not None:
+        u, v = point
+        box = u - CLICK_REACH, v - CLICK_REACH, u + CLICK_REACH, v + CLICK_REACH
+    if box is not None:
+        mask = np.zeros(shape, bool)
+        mask[_within(box)] = True
+    return mask
+
+
+def _within(box: Sequence[float]) -> tuple[slice, slice]:
+    """Rows and columns of a box (u0, v0, u1, v1), its corners in any order."""
+    columns, rows = (
+        slice(max(int(np.ceil(low)), 0), max(int(np.floor(high)) + 1, 0))
+        for low, high in (sorted(box[::2]), sorted(box[1::2]))
+    )
+    return rows, columns
