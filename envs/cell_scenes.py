@@ -32,6 +32,7 @@ from utils.transforms import pose_matrix
 
 # Their places are part of the scenes' seeds.
 LAYOUTS = ("isolated", "packed", "pile", "dense", "bin", "household", "retrieve")
+TARGET_LAYOUT = "retrieve"  # of whose objects one is wanted
 DENSE_COUNT, RETRIEVE_COUNT = 15, 8
 # Of the object to retrieve: what others cover of it, seen from above, and what shows of it.
 LEAST_COVERED, LEAST_SHOWN, LEAST_AREA = 0.2, 0.2, 2e-4  # shares, m2
@@ -79,10 +80,10 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
-            target = _covered(placements, config) if layout == "retrieve" else None
-            if layout != "retrieve" or target is not None:
+            target = _covered(placements, config) if layout == TARGET_LAYOUT else None
+            if layout != TARGET_LAYOUT or target is not None:
                 return Scene(layout, seed, placements, walls, target)
-    covering = " with one under others" if layout == "retrieve" else ""
+    covering = " with one under others" if layout == TARGET_LAYOUT else ""
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
         f"inside the {config.workspace.size} m workspace{covering} in {_TRIES} tries; use smaller "

@@ -45,6 +45,7 @@ from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
+ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
@@ -128,7 +129,10 @@ def run_round(
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0, detail=detail))
                 ended = NO_PLAN
                 break
-            grasp = no_deeper(first_untried(within_reach(cell, worth), failed), failed, stops)
+            reached: Iterable[Grasp] = within_reach(cell, worth)
+            if wanted is not None:
+                reached = elsewhere_first(reached, failed)
+            grasp = no_deeper(first_untried(reached, failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -277,6 +281,17 @@ def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp:
         if not any(_alike(grasp, other) for other in failed):
             return grasp
     return first
+
+
+def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Grasp]:
+    """The grasps in their order, but first those that are more likely to succeed than not and lie
+    ANOTHER from all that failed."""
+
+    def is_near(grasp: Grasp) -> bool:
+        gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
+        return grasp.quality < 0.5 or min(gaps, default=np.inf) < ANOTHER
+
+    return sorted(grasps, key=is_near)
 
 
 def _alike(grasp: Grasp, other: Grasp) -> bool:

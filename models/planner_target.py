@@ -115,12 +115,14 @@ class TargetPlanner:
         return [pixels for weight, pixels in found if weight > settings.in_the_way]
 
 
-def check_takes_targets(plan: Planner, name: str = "the planner") -> None:
-    """Raise UserError for a planner that does not honour `RGBDFrame.target`."""
+def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "do that") -> None:
+    """Raise UserError for a planner that does not honour `RGBDFrame.target`. name, task: of the
+    planner, and what it should do; for the error."""
     if not takes_targets(plan):
         raise UserError(
-            f"{name} cannot grasp one object among others: it has no method segments(frame) "
-            "(docs/planner.md); heuristic, graspnet, oracle and their 6d variants can"
+            f"{name} does not tell objects apart (it has no method segments(frame), see "
+            f"docs/planner.md), so that it cannot {task}; heuristic, graspnet, oracle and their 6d "
+            "variants can"
         )
 
 

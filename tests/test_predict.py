@@ -27,22 +27,22 @@ from tests.helpers.hand_made import (
     hand_made_backbone,
 )
 from utils.errors import UserError
-from utils.image_overlay import is_prediction_panel, prediction_panel
+from utils.image_overlay import grasp_picture, is_grasp_picture
 from utils.transforms import RGBDFrame, look_at, transform_points
 
-PICTURE = predict.picture
+PICTURE = predict.grasp_picture
 
 
 @pytest.fixture(scope="module")
 def panel() -> bytes:
-    maps = np.zeros((3, 32, 32), np.float32)
-    return prediction_panel(np.zeros((32, 32, 3), np.uint8), np.eye(3), [], *maps, 0.08)
+    black = np.zeros((32, 32, 3), np.uint8)
+    return grasp_picture(RGBDFrame(black, np.ones((32, 32)), np.eye(3), np.eye(4)), [], [])
 
 
 @pytest.fixture(autouse=True)
 def quick_picture(monkeypatch, panel):
     """One picture for all: drawing takes longer than predicting."""
-    monkeypatch.setattr(predict, "picture", lambda *_: panel)
+    monkeypatch.setattr(predict, "grasp_picture", lambda *_: panel)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -98,7 +98,7 @@ class UserFiles:
         assert predict.main(self.command(**changes)) == 0
         printed = json.loads(capsys.readouterr().out)
         assert printed == json.loads((self.folder / "out" / "grasps.json").read_text())
-        assert is_prediction_panel(self.folder / "out" / "grasps.png")
+        assert is_grasp_picture(self.folder / "out" / "grasps.png")
         return printed
 
 
@@ -111,7 +111,7 @@ def by_row(grasps: list[dict]) -> list[dict]:
 
 
 def test_frames_of_the_output_agree(files, capsys, monkeypatch, panel):
-    monkeypatch.setattr(predict, "picture", PICTURE)
+    monkeypatch.setattr(predict, "grasp_picture", PICTURE)
     found = files.run(capsys)
     assert (files.folder / "out" / "grasps.png").read_bytes() != panel
     assert found["format"] == predict.FORMAT and len(found["grasps"]) == len(CUBES)
