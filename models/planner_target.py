@@ -24,26 +24,27 @@ from utils.transforms import Grasp, RGBDFrame
 class ClearingSettings:
     """When to take the target, and what is in its way; metres unless said.
 
-    promising: least chance of success with which the target is grasped while something else may be
-    moved aside. least: the same for a neighbour that is moved aside; worse grasps come last.
-    near: a neighbour's surface at this distance from the target, seen from above, counts exp(-1) of
-    one right beside it. over: height over the target at which it counts in full. beside: what a
-    surface counts that is not over the target. in_the_way: cm2 of such surface from which a
-    neighbour is in the way. points: of the target and of each neighbour that are looked at.
+    promising: least chance of success with which the target, or what is in its way, is grasped
+    while there is an alternative. near: a surface at this distance from the target, seen from
+    above, counts exp(-1) of one right beside it. over: height over the target at which it counts in
+    full. beside: what a surface counts that is not over the target. in_the_way: cm2 of such surface
+    from which an object is in the way. points: of each object that are looked at. enough: objects
+    with promising grasps after which the search for others ends; one more than is needed, for the
+    case that a grasp fails.
     """
 
     promising: float = 0.8
-    least: float = 0.5
     near: float = 0.02
     over: float = 0.02
     beside: float = 0.2
     in_the_way: float = 0.5
     points: int = 2000
+    enough: int = 2
 
 
 class TargetPlanner:
     """A planner whose grasps of the target come first, or, where none is promising, those that
-    move its neighbours aside; best first, so that qualities need not fall.
+    move aside what is in its way; best first, so that qualities need not fall.
 
     plan: honours targets. Frames carry the target's visible pixels (`RGBDFrame.target`), none where
     it is hidden. Raises UserError for a planner that cannot tell objects apart.
@@ -64,55 +65,85 @@ class TargetPlanner:
         if frame.target is None:
             return self.plan(frame)
         grasps = self.plan(frame) if frame.target.any() else []
-        if grasps and grasps[0].quality >= self.settings.promising:
+        if self._promising(grasps):
             return grasps
-        clearing = self.clearing(frame)
-        useful = [grasp for grasp in clearing if grasp.quality >= self.settings.least]
-        return useful + sorted(
-            [*grasps, *(grasp for grasp in clearing if grasp.quality < self.settings.least)],
-            key=lambda grasp: -grasp.quality,
-        )
+        clearing, least = self.clearing(frame), self.settings.promising
+        first = [grasp for grasp in clearing if grasp.quality >= least]
+        rest = [grasp for grasp in (*grasps, *clearing) if grasp.quality < least]
+        return [*first, *sorted(rest, key=lambda grasp: -grasp.quality)]
 
     def clearing(self, frame: RGBDFrame) -> list[Grasp]:
-        """Grasps of the objects in the target's way, those of the object most in the way first."""
-        found = []
-        for pixels in self.neighbours(frame):
-            found += self.plan(replace(frame, target=pixels))
-        return found
-
-    def neighbours(self, frame: RGBDFrame) -> list[np.ndarray]:
-        """(H, W) bool of each object that is in the target's way, the one most in the way first.
-
-        An object is in the way by its surface near the target and over it, seen from above; over
-        the place where the target was last seen, where no pixel shows it now.
-        """
-        assert frame.target is not None
-        settings, points = self.settings, frame.points()
-        known = np.isfinite(points[..., 2])
-        if (frame.target & known).any():
-            self._last = _thinned(points[frame.target & known], settings.points)
-        if len(self._last) == 0:
-            return []
+        """Grasps of what is in the target's way, of the object most in the way first; where none of
+        them is promising, of what is in the way of these objects, and so on."""
         segments = self.plan.segments(frame)  # type: ignore[attr-defined]
-        labels = np.where(frame.target, -1, segments)
-        tree = cKDTree(self._last[:, :2])
-        # What a pixel shows of the scene, cm2, with the depth along the axis for the distance.
-        area = 1e4 * frame.depth**2 / (frame.K[0, 0] * frame.K[1, 1])
-        found = []
-        for label in np.unique(labels[labels >= 0]):
-            pixels = labels == label
-            row, column = np.nonzero(pixels & known)
-            if len(row) < (1 - MOSTLY) * (segments == label).sum():
-                continue  # the rim of the target, or nothing known
-            step = -(-len(row) // settings.points)
+        objects = _Objects(frame, segments, self.settings)
+        shown = objects.surface(frame.target)
+        if len(shown):
+            self._last = shown
+        ring, visited, promising, others = [self._last], set(), [], []
+        while ring and not promising:
+            numbers = dict.fromkeys(n for place in ring for n in objects.in_the_way(place))
+            ring = []
+            for number in numbers:
+                if number in visited or len(promising) == self.settings.enough:
+                    continue
+                visited.add(number)
+                pixels = objects.labels == number
+                ring.append(objects.surface(pixels))
+                grasps = self.plan(replace(frame, target=pixels))
+                (promising if self._promising(grasps) else others).append(grasps)
+        return [grasp for grasps in [*promising, *others] for grasp in grasps]
+
+    def _promising(self, grasps: list[Grasp]) -> bool:
+        return bool(grasps) and grasps[0].quality >= self.settings.promising
+
+
+class _Objects:
+    """The objects of a frame but the target, as a planner tells them apart.
+
+    labels: (H, W) numbers of the objects, -1 elsewhere.
+    """
+
+    def __init__(self, frame: RGBDFrame, segments: np.ndarray, settings: ClearingSettings):
+        assert frame.target is not None
+        self.settings = settings
+        self.labels = np.where(frame.target, -1, segments)
+        self._points = frame.points()
+        self._known = np.isfinite(self._points[..., 2])
+        # What a pixel shows of the scene, cm2.
+        self._area = 1e4 * frame.depth**2 / (frame.K[0, 0] * frame.K[1, 1])
+        numbers, counts = np.unique(self.labels[self.labels >= 0], return_counts=True)
+        whole = np.bincount(segments[segments >= 0], minlength=1)
+        # The rim of the target is none of the others.
+        self.numbers = [
+            int(number)
+            for number, count in zip(numbers, counts)
+            if count >= (1 - MOSTLY) * whole[number]
+        ]
+
+    def surface(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) points in W that some pixels (H, W) show, at most `points`, evenly."""
+        points = self._points[pixels & self._known]
+        return points[:: max(1, -(-len(points) // self.settings.points))]
+
+    def in_the_way(self, place: np.ndarray) -> list[int]:
+        """The objects in the way of a hand that goes to a surface (N, 3), which may be hidden now:
+        those with enough surface near it and over it, seen from above; the one with most first."""
+        if len(place) == 0:
+            return []
+        tree, settings, found = cKDTree(place[:, :2]), self.settings, []
+        for number in self.numbers:
+            row, column = np.nonzero((self.labels == number) & self._known)
+            step = max(1, -(-len(row) // settings.points))
             row, column = row[::step], column[::step]
-            surface = points[row, column]
+            surface = self._points[row, column]
             apart, nearest = tree.query(surface[:, :2])
-            over = np.clip((surface[:, 2] - self._last[nearest, 2]) / settings.over, 0, 1)
+            over = np.clip((surface[:, 2] - place[nearest, 2]) / settings.over, 0, 1)
             weight = np.exp(-apart / settings.near) * np.maximum(over, settings.beside)
-            found.append((step * float((weight * area[row, column]).sum()), pixels))
-        found.sort(key=lambda pair: -pair[0])
-        return [pixels for weight, pixels in found if weight > settings.in_the_way]
+            weight = step * float((weight * self._area[row, column]).sum())
+            if weight > settings.in_the_way:
+                found.append((weight, number))
+        return [number for _, number in sorted(found, key=lambda pair: -pair[0])]
 
 
 def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "do that") -> None:
@@ -124,8 +155,3 @@ def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "d
             f"docs/planner.md), so that it cannot {task}; heuristic, graspnet, oracle and their 6d "
             "variants can"
         )
-
-
-def _thinned(points: np.ndarray, count: int) -> np.ndarray:
-    """About `count` of points (N, 3), evenly."""
-    return points[:: -(-len(points) // count)]

@@ -54,8 +54,8 @@ def workspace_of(
     size = float((high - low).max())
     if size <= LARGEST:
         return Workspace(_pair((low + high) / 2), max(size, SMALLEST), table_height), []
-    within = np.maximum(low + LARGEST / 2, high - LARGEST / 2)
-    centre = np.clip(middle, np.minimum(low + LARGEST / 2, within), within)
+    inwards = np.minimum(np.maximum(middle, low + LARGEST / 2), high - LARGEST / 2)
+    centre = np.where(high - low < LARGEST, (low + high) / 2, inwards)
     remark = (
         f"what is above the table is spread over {size:.1f} m, so that only the square of "
         f"{LARGEST:g} m {place} was searched; give --workspace or crop the image"
