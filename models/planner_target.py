@@ -28,16 +28,19 @@ class ClearingSettings:
     while there is an alternative. near: a surface at this distance from the target, seen from
     above, counts exp(-1) of one right beside it. over: height over the target at which it counts in
     full. beside: what a surface counts that is not over the target. in_the_way: cm2 of such surface
-    from which an object is in the way. points: of each object that are looked at. enough: objects
-    with promising grasps after which the search for others ends; one more than is needed, for the
-    case that a grasp fails.
+    from which an object is in the way. covering: cm2 of surface over the target and half as near,
+    from which an object may rest on it, so that it goes first even where the target's grasps look
+    promising. points: of each object that are looked at. enough: objects with promising grasps
+    after which the search for others ends; one more than is needed, for the case that a grasp
+    fails.
     """
 
-    promising: float = 0.8
+    promising: float = 0.9
     near: float = 0.02
     over: float = 0.02
     beside: float = 0.2
     in_the_way: float = 0.5
+    covering: float = 3.0
     points: int = 2000
     enough: int = 2
 
@@ -64,35 +67,52 @@ class TargetPlanner:
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if frame.target is None:
             return self.plan(frame)
-        grasps = self.plan(frame) if frame.target.any() else []
-        if self._promising(grasps):
-            return grasps
-        clearing, least = self.clearing(frame), self.settings.promising
-        first = [grasp for grasp in clearing if grasp.quality >= least]
-        rest = [grasp for grasp in (*grasps, *clearing) if grasp.quality < least]
-        return [*first, *sorted(rest, key=lambda grasp: -grasp.quality)]
-
-    def clearing(self, frame: RGBDFrame) -> list[Grasp]:
-        """Grasps of what is in the target's way, of the object most in the way first; where none of
-        them is promising, of what is in the way of these objects, and so on."""
-        segments = self.plan.segments(frame)  # type: ignore[attr-defined]
-        objects = _Objects(frame, segments, self.settings)
+        objects = _Objects(frame, self.plan.segments(frame), self.settings)  # type: ignore[attr-defined]
         shown = objects.surface(frame.target)
         if len(shown):
             self._last = shown
-        ring, visited, promising, others = [self._last], set(), [], []
-        while ring and not promising:
-            numbers = dict.fromkeys(n for place in ring for n in objects.in_the_way(place))
-            ring = []
-            for number in numbers:
-                if number in visited or len(promising) == self.settings.enough:
-                    continue
-                visited.add(number)
-                pixels = objects.labels == number
-                ring.append(objects.surface(pixels))
-                grasps = self.plan(replace(frame, target=pixels))
-                (promising if self._promising(grasps) else others).append(grasps)
-        return [grasp for grasps in [*promising, *others] for grasp in grasps]
+        grasps = self.plan(frame) if frame.target.any() else []
+        if self._promising(grasps):
+            covering, _ = self._grasps_of(objects, objects.covering(self._last))
+            return [*covering, *grasps]
+        clearing, others = self._clearing(objects)
+        rest = sorted([*grasps, *others], key=lambda grasp: -grasp.quality)
+        return [*clearing, *rest]
+
+    def clearing(self, frame: RGBDFrame) -> list[Grasp]:
+        """Grasps that move aside what is in the way of the target, best first."""
+        objects = _Objects(frame, self.plan.segments(frame), self.settings)  # type: ignore[attr-defined]
+        self._last = objects.surface(frame.target)
+        promising, others = self._clearing(objects)
+        return [*promising, *sorted(others, key=lambda grasp: -grasp.quality)]
+
+    def _clearing(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
+        """Promising grasps and others of what is in the target's way, of the object most in the way
+        first; where none is promising, of what is in the way of these objects, and so on."""
+        ring, visited, others = [self._last], set(), []
+        while ring:
+            found = dict.fromkeys(n for place in ring for n in objects.in_the_way(place))
+            numbers = [number for number in found if number not in visited]
+            promising, more = self._grasps_of(objects, numbers)
+            others += more
+            if promising:
+                return promising, others
+            visited.update(numbers)
+            ring = [objects.surface(objects.labels == number) for number in numbers]
+        return [], others
+
+    def _grasps_of(self, objects: _Objects, numbers: list[int]) -> tuple[list[Grasp], list[Grasp]]:
+        """Promising grasps of objects, in their order, and the other ones."""
+        promising, others, enough = [], [], self.settings.enough
+        for number in numbers:
+            found = self.plan(replace(objects.frame, target=objects.labels == number))
+            least = self.settings.promising
+            promising += [grasp for grasp in found if grasp.quality >= least]
+            others += [grasp for grasp in found if grasp.quality < least]
+            enough -= self._promising(found)
+            if enough == 0:
+                break
+        return promising, others
 
     def _promising(self, grasps: list[Grasp]) -> bool:
         return bool(grasps) and grasps[0].quality >= self.settings.promising
@@ -106,7 +126,7 @@ class _Objects:
 
     def __init__(self, frame: RGBDFrame, segments: np.ndarray, settings: ClearingSettings):
         assert frame.target is not None
-        self.settings = settings
+        self.frame, self.settings = frame, settings
         self.labels = np.where(frame.target, -1, segments)
         self._points = frame.points()
         self._known = np.isfinite(self._points[..., 2])
@@ -129,6 +149,14 @@ class _Objects:
     def in_the_way(self, place: np.ndarray) -> list[int]:
         """The objects in the way of a hand that goes to a surface (N, 3), which may be hidden now:
         those with enough surface near it and over it, seen from above; the one with most first."""
+        settings = self.settings
+        return self._around(place, settings.near, settings.beside, settings.in_the_way)
+
+    def covering(self, place: np.ndarray) -> list[int]:
+        """The objects that may rest on what has a surface (N, 3)."""
+        return self._around(place, self.settings.near / 2, 0.0, self.settings.covering)
+
+    def _around(self, place: np.ndarray, near: float, beside: float, least: float) -> list[int]:
         if len(place) == 0:
             return []
         tree, settings, found = cKDTree(place[:, :2]), self.settings, []
@@ -139,10 +167,9 @@ class _Objects:
             surface = self._points[row, column]
             apart, nearest = tree.query(surface[:, :2])
             over = np.clip((surface[:, 2] - place[nearest, 2]) / settings.over, 0, 1)
-            weight = np.exp(-apart / settings.near) * np.maximum(over, settings.beside)
-            weight = step * float((weight * self._area[row, column]).sum())
-            if weight > settings.in_the_way:
-                found.append((weight, number))
+            weight = np.exp(-apart / near) * np.maximum(over, beside) * self._area[row, column]
+            if step * float(weight.sum()) > least:
+                found.append((step * float(weight.sum()), number))
         return [number for _, number in sorted(found, key=lambda pair: -pair[0])]
 
 
