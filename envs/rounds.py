@@ -105,6 +105,7 @@ def run_round(
         plan = TargetPlanner(plan)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
+    missed: list[Grasp] = []  # in the round
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
     plan_seconds, ended = 0.0, "cleared"
     try:
@@ -113,6 +114,7 @@ def run_round(
         while cell.remaining and len(failed) < max_failures:
             frame = calibrated(cell, calibration, cell.frame(privileged))
             if wanted is not None:
+                assert frame.segmentation is not None  # a cell's frames have it
                 frame = replace(frame, target=frame.segmentation == wanted)
             start = time.perf_counter()
             try:
@@ -131,7 +133,7 @@ def run_round(
                 break
             reached: Iterable[Grasp] = within_reach(cell, worth)
             if wanted is not None:
-                reached = elsewhere_first(reached, failed)
+                reached = elsewhere_first(reached, missed)
             grasp = no_deeper(first_untried(reached, failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
@@ -164,6 +166,7 @@ def run_round(
                 )
             )
             failed = [] if outcome.success else [*failed, grasp]
+            missed += [] if outcome.success else [grasp]
             stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
@@ -289,7 +292,7 @@ def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Gr
 
     def is_near(grasp: Grasp) -> bool:
         gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
-        return grasp.quality < 0.5 or min(gaps, default=np.inf) < ANOTHER
+        return grasp.quality < 0.5 or bool(min(gaps, default=np.inf) < ANOTHER)
 
     return sorted(grasps, key=is_near)
 

@@ -182,8 +182,9 @@ class OracleFanPlanner(FanPlanner):
     count = 20
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        overhead = self.heights(frame)
-        self._truth = truth = frame.truth
+        overhead, truth = self.heights(frame), frame.truth
+        assert truth is not None  # `heights` needs it
+        self._truth = truth
         self._buried = buried_share(truth, overhead)
         wanted = None if frame.target is None else object_of_target(overhead, frame)
 

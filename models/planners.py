@@ -135,15 +135,16 @@ class OraclePlanner(SearchPlanner):
         self.judged = judged
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        heights = self.heights(frame)
+        heights, truth = self.heights(frame), frame.truth
+        assert truth is not None  # `heights` needs it
         aimed = heights
         if frame.target is not None:
             aimed = only_object(heights, object_of_target(heights, frame))
         found = self.search(aimed).distinct(self.judged, 0.004, np.deg2rad(8))
         if len(found) == 0:
             return []
-        quality = exact_quality(found, frame.truth, self.gripper)
-        buried = buried_share(frame.truth, heights)
+        quality = exact_quality(found, truth, self.gripper)
+        buried = buried_share(truth, heights)
         # Antipodal grasps come first; where there is none, the height map's score ranks the rest.
         found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
         return self.grasps(found.best(len(found)))
