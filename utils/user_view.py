@@ -21,8 +21,8 @@ SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to
 MARGIN = 0.02  # m around what stands on the table
 _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
 
-# The planners were trained straight above and measured 45 degrees off the vertical, too; beyond
-# MOST_OBLIQUE the camera sees mostly flanks, and the tops of what stands behind hide.
+# The network has learned from above, and planners are measured up to 45 degrees off the vertical
+# (docs/six_dof.md). At 70 degrees an object hides the table behind it for 2.7 times its height.
 OBLIQUE, MOST_OBLIQUE = 45.0, 70.0  # degrees
 MANY_UNSEEN, MOST_UNSEEN = 0.25, 0.5  # shares of the workspace's pixels whose depth is unknown
 
@@ -88,7 +88,7 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
     if tilt > OBLIQUE:
         remarks.append(
             f"the camera looks {tilt:.0f} degrees off the table's normal; planners are measured up "
-            f"to {OBLIQUE:g}, and fail more often beyond"
+            f"to {OBLIQUE:g} degrees alone"
         )
     unseen = unseen_share(frame, workspace)
     if unseen > MOST_UNSEEN:
