@@ -19,7 +19,7 @@ planner works on the square of the table that holds all matter above it, or on -
 its centre and side in the world. One object is named by a pixel on it (--point U V), by a box
 around it (--box U0 V0 U1 V1, the object that fills most of it), or by its pixels (--mask FILE, a
 PNG or NPY of the image's size, not 0 where the object is). Then all grasps are of that object, and
-`clearing` holds grasps that move aside what is in its way.
+`clearing` holds grasps that first move aside what is in its way, if anything is.
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
 the table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture
@@ -52,7 +52,7 @@ from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
-from models.planner_target import TargetPlanner
+from models.planner_target import TargetPlanner, check_reached
 from models.planners import make_planner
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
@@ -69,7 +69,7 @@ from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read
 from utils.runs import run_script, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
-from utils.transforms import Grasp, RGBDFrame
+from utils.transforms import RGBDFrame
 from utils.user_view import check_view, given_workspace, workspace_of
 
 NETWORK_PLANNERS = {"graspnet": GraspNetPlanner, "graspnet6d": GraspNetFanPlanner}
@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     grasps, clearing = planner(frame)[: options.count], None
     if frame.target is not None:
-        clearing = TargetPlanner(planner).clearing(frame)[: options.count]
+        clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
         remarks += check_reached(grasps, clearing)
     posed, given = options.camera_pose is not None, options.checkpoint
     network = options.planner.startswith("graspnet")
@@ -238,19 +238,6 @@ def find_target(
     if options.box is not None:
         return target_in_box(planner.segments(frame), options.box)
     return None
-
-
-def check_reached(grasps: Sequence[Grasp], clearing: Sequence[Grasp]) -> list[str]:
-    """A remark on a target that is not free yet. Raises UserError for one that no grasp reaches,
-    and in whose way nothing lies that could be moved."""
-    if grasps:
-        return []
-    if not clearing:
-        raise UserError(
-            "no grasp reaches the target, and nothing beside it can be moved aside; try another "
-            "view or --planner graspnet6d, whose hand comes from any side"
-        )
-    return ["no grasp reaches the target yet; `clearing` moves aside what is in its way"]
 
 
 if __name__ == "__main__":

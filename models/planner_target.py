@@ -8,6 +8,7 @@ seen, so that it can uncover what is wholly hidden. This module knows no simulat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,22 +68,22 @@ class TargetPlanner:
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if frame.target is None:
             return self.plan(frame)
-        objects = _Objects(frame, self.plan.segments(frame), self.settings)  # type: ignore[attr-defined]
-        shown = objects.surface(frame.target)
+        grasps = self.plan(frame) if frame.target.any() else []
+        clearing, least = self.clearing(frame, grasps), self.settings.promising
+        first = [grasp for grasp in clearing if grasp.quality >= least]
+        others = [grasp for grasp in clearing if grasp.quality < least]
+        return [*first, *sorted([*grasps, *others], key=lambda grasp: -grasp.quality)]
+
+    def clearing(self, frame: RGBDFrame, grasps: list[Grasp]) -> list[Grasp]:
+        """Grasps that move aside what is in the way of the target, the promising ones of the object
+        most in the way first; where its own `grasps` are promising, only of what may rest on it."""
+        segments = self.plan.segments(frame)  # type: ignore[attr-defined]
+        objects = _Objects(frame, segments, self.settings)
+        shown = objects.surface(objects.target)
         if len(shown):
             self._last = shown
-        grasps = self.plan(frame) if frame.target.any() else []
         if self._promising(grasps):
-            covering, _ = self._grasps_of(objects, objects.covering(self._last))
-            return [*covering, *grasps]
-        clearing, others = self._clearing(objects)
-        rest = sorted([*grasps, *others], key=lambda grasp: -grasp.quality)
-        return [*clearing, *rest]
-
-    def clearing(self, frame: RGBDFrame) -> list[Grasp]:
-        """Grasps that move aside what is in the way of the target, best first."""
-        objects = _Objects(frame, self.plan.segments(frame), self.settings)  # type: ignore[attr-defined]
-        self._last = objects.surface(frame.target)
+            return self._grasps_of(objects, objects.covering(self._last))[0]
         promising, others = self._clearing(objects)
         return [*promising, *sorted(others, key=lambda grasp: -grasp.quality)]
 
@@ -127,6 +128,7 @@ class _Objects:
     def __init__(self, frame: RGBDFrame, segments: np.ndarray, settings: ClearingSettings):
         assert frame.target is not None
         self.frame, self.settings = frame, settings
+        self.target = frame.target
         self.labels = np.where(frame.target, -1, segments)
         self._points = frame.points()
         self._known = np.isfinite(self._points[..., 2])
@@ -182,3 +184,20 @@ def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "d
             f"docs/planner.md), so that it cannot {task}; heuristic, graspnet, oracle and their 6d "
             "variants can"
         )
+
+
+def check_reached(grasps: Sequence[Grasp], clearing: Sequence[Grasp]) -> list[str]:
+    """A remark on a target that is not free yet. Raises UserError for one that no grasp reaches,
+    and in whose way nothing lies that could be moved."""
+    if grasps and clearing:
+        return [
+            "something is in the target's way or may rest on it: `clearing` moves it aside first"
+        ]
+    if grasps:
+        return []
+    if not clearing:
+        raise UserError(
+            "no grasp reaches the target, and nothing beside it can be moved aside; try another "
+            "view or --planner graspnet6d, whose hand comes from any side"
+        )
+    return ["no grasp reaches the target yet; `clearing` moves aside what is in its way"]
