@@ -1,8 +1,9 @@
-"""Ranked grasps for your own RGB-D image.
+"""Ranked grasps for your own RGB-D image, of all that it shows or of one object.
 
     python predict.py --rgb rgb.png --depth depth.png --intrinsics 615 615 320 240
     python predict.py ... --intrinsics intrinsics.json      # {"fx": 615, "fy": 615, "cx": 320, ...}
     python predict.py ... --camera-pose T_WC.txt --table-height 0.02    # grasps in your world, too
+    python predict.py ... --point 312 200                   # grasp that one
     python predict.py --export graspnet.onnx                            # the network for ONNX
 
 --depth is a PNG, TIFF or NPY file of the colour image's size. Whole numbers are millimetres, floats
@@ -12,15 +13,24 @@ pixel centres, or a JSON file with these keys (and width and height, which are c
 .yaml: it takes a point in the camera's optical frame (x right, y down, z forward) to the world,
 whose z is up.
 
+The grasps are those of a planner (docs/planner.md): --planner graspnet, heuristic, or graspnet6d
+and heuristic6d, whose hand comes from any side. --checkpoint takes a network of your own. The
+planner works on the square of the table that holds all matter above it, or on --workspace X Y SIZE,
+its centre and side in the world. One object is named by a pixel on it (--point U V), by a box
+around it (--box U0 V0 U1 V1, the object that fills most of it), or by its pixels (--mask FILE, a
+PNG or NPY of the image's size, not 0 where the object is). Then all grasps are of that object, and
+`clearing` holds grasps that first move aside what is in its way, if anything is.
+
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
-the gripper descends along that plane's normal. The program prints JSON, and writes it to
-OUT/grasps.json with a picture in OUT/grasps.png; OUT is runs/predict/<name of the image>, with a
-number where another image of that name was first. Each grasp has `pixel` (u, v) and `image_angle`
-(from right towards down) on the image, `width` between the finger pads, and in `camera` and `world`
-the pose of the middle between the pads, 7.2 mm above the lowest point of the fingertips: z along
-the approach, y along the closing line. `quality` is the network's own score, and not a chance of
-success, as planners state it (docs/planner.md). Units are metres and radians; quaternions are x, y,
-z, w. If there is nothing to grasp the list is empty. Bad input ends with one sentence and status 2.
+the table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture
+in OUT/grasps.png; OUT is runs/predict/<name of the image>, with a number where another image of
+that name was first. Each grasp has `pixel` (u, v) and `image_angle` (from right towards down),
+where its position and closing line lie on the image, `width` between the finger pads, `tilt` of the
+approach from the table's normal, and in `camera` and `world` the pose of the middle between the
+pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
+line. `quality` is the chance of success where `calibrated` is true, and else the planner's score.
+Units are metres and radians; quaternions are x, y, z, w. If there is nothing to grasp the list is
+empty. `remarks` say what to mistrust. Bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations
@@ -29,33 +39,46 @@ import utils.installation  # noqa: F401 - ends in one sentence where a package i
 
 # isort: split
 import argparse
-import itertools
 import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from models.graspnet import check_rgbd
-from models.graspnet_inference import PredictedGrasp, Prediction, predict, training_scale
+from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
-from utils.errors import UserError
-from utils.image_overlay import is_prediction_panel, prediction_panel
-from utils.images import read_depth, read_intrinsics, read_pose, read_rgb
+from models.planner_antipodal import SearchPlanner
+from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
+from models.planner_target import TargetPlanner, check_reached
+from models.planners import make_planner
+from utils.errors import UserError, unknown_choice
+from utils.geometry import GripperGeometry, Workspace
+from utils.grasp_files import (
+    FORMAT,
+    VERSION,
+    check_output,
+    free_folder,
+    grasps_as_plain,
+    scene_as_plain,
+)
+from utils.image_overlay import grasp_picture
+from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
 from utils.runs import run_script, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
-from utils.transforms import RGBDFrame, inverse_pose, position_quaternion
+from utils.target import check_target, marked_pixels, target_at, target_in_box
+from utils.transforms import RGBDFrame
+from utils.user_view import check_view, given_workspace, workspace_of
 
-FORMAT = "robot-grasping grasps"  # marks a grasps.json of this program
-VERSION = 1
+NETWORK_PLANNERS = {"graspnet": GraspNetPlanner, "graspnet6d": GraspNetFanPlanner}
+PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = parse_options(argv)
-    saved = load_graspnet(options.checkpoint)
+    saved = load_graspnet(options.checkpoint or SHIPPED)
     if options.export is not None:
         from models.graspnet_io import export_onnx  # nothing else needs ONNX
 
@@ -66,18 +89,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = options.out or free_folder(Path("runs/predict") / options.rgb.stem, options.rgb)
     check_output(out)
     image = read_image(options)
+    options.mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame = replace(image, T_WC=table.T_WC)
-    found = predict(
-        saved.model, saved.metres_per_pixel, frame, table.height, saved.gripper, options.count
-    )
+    workspace, remarks = locate_workspace(frame, table, options)
+    remarks += check_view(frame, workspace)
+    planner = new_planner(options, saved, workspace)
+    frame = replace(frame, target=find_target(planner, frame, options))
 
-    text = json.dumps(as_plain(found, frame, table, options), indent=2, allow_nan=False)
-    write_atomic(out / "grasps.png", picture(found, frame, saved))
+    grasps, clearing = planner(frame)[: options.count], None
+    if frame.target is not None:
+        clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
+        remarks += check_reached(grasps, clearing)
+    posed, given = options.camera_pose is not None, options.checkpoint
+    network = options.planner.startswith("graspnet")
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "rgb": str(options.rgb),
+        "depth": str(options.depth),
+        "planner": options.planner,
+        "checkpoint": str(given or SHIPPED) if network else None,
+        "calibrated": planner.calibration is not None,
+        **scene_as_plain(frame, table, workspace, posed),
+        "grasps": grasps_as_plain(grasps, frame, posed),
+        "clearing": None if clearing is None else grasps_as_plain(clearing, frame, posed),
+        "remarks": remarks,
+    }
+    text = json.dumps(content, indent=2, allow_nan=False)
+    write_atomic(out / "grasps.png", grasp_picture(frame, grasps, clearing or []))
     write_atomic(out / "grasps.json", text + "\n")
     print(text)
+    for remark in remarks:
+        print(f"remark: {remark}", file=sys.stderr)
     print(f"wrote {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
     return 0
 
@@ -95,7 +141,17 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
     parser.add_argument("--table-height", type=float, metavar="Z", help="m in the world")
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE", default=SHIPPED)
+    parser.add_argument("--planner", metavar="NAME", help=f"{', '.join(PLANNERS)}")
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="a network of your own")
+    parser.add_argument(
+        "--workspace", type=float, nargs=3, metavar=("X", "Y", "SIZE"), help="m in the world"
+    )
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--point", type=float, nargs=2, metavar=("U", "V"), help="on the object")
+    which.add_argument(
+        "--box", type=float, nargs=4, metavar=("U0", "V0", "U1", "V1"), help="around the object"
+    )
+    which.add_argument("--mask", type=Path, metavar="FILE", help="the object's pixels, PNG or NPY")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
     )
@@ -104,11 +160,17 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse_args(argv)
     image = [options.rgb, options.depth, options.intrinsics]
     others = [options.depth_scale, options.camera_pose, options.table_height, options.out]
-    others += [*image, options.count]
+    others += [*image, options.count, options.planner, options.workspace]
+    others += [options.point, options.box, options.mask]
     if options.export is not None and any(part is not None for part in others):
         raise UserError("--export writes the network and takes only --checkpoint beside it")
     if options.export is None and any(part is None for part in image):
         raise UserError("--rgb, --depth and --intrinsics are needed (or --export FILE.onnx)")
+    options.planner = options.planner or PLANNERS[0]
+    if options.planner not in PLANNERS:
+        raise unknown_choice("--planner", options.planner, PLANNERS)
+    if options.checkpoint is not None and not options.planner.startswith("graspnet"):
+        raise UserError(f"--checkpoint: {options.planner} has no network; omit one of the two")
     options.count = 20 if options.count is None else options.count
     if options.count < 1:
         raise UserError(f"--count: got {options.count}, expected at least 1")
@@ -117,40 +179,9 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
             raise UserError("--table-height is a height in the world: it needs --camera-pose")
         if not np.isfinite(options.table_height):
             raise UserError(f"--table-height: got {options.table_height}, expected metres")
+    if options.workspace is not None and options.camera_pose is None:
+        raise UserError("--workspace is a square in the world: it needs --camera-pose")
     return options
-
-
-def free_folder(folder: Path, rgb: Path) -> Path:
-    """`folder`, or `folder`-2, -3, ...: the first that holds no grasps of another image."""
-    for number in itertools.count(1):
-        numbered = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
-        before = own_json(numbered / "grasps.json")
-        if before is None or Path(before["rgb"]).resolve() == rgb.resolve():
-            return numbered
-    raise AssertionError("itertools.count ended")
-
-
-def check_output(folder: Path) -> None:
-    """Raise UserError where the results would overwrite files of another program."""
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"--out {folder}: exists and is no folder")
-    text, drawing = folder / "grasps.json", folder / "grasps.png"
-    for path, own in (
-        (text, own_json(text) is not None),
-        (drawing, is_prediction_panel(drawing)),
-    ):
-        if path.exists() and not own:
-            raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
-
-
-def own_json(path: Path) -> dict[str, Any] | None:
-    """The content of a grasps.json of this program; None if the file is something else."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        Path(content["rgb"]).resolve()
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return content if content.get("format") == FORMAT else None
 
 
 def read_image(options: argparse.Namespace) -> RGBDFrame:
@@ -172,61 +203,41 @@ def locate_table(image: RGBDFrame, options: argparse.Namespace) -> Table:
     return table_at_height(options.table_height, image.points(), T_WC)
 
 
-def as_plain(
-    found: Prediction, frame: RGBDFrame, table: Table, options: argparse.Namespace
-) -> dict[str, Any]:
-    """The content of grasps.json."""
-    T_CW, posed = inverse_pose(frame.T_WC), options.camera_pose is not None
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "rgb": str(options.rgb),
-        "depth": str(options.depth),
-        "checkpoint": str(options.checkpoint),
-        "K": frame.K.tolist(),
-        "T_WC": frame.T_WC.tolist() if posed else None,
-        "table": {
-            "estimated": table.share is not None,
-            "normal_camera": T_CW[:3, 2].tolist(),
-            "camera_height": float(frame.T_WC[2, 3] - table.height),
-            "height_world": table.height if posed else None,
-        },
-        "grasps": [grasp_as_plain(grasp, T_CW, posed) for grasp in found.grasps],
-    }
+def locate_workspace(
+    frame: RGBDFrame, table: Table, options: argparse.Namespace
+) -> tuple[Workspace, list[str]]:
+    """The square that the planner works on, and remarks."""
+    if options.workspace is None:
+        marked = marked_pixels(frame.depth.shape, options.point, options.box, options.mask)
+        return workspace_of(frame, table.height, marked)
+    return given_workspace(options.workspace, table.height), []
 
 
-def grasp_as_plain(grasp: PredictedGrasp, T_CW: np.ndarray, posed: bool) -> dict[str, Any]:
-    plain = {
-        "quality": grasp.in_world.quality,
-        "pixel": grasp.on_image.pixel.tolist(),
-        "image_angle": grasp.on_image.angle,
-        "width": grasp.in_world.width,
-        "camera": pose_as_plain(T_CW @ grasp.in_world.pose),
-    }
-    if posed:
-        plain["world"] = {**pose_as_plain(grasp.in_world.pose), "angle": grasp.in_world.angle}
-    return plain
+def new_planner(
+    options: argparse.Namespace, saved: SavedGraspNet, workspace: Workspace
+) -> SearchPlanner:
+    """The planner, which gives as many grasps as were asked for, or as usual."""
+    if options.checkpoint is None:
+        planner = make_planner(options.planner, GripperGeometry(), workspace, 0, "--planner")
+    else:
+        make = NETWORK_PLANNERS[options.planner]
+        planner = make(saved.gripper, workspace, checkpoint=options.checkpoint)
+    planner.return_at_least(options.count)
+    return planner
 
 
-def pose_as_plain(T: np.ndarray) -> dict[str, Any]:
-    position, quaternion = position_quaternion(T)
-    return {
-        "position": position.tolist(),
-        "rotation": T[:3, :3].tolist(),
-        "quaternion": quaternion.tolist(),
-    }
-
-
-def picture(found: Prediction, frame: RGBDFrame, saved: SavedGraspNet) -> bytes:
-    return prediction_panel(
-        frame.rgb,
-        frame.K,
-        [grasp.on_image for grasp in found.grasps],
-        found.quality,
-        found.angle,
-        found.width,
-        saved.model.max_width,
-    )
+def find_target(
+    planner: SearchPlanner, frame: RGBDFrame, options: argparse.Namespace
+) -> np.ndarray | None:
+    """(H, W) bool, the pixels of the one object that was named; None where none was."""
+    if options.mask is not None:
+        check_target(options.mask, frame, planner.workspace)
+        return options.mask
+    if options.point is not None:
+        return target_at(planner.segments(frame), frame, options.point)
+    if options.box is not None:
+        return target_in_box(planner.segments(frame), options.box)
+    return None
 
 
 if __name__ == "__main__":

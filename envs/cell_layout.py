@@ -150,12 +150,14 @@ class Placement:
 class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
     drawn. walls: stand on the table and are part of it: of its colour and friction, and what
-    touches them touches the table."""
+    touches them touches the table. target: number of the one object that is to be retrieved, None
+    where all are to be picked."""
 
     layout: str
     seed: int
     placements: tuple[Placement, ...]
     walls: tuple[Box, ...] = ()
+    target: int | None = None
 
 
 EMPTY = Scene("isolated", 0, ())

@@ -3,7 +3,8 @@
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
 whatever `scene.count` says. `bin`: a pile between walls that stand around the workspace.
-`household`: a pile of objects as different in size as the set has them, see `_mixed`.
+`household`: a pile of objects as different in size as the set has them, see `_mixed`. `retrieve`: a
+pile of RETRIEVE_COUNT objects, one of which, partly covered by others, is wanted, see `_covered`.
 `packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
 
 The objects come to rest in the simulator `scene.simulator`, whichever simulator the scene is for,
@@ -19,15 +20,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.cell_layout import Box, LayoutTable, ObjectModel, Placement, Scene, square_walls
-from envs.objects import ObjectSet
+from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
+from models.planner_contacts import buried_share
 from utils.config import Config
 from utils.errors import UserError
+from utils.geometry import SceneGeometry, SolidObject, Workspace
 from utils.grasp_quality import RELAXED
+from utils.height_map import height_map_from_scene
+from utils.transforms import pose_matrix
 
 # Their places are part of the scenes' seeds.
-LAYOUTS = ("isolated", "packed", "pile", "dense", "bin", "household")
-DENSE_COUNT = 15
+LAYOUTS = ("isolated", "packed", "pile", "dense", "bin", "household", "retrieve")
+TARGET_LAYOUT = "retrieve"  # of whose objects one is wanted
+DENSE_COUNT, RETRIEVE_COUNT = 15, 8
+# Of the object to retrieve: what others cover of it, seen from above, and what shows of it.
+LEAST_COVERED, LEAST_SHOWN, LEAST_AREA = 0.2, 0.2, 2e-4  # shares, m2
 
 _DROP_CLEARANCE = 0.02  # m between an isolated object's lowest point and the table
 _PILE_DROP_HEIGHT = 0.20  # m, as in VGN
@@ -56,7 +64,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         raise SceneError(f"unknown scene layout {layout!r}; allowed are {', '.join(LAYOUTS)}")
     rng = np.random.default_rng([seed, LAYOUTS.index(layout)])
     arrange = _ARRANGEMENTS[layout]
-    count = {"isolated": 1, "dense": DENSE_COUNT}.get(layout, config.scene.count)
+    fixed = {"isolated": 1, "dense": DENSE_COUNT, "retrieve": RETRIEVE_COUNT}
+    count = fixed.get(layout, config.scene.count)
     walls = tuple(_walls_around(config)) if layout == "bin" else ()
     for _ in range(_TRIES):
         if layout == "household":
@@ -71,11 +80,14 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
-            return Scene(layout, seed, placements, walls)
+            target = _covered(placements, config) if layout == TARGET_LAYOUT else None
+            if layout != TARGET_LAYOUT or target is not None:
+                return Scene(layout, seed, placements, walls, target)
+    covering = " with one under others" if layout == TARGET_LAYOUT else ""
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
-        f"inside the {config.workspace.size} m workspace in {_TRIES} tries; use smaller objects "
-        "(objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
+        f"inside the {config.workspace.size} m workspace{covering} in {_TRIES} tries; use smaller "
+        "objects (objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
 
 
@@ -92,6 +104,29 @@ def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:
         )
     places = (np.arange(count) + rng.uniform(size=count)) * len(fitting) / count
     return rng.permutation(np.array(fitting)[places.astype(int)])
+
+
+def _covered(placements: tuple[Placement, ...], config: Config) -> int | None:
+    """The number of the object to retrieve: of those that the hand spans and that still show, the
+    one of which others cover the largest share, seen from above; None where that is too little."""
+    bodies = tuple(
+        SolidObject(
+            tuple(solid.transformed(pose_matrix(one.position, one.quaternion))
+                  for solid in one.model.geometry()),
+            one.position,
+            one.model.friction,
+        )
+        for one in placements
+    )  # fmt: skip
+    scene = SceneGeometry(bodies)
+    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    heights = height_map_from_scene(scene, workspace)
+    covered = buried_share(scene, heights)
+    shown = np.bincount(heights.label[heights.label >= 0], minlength=len(placements))
+    wanted = (shown * heights.cell**2 >= LEAST_AREA) & (1 - covered >= LEAST_SHOWN)
+    wanted &= [fits(one.model, config.gripper.geometry) for one in placements]
+    covered = np.where(wanted, covered, 0.0)
+    return int(covered.argmax()) if covered.max() >= LEAST_COVERED else None
 
 
 def _walls_around(config: Config) -> Iterator[Box]:
@@ -176,5 +211,5 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
-    "bin": _pile_up, "household": _pile_up,
+    "bin": _pile_up, "household": _pile_up, "retrieve": _pile_up,
 }  # fmt: skip

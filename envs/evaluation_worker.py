@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from envs.cell_scenes import make_scene
+from envs.cell_scenes import TARGET_LAYOUT, make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
 from envs.policy_approach import (
@@ -25,6 +25,7 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
+from models.planner_target import check_takes_targets
 from models.planners import (
     Planner,
     calibration_of,
@@ -64,6 +65,9 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
                 f"{key}: {name} plans grasps from any side, and closed loops follow those from "
                 f"straight above alone; score it with {OPEN_LOOP} alone"
             )
+        for scenario in config.evaluate.scenarios:
+            if SCENARIOS[scenario].layout == TARGET_LAYOUT and planner is not None:
+                check_takes_targets(planner, f"{key}: {name}", f"play {scenario!r}")
         if config.evaluate.abstain > 0 and (planner is None or calibration_of(planner) is None):
             raise UserError(
                 f"evaluate.abstain: {name} states no chances of success; allowed with it are "

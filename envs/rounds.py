@@ -4,6 +4,10 @@ The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every objec
 the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
 its planner raises an exception. A grasp that has just failed is not tried again while the planner
 offers another one: often nothing has moved, and a deterministic planner would repeat itself.
+
+Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
+would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
+in its way, and the round ends when the target is in the bin, or after as many grasps as objects.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.objects import fits
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
+from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.errors import TargetLostError, one_line
 from utils.result_records import (
@@ -40,6 +45,7 @@ from utils.transforms import Grasp, RGBDFrame, grasp_to_image
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
+ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
@@ -94,8 +100,12 @@ def run_round(
         for index, placed in enumerate(scene.placements)
         if not fits(placed.model, cell.gripper)
     }
+    wanted = scene.target
+    if wanted is not None:
+        plan = TargetPlanner(plan)
     attempts: list[AttemptRecord] = []
     failed: list[Grasp] = []  # in a row
+    missed: list[Grasp] = []  # in the round
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
     plan_seconds, ended = 0.0, "cleared"
     try:
@@ -103,6 +113,9 @@ def run_round(
             reset_planner(plan, scene.seed)
         while cell.remaining and len(failed) < max_failures:
             frame = calibrated(cell, calibration, cell.frame(privileged))
+            if wanted is not None:
+                assert frame.segmentation is not None  # a cell's frames have it
+                frame = replace(frame, target=frame.segmentation == wanted)
             start = time.perf_counter()
             try:
                 with planner_errors(policy):
@@ -118,7 +131,10 @@ def run_round(
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0, detail=detail))
                 ended = NO_PLAN
                 break
-            grasp = no_deeper(first_untried(within_reach(cell, worth), failed), failed, stops)
+            reached: Iterable[Grasp] = within_reach(cell, worth)
+            if wanted is not None:
+                reached = elsewhere_first(reached, missed)
+            grasp = no_deeper(first_untried(reached, failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -150,9 +166,17 @@ def run_round(
                 )
             )
             failed = [] if outcome.success else [*failed, grasp]
+            missed += [] if outcome.success else [grasp]
             stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
+            if wanted is not None:
+                if wanted not in cell.remaining:
+                    ended = "target" if outcome.success and held == wanted else "lost"
+                    break
+                if len(attempts) == len(scene.placements):
+                    ended = "picks"
+                    break
     except PlannerError as error:
         attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, 0.0, detail=str(error)))
         ended = PLANNER_ERROR
@@ -169,6 +193,7 @@ def run_round(
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
         cell.config.camera.depth_noise,
         None if chances is None else (chances.slope, chances.offset),
+        None if wanted is None else ended == "target",
     )  # fmt: skip
 
 
@@ -259,6 +284,17 @@ def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp:
         if not any(_alike(grasp, other) for other in failed):
             return grasp
     return first
+
+
+def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Grasp]:
+    """The grasps in their order, but first those that are more likely to succeed than not and lie
+    ANOTHER from all that failed."""
+
+    def is_near(grasp: Grasp) -> bool:
+        gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
+        return grasp.quality < 0.5 or bool(min(gaps, default=np.inf) < ANOTHER)
+
+    return sorted(grasps, key=is_near)
 
 
 def _alike(grasp: Grasp, other: Grasp) -> bool:

@@ -279,6 +279,7 @@ SCENARIOS = {
     "dense": Scenario("dense"),
     "bin": Scenario("bin"),
     "household": Scenario("household"),
+    "retrieve": Scenario("retrieve"),
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),
     "moving_5cm": Scenario("isolated", speed=0.05),

@@ -18,10 +18,12 @@ import numpy as np
 
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from utils.calibration import Calibration
+from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import contact_levels, fit_faces
-from utils.height_map import WALL_LABEL, HeightMap
-from utils.transforms import Grasp, transform_points
+from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap
+from utils.target import pixel_labels
+from utils.transforms import Grasp, RGBDFrame, transform_points
 
 _NOWHERE = -1e3  # m, under everything
 
@@ -46,11 +48,26 @@ class SearchPlanner:
         self.gripper, self.workspace = gripper, workspace
         self.settings = settings or SearchSettings()
 
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        """The map from above of a frame, cut into objects as the planner sees them."""
+        raise NotImplementedError
+
+    def segments(self, frame: RGBDFrame) -> np.ndarray:
+        """(H, W) int32: the number of the object at each pixel, -1 where there is none. A planner
+        with this method honours `RGBDFrame.target`: it returns grasps of that object alone."""
+        frame = corrected(frame, self.workspace.table_height)
+        return pixel_labels(self.heights(frame), frame)
+
     def search(
         self, heights: HeightMap, value: Callable[[Candidates], np.ndarray] | None = None
     ) -> Candidates:
         """Feasible candidates on a height map, best first; `value` as in `search`."""
         return search(heights, self.gripper, self.workspace, self.settings, value)
+
+    def return_at_least(self, count: int) -> None:
+        """Return up to `count` grasps, where the planner would return fewer."""
+        returned = max(count, self.settings.returned)
+        self.settings = replace(self.settings, returned=returned)
 
     def grasps(self, found: Candidates) -> list[Grasp]:
         """The best of the candidates as grasps, no two of them nearly alike."""
@@ -115,6 +132,8 @@ def dense_candidates(
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
     beside = max(settings.rooms) + 2 * thickness
+    if (heights.label == OTHER_LABEL).any():  # what is not to be grasped may be under the palm
+        beside += gripper.palm_half_length
     half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
     size, middle = 2 * half + 1, heights.origin + cell * centre_cell
     # Gradients of the blurred map point across an edge whatever its height.
@@ -298,8 +317,14 @@ def measure(
 
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
-    left_over &= np.minimum(*ends) != WALL_LABEL
+    left_over &= np.minimum(*ends) > WALL_LABEL
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
+    other = heights.label == OTHER_LABEL
+    if other.any():
+        between = np.abs(u - shift[left_over, None]) < width[left_over, None] / 2
+        mixed = other.take(where[left_over]) & (height[left_over] > tip[left_over, None, None])
+        mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (len(v) * between.sum(axis=1))
+        left_over = left_over[mixed <= settings.most_other]
     near, opening, covered = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
     opening[left_over] = _widest_opening(
         heights.highest_around("height", 1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),

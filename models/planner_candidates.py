@@ -124,6 +124,7 @@ class SearchSettings:
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again
     split_factor: float = 0.5  # on the score of a grasp whose ends lie on different objects
+    most_other: float = 0.1  # share of other objects between the fingers that close on a target
     returned: int = 20  # grasps at most
     distinct_distance: float = 0.01  # no two returned grasps are both closer than this
     distinct_turn: float = np.deg2rad(20)  # and turned by less than this

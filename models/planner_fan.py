@@ -27,6 +27,7 @@ from utils.height_map import (
     tilted_view,
     without_holes,
 )
+from utils.target import object_of_target, only_object, only_target
 from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
 
 Value = Callable[[HeightMap, Candidates], np.ndarray]
@@ -84,6 +85,10 @@ class FanPlanner(SearchPlanner):
         super().__init__(gripper, workspace, seed, settings)
         self.fan = fan
         self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
+
+    def return_at_least(self, count: int) -> None:
+        super().return_at_least(count)
+        self.fan = replace(self.fan, returned=max(count, self.fan.returned))
 
     def search_fan(
         self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
@@ -157,13 +162,16 @@ class HeuristicFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        overhead = height_map_from_frame(frame, self.workspace)
+        overhead = only_target(self.heights(frame), frame)
         filled, hiding = without_holes(frame)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
         return self.search_fan(seen)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return height_map_from_frame(frame, self.workspace)
 
 
 class OracleFanPlanner(FanPlanner):
@@ -176,11 +184,22 @@ class OracleFanPlanner(FanPlanner):
     count = 20
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        overhead, truth = self.heights(frame), frame.truth
+        assert truth is not None  # `heights` needs it
+        self._truth = truth
+        self._buried = buried_share(truth, overhead)
+        wanted = None if frame.target is None else object_of_target(overhead, frame)
+
+        def exact(T_WV: np.ndarray) -> HeightMap:
+            heights = height_map_from_scene(truth, self.workspace, T_WV=T_WV)
+            return heights if frame.target is None else only_object(heights, wanted)
+
+        return self.search_fan(exact)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
-        self._truth = truth = frame.truth
-        self._buried = buried_share(truth, height_map_from_scene(truth, self.workspace))
-        return self.search_fan(lambda T_WV: height_map_from_scene(truth, self.workspace, T_WV=T_WV))
+        return height_map_from_scene(frame.truth, self.workspace)
 
     def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
         found = found.distinct(self.count, 0.004, np.deg2rad(8))

@@ -41,6 +41,7 @@ from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import grasp_depth
 from utils.height_map import (
+    OTHER_LABEL,
     HeightMap,
     height_map_from_frame,
     local_maxima,
@@ -48,6 +49,7 @@ from utils.height_map import (
     without_holes,
 )
 from utils.images import PixelScaling
+from utils.target import only_target
 from utils.transforms import Grasp, RGBDFrame, deproject, project, transform_points
 
 
@@ -169,7 +171,11 @@ class GraspNetPlanner(SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
-        return self.grasps(self.search(seen.heights, partial(seen.value, seen.heights)))
+        heights = only_target(seen.heights, frame)
+        return self.grasps(self.search(heights, partial(seen.value, heights)))
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return NetworkView(self.network, frame, self.workspace).heights
 
 
 class GraspNetDirectPlanner(GraspNetPlanner):
@@ -183,7 +189,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace, crop=True)
-        heights, value = seen.heights, partial(seen.value, seen.heights)
+        heights = only_target(seen.heights, frame)
+        value = partial(seen.value, heights)
         rough = self._at_peaks(seen.peaks(PEAKS), heights)
         rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
         for settings in (self.settings, self.settings.relaxed()):
@@ -199,6 +206,7 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         """Candidates at points (N, 3) at all angles, their fingertips at the surface."""
         away = np.abs(points[:, :2] - self.workspace.centre).max(axis=1)
         points = points[away < self.workspace.size / 2 + self.settings.reach]
+        points = points[heights.label[heights.index(points[:, :2])] != OTHER_LABEL]
         count = self.settings.angles
         angle = np.tile(np.arange(count) * np.pi / count, len(points))
         xy = np.repeat(points[:, :2], count, axis=0)
@@ -232,12 +240,16 @@ class GraspNetFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
+        overhead = only_target(seen.heights, frame)
         filled, hiding = without_holes(seen.frame)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
-            return tilted_height_map(seen.heights, filled, hiding, T_WV)
+            return tilted_height_map(overhead, filled, hiding, T_WV)
 
         return self.search_fan(tilted, seen.value)
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return NetworkView(self.network, frame, self.workspace).heights
 
 
 class NetworkView:
@@ -300,7 +312,8 @@ def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     K = frame.K.copy()
     K[:2, 2] -= left, top
     window = np.s_[top:bottom, left:right]
-    return replace(frame, rgb=frame.rgb[window], depth=frame.depth[window], K=K)
+    part = replace(frame, rgb=frame.rgb[window], depth=frame.depth[window], K=K)
+    return replace(part, segmentation=None, target=None)
 
 
 def quality_between(

@@ -31,19 +31,22 @@ from utils.calibration import Calibration, load_calibrations
 from utils.depth_correction import corrected
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
-from utils.height_map import height_map_from_frame, height_map_from_scene
+from utils.height_map import HeightMap, height_map_from_frame, height_map_from_scene
 from utils.plugins import is_import_path, load_plugin
+from utils.target import object_of_target, only_object, only_target
 from utils.transforms import Grasp, RGBDFrame
 
 
 class Planner(Protocol):
-    """Any callable that plans grasps. Four attributes are optional.
+    """Any callable that plans grasps. Five attributes are optional.
 
     needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
     tilts: True if grasps come from any side, and not from straight above alone.
     calibration: by which qualities are chances of success (`utils.calibration.Calibration`);
         without the attribute, or with None, they are scores.
     reset(seed): called before each scene, for planners that draw random numbers.
+    segments(frame): (H, W) int32, the number of the object at each pixel, -1 where there is none;
+        a planner that has it honours `RGBDFrame.target` and returns grasps of that object alone.
     """
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]: ...
@@ -57,6 +60,11 @@ def needs_truth(planner: Planner | type) -> bool:
 def tilts(planner: Planner | type) -> bool:
     """Whether the planner's grasps come from any side."""
     return bool(getattr(planner, "tilts", False))
+
+
+def takes_targets(planner: Planner | type) -> bool:
+    """Whether the planner grasps one object among others where its frame names one."""
+    return callable(getattr(planner, "segments", None))
 
 
 def calibration_of(planner: Planner) -> Calibration | None:
@@ -107,7 +115,10 @@ class HeuristicPlanner(SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        return self.grasps(self.search(height_map_from_frame(frame, self.workspace)))
+        return self.grasps(self.search(only_target(self.heights(frame), frame)))
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        return height_map_from_frame(frame, self.workspace)
 
 
 class OraclePlanner(SearchPlanner):
@@ -130,17 +141,24 @@ class OraclePlanner(SearchPlanner):
         self.judged = judged
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        if frame.truth is None:
-            raise ValueError("The oracle planner needs frame.truth; this frame holds none")
-        heights = height_map_from_scene(frame.truth, self.workspace)
-        found = self.search(heights).distinct(self.judged, 0.004, np.deg2rad(8))
+        heights, truth = self.heights(frame), frame.truth
+        assert truth is not None  # `heights` needs it
+        aimed = heights
+        if frame.target is not None:
+            aimed = only_object(heights, object_of_target(heights, frame))
+        found = self.search(aimed).distinct(self.judged, 0.004, np.deg2rad(8))
         if len(found) == 0:
             return []
-        quality = exact_quality(found, frame.truth, self.gripper)
-        buried = buried_share(frame.truth, heights)
+        quality = exact_quality(found, truth, self.gripper)
+        buried = buried_share(truth, heights)
         # Antipodal grasps come first; where there is none, the height map's score ranks the rest.
         found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
         return self.grasps(found.best(len(found)))
+
+    def heights(self, frame: RGBDFrame) -> HeightMap:
+        if frame.truth is None:
+            raise ValueError("The oracle planner needs frame.truth; this frame holds none")
+        return height_map_from_scene(frame.truth, self.workspace)
 
 
 # A planner is made by a call with the gripper, the workspace and a seed.

@@ -1,13 +1,16 @@
 """Scenes as pure functions of their seeds, laid out in each simulator."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import square_walls
-from envs.cell_scenes import LAYOUTS, SceneError, make_scene
+from envs.cell_layout import Placement, square_walls
+from envs.cell_scenes import LAYOUTS, SceneError, _covered, make_scene
 from envs.objects import ObjectPart, load_object_set
 from envs.simulators import make_layout_table
+from tests.helpers.box_frames import CORNERS
 from tests.helpers.simulators import INSTALLED
 from utils.config import with_settings
 
@@ -35,7 +38,8 @@ def test_scene_is_a_pure_function_of_its_seed(layout, primitives, laid_out):
     first = make_scene(layout, primitives, 7, laid_out)
     other = make_scene(layout, primitives, 9, laid_out)  # other work in between
     again = make_scene(layout, primitives, 7, laid_out)
-    assert len(first.placements) == (1 if layout == "isolated" else laid_out.scene.count)
+    count = {"isolated": 1, "retrieve": 8}.get(layout, laid_out.scene.count)
+    assert len(first.placements) == count and first.target == again.target
     for a, b in zip(first.placements, again.placements):
         assert a.model.name == b.model.name
         np.testing.assert_array_equal(a.position, b.position)
@@ -53,6 +57,25 @@ def test_a_dense_pile_has_fifteen_objects_whatever_the_config_says(primitives, c
     for placement in scene.placements:
         offset = abs(placement.position[:2] - config.workspace.center)
         assert offset.max() <= config.workspace.size / 2 and placement.position[2] > 0
+
+
+def test_the_object_to_retrieve_is_the_one_that_is_covered_most(config, box_set):
+    """A plate of 8 cm x 6 cm under a box of 3 cm x 6 cm: three eighths of it are covered."""
+    flat, narrow = (
+        replace(box_set[0], parts=(CORNERS * np.array(size) / 2,))
+        for size in ((0.08, 0.06, 0.02), (0.03, 0.06, 0.03))
+    )
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+
+    def placed(*others) -> tuple[Placement, ...]:
+        plate = Placement(flat, np.array([0.5, 0.0, 0.01]), level)
+        return plate, *(Placement(narrow, np.array(place), level) for place in others)
+
+    over, beside = (0.5, 0.0, 0.035), (0.4, 0.1, 0.015)
+    assert _covered(placed(over, beside), config) == 0
+    assert _covered(placed(beside), config) is None  # nothing is covered
+    cover = [(0.5 + dx, 0.0, 0.035) for dx in (-0.03, 0.0, 0.03)]
+    assert _covered(placed(*cover), config) is None  # nothing is left to be seen
 
 
 def test_a_household_is_as_mixed_as_its_set(primitives, config):

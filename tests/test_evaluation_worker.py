@@ -2,7 +2,9 @@
 
 import pytest
 
-from envs.evaluation_worker import film_name
+from envs.evaluation_worker import check_everything, film_name
+from utils.config import Config, with_settings
+from utils.errors import UserError
 from utils.evaluation import Task
 
 
@@ -18,3 +20,13 @@ from utils.evaluation import Task
 def test_a_film_has_a_name_that_every_system_allows(policy, objects, noise, name):
     task = Task(objects, "pile", 7, ((policy, "open_loop", noise),))
     assert film_name(task, policy, noise, "mp4") == name
+
+
+def test_a_planner_that_cannot_tell_objects_apart_does_not_retrieve(config):
+    def asked(policy: str) -> Config:
+        changes = {"policies": (policy,), "scenarios": ("retrieve",), "object_sets": ("box",)}
+        return with_settings(config, "evaluate", changes)
+
+    with pytest.raises(UserError, match="random does not tell objects apart.*play 'retrieve'"):
+        check_everything(asked("random"))
+    check_everything(asked("heuristic"))

@@ -44,7 +44,8 @@ def test_results_json_is_strict_and_complete(tmp_path):
     loops = {"controller", "turn_ms_p95", "turn_ms_mean"}
     held = {"turned", "slid", "firm"}
     fitting = {"graspable_attempts", "graspable_successes", "graspable_total"}
-    others = {"failures", "calibration_error"}
+    others = {"failures", "calibration_error", "targets", "targets_in_hand"}
+    others |= {"target_in_hand_rate", "target_in_hand_ci95", "picks_to_target"}
     assert set(content["rows"][0]) == {*fields.split()} | others | loops | held | fitting
     assert content["rows"][1]["picks_per_hour"] is None
     (pair,) = content["comparisons"]
@@ -82,6 +83,24 @@ def test_a_closed_loop_s_turns_have_a_column():
     assert "turn ms, 95 %" in table[0]
     assert "8.0, 14.0" in table[-1] and "8.0" not in table[2]
     assert "turn ms" not in format_table(summarise(ROUNDS, 0))
+
+
+def test_the_target_has_columns_where_one_was_wanted():
+    """Two of three rounds end with the target in the bin, after 1 and 4 grasps."""
+    ends = [(1, True), (4, True), (2, False)]
+    rounds = [
+        replace(
+            ROUNDS[0], seed=seed, scenario="retrieve", target_in_hand=found,
+            attempts=ROUNDS[0].attempts[:1] * picks, ended="target" if found else "picks",
+        )
+        for seed, (picks, found) in enumerate(ends)
+    ]  # fmt: skip
+    row = summarise(rounds, 0)[0]
+    assert (row.targets, row.targets_in_hand, row.picks_to_target) == (3, 2, 2.5)
+    table = format_table([row]).splitlines()
+    assert "target in hand" in table[0] and "67 % [21, 94] 2/3" in table[2] and "2.5" in table[2]
+    assert "target" not in format_table(summarise(ROUNDS, 0))
+    assert summarise(ROUNDS, 0)[0].target_in_hand_rate is None
 
 
 def test_a_depth_noise_has_a_column_where_there_is_any(tmp_path):

@@ -9,7 +9,14 @@ import pytest
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
 from envs.objects import load_object_set
-from envs.rounds import ROOM_OVER_TOUCH, first_untried, no_deeper, run_round, within_reach
+from envs.rounds import (
+    ROOM_OVER_TOUCH,
+    elsewhere_first,
+    first_untried,
+    no_deeper,
+    run_round,
+    within_reach,
+)
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.geometry import GripperGeometry, Workspace
@@ -57,6 +64,57 @@ def test_stop_rule(cell, box_set):
     miss = cube_grasp(offset=(0.13, 0, 0))
     failed = run_round(cell, scene, planner_of([miss]), **settings)
     assert (failed.ended, failed.executed, failed.successes) == ("failures", 2, 0)
+
+
+class Targeted:
+    """A planner that tells objects apart, and returns these grasps whatever it sees."""
+
+    def __init__(self, grasps):
+        self.grasps, self.frames = grasps, []
+
+    def segments(self, frame):
+        return np.full(frame.depth.shape, -1)
+
+    def __call__(self, frame):
+        self.frames.append(frame)
+        return list(self.grasps)
+
+
+def test_a_round_with_a_target_ends_when_it_is_in_the_bin(cell, box_set):
+    """Two cubes 12 cm apart, of which the second is wanted."""
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    places = np.array([(0.5, 0.06, 0.03), (0.5, -0.06, 0.03)])
+    placements = tuple(Placement(box_set[0], place, level) for place in places)
+    scene = Scene("retrieve", 0, placements, target=1)
+    settings = {"policy": "x", "objects": "box", "max_failures": 9}
+    other, wanted, miss = (
+        cube_grasp(offset=offset) for offset in ((0, 0.06, 0), (0, -0.06, 0), (0.13, 0, 0))
+    )
+    plan = Targeted([wanted, other])
+    record = run_round(cell, scene, plan, **settings)
+    assert (record.ended, record.target_in_hand, record.executed) == ("target", True, 1)
+    assert record.objects_cleared == 1 and cell.remaining == {0}
+    seen = plan.frames[0]
+    assert seen.segmentation is None and seen.truth is None
+    points = seen.points()[seen.target]  # the target's pixels alone
+    assert len(points) > 200 and (np.abs(points[:, :2] - places[1, :2]) < 0.035).all()
+
+    record = run_round(cell, scene, Targeted([other]), **settings)  # then the other one is gone
+    assert (record.ended, record.target_in_hand, record.executed) == ("picks", False, 2)
+    record = run_round(cell, scene, Targeted([miss]), **settings)
+    assert (record.ended, record.target_in_hand, record.executed) == ("picks", False, 2)
+    record = run_round(cell, scene, Targeted([miss]), **(settings | {"max_failures": 1}))
+    assert (record.ended, record.target_in_hand) == ("failures", False)
+    record = run_round(cell, scene, Targeted([]), **settings)
+    assert (record.ended, record.target_in_hand) == ("no_plan", False)
+
+
+def test_after_a_failure_another_object_comes_first() -> None:
+    near, far = cube_grasp(offset=(0.03, 0, 0)), cube_grasp(offset=(0.06, 0, 0))
+    poor = replace(cube_grasp(offset=(0.1, 0, 0)), quality=0.4)
+    failed = cube_grasp()
+    assert elsewhere_first([near, poor, far], [failed]) == [far, near, poor]
+    assert elsewhere_first([near, far], []) == [near, far]
 
 
 def test_what_failed_is_not_tried_again_while_there_is_another() -> None:

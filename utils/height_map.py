@@ -39,6 +39,7 @@ from utils.transforms import (
 HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
+OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
@@ -55,7 +56,7 @@ class HeightMap:
     ceiling: (R, C) metres in V, the highest that matter could reach which was hidden or not
         measured; equals `height` where the surface was measured.
     label: (R, C) int, which object the cell belongs to; -1 for the table, WALL_LABEL for walls
-        around the workspace.
+        around the workspace, OTHER_LABEL for objects that are not to be grasped.
     centres: (M, 3) each label's centre of mass in V, or an estimate of it.
     table_height: metres in W.
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.

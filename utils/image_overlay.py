@@ -1,4 +1,4 @@
-"""Pictures of grasps: drawn on images, in contact sheets, and beside the maps of a prediction.
+"""Pictures of grasps: drawn on images, in contact sheets, and for the user of predict.py.
 
 This module knows the pinhole camera, but no simulator, no planner and no network.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from utils.images import PixelScaling
-from utils.transforms import ImageGrasp
+from utils.transforms import Grasp, ImageGrasp, RGBDFrame, grasp_to_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,71 +95,53 @@ def _line(image: np.ndarray, start, end, color, thickness: int) -> None:
 # --- The picture of a prediction ------------------------------------------------------------
 
 NUMBERED = 10  # grasps with a rank beside them; more would hide each other
-PICTURE_SIDE = 1000  # pixels, the longer side of the image in the panel
-NOTHING, CERTAIN = 0.1, 0.5  # quality at which angle and width are invisible, and in full colour
+PICTURE_SIDE = 1000  # pixels, the longer side of the picture
 INK, PAPER = "#1d2430", "white"
+TARGET_COLOR, ASIDE_COLOR = (255, 176, 32), (96, 165, 250)  # RGB
 MARK = "Software", "robot-grasping predict.py"  # PNG text that marks pictures of this project
 
 
-def prediction_panel(
-    rgb: np.ndarray,
-    K: np.ndarray,
-    grasps: Sequence[ImageGrasp],
-    quality: np.ndarray,
-    angle: np.ndarray,
-    width: np.ndarray,
-    max_width: float,
-) -> bytes:
-    """The image with its grasps beside the maps of quality, angle and width, as bytes of a PNG.
+def grasp_picture(frame: RGBDFrame, grasps: Sequence[Grasp], clearing: Sequence[Grasp]) -> bytes:
+    """The image with ranked grasps, as bytes of a PNG.
 
-    rgb: (H, W, 3) uint8. K: (3, 3). grasps: best first, in pixels of rgb; the first ten are
-    numbered in that order, the best is green. quality, angle, width: (H, W); image angles in
-    radians, widths in metres. max_width: metres at the top of the width's scale.
+    The first ten grasps are numbered, the best is green. The frame's target is outlined; grasps
+    that move aside what is in its way, of which one is enough, are blue.
     """
-    from matplotlib.cm import ScalarMappable  # slow to import, and few callers need it
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # slow to import, and few callers need it
 
-    scaling = _to_picture(K, rgb.shape[:2])
-    picture = _with_grasps(scaling, rgb, K, grasps)
+    scaling = _to_picture(frame.K, frame.depth.shape)
+    picture = scaling.image(frame.rgb)
+    if frame.target is not None:
+        mask = scaling.image(frame.target.astype(np.float32)) > 0.5
+        outlines, _ = cv2.findContours(
+            mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        for colour, width in ((OUTLINE, 5), (TARGET_COLOR, 3)):
+            cv2.drawContours(picture, outlines, -1, colour, width, cv2.LINE_AA)
+    colours = [SUCCESS_COLOR, *[(255, 255, 255)] * len(grasps)]
+    picture = _with_grasps(scaling, picture, frame, clearing[:1], [ASIDE_COLOR])
+    picture = _with_grasps(scaling, picture, frame, grasps, colours)
     rows, columns = picture.shape[:2]
-    height = 6.6  # inches; the maps take a third of it each
-    image_width = height * columns / rows
-    map_width = 0.3 * image_width + 0.7  # with room for its scale
-    figure = Figure(figsize=(image_width + map_width, height + 0.3), layout="constrained")
+    height = 6.6  # inches
+    figure = Figure(figsize=(height * columns / rows, height + 0.3), layout="constrained")
     figure.set_facecolor(PAPER)
-    grid = figure.add_gridspec(3, 2, width_ratios=(image_width, map_width))
-    image = figure.add_subplot(grid[:, 0])
+    image = figure.add_subplot()
     image.imshow(picture, interpolation="antialiased")
     title = f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}, best first"
-    _finish(image, title if grasps else "no grasp found")
+    title = title if grasps else "no grasp found"
+    if clearing:
+        title += "; blue: the first to move aside what is in the way"
+    _finish(image, title)
     for rank, grasp in reversed(list(enumerate(grasps[:NUMBERED], start=1))):  # the best on top
-        _number(image, rank, scaling.pixels(grasp.pixel))
-
-    known = scaling.image(quality.astype(np.float32))
-    shown = np.clip((known - NOTHING) / (CERTAIN - NOTHING), 0, 1)
-    bare = np.full((*shown.shape, 3), 0.93)
-    for row, (name, values, high, colours, alpha) in enumerate((
-        ("quality", quality, 1.0, "viridis", None),
-        ("angle on the image, degrees", np.rad2deg(angle), 180.0, "hsv", shown),
-        ("width, mm", 1000 * width, 1000 * max_width, "plasma", shown),
-    )):  # fmt: skip
-        axes = figure.add_subplot(grid[row, 1])
-        axes.imshow(bare)
-        drawn = axes.imshow(_nearest(scaling, values), vmin=0, vmax=high, cmap=colours, alpha=alpha)
-        scale = ScalarMappable(drawn.norm, drawn.cmap)  # without the fading
-        bar = figure.colorbar(scale, ax=axes, fraction=0.05, pad=0.03)
-        if high == 180.0:
-            bar.set_ticks([0, 45, 90, 135, 180])
-        bar.ax.tick_params(labelsize=8, colors=INK)
-        bar.outline.set_visible(False)
-        _finish(axes, name)
+        pixel = grasp_to_image(grasp, frame.K, frame.T_WC).pixel
+        _number(image, rank, scaling.pixels(pixel))
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150, metadata=dict([MARK]))
     return file.getvalue()
 
 
-def is_prediction_panel(path) -> bool:
-    """Whether the file is a picture that `prediction_panel` made."""
+def is_grasp_picture(path) -> bool:
+    """Whether the file is a picture that `grasp_picture` made."""
     try:
         with Image.open(path, formats=["PNG"]) as image:
             return image.info.get(MARK[0]) == MARK[1]
@@ -167,33 +149,27 @@ def is_prediction_panel(path) -> bool:
         return False
 
 
-def _to_picture(K: np.ndarray, shape: tuple[int, int]) -> PixelScaling:
-    """Square pixels, and the longer side as the panel wants it."""
+def _to_picture(K: np.ndarray, shape: tuple[int, ...]) -> PixelScaling:
+    """Square pixels, and the longer side as the picture wants it."""
     focal = K[0, 0]
     factor = PICTURE_SIDE / max(shape[1], shape[0] * focal / K[1, 1])
     return PixelScaling.to_focal_length(K, factor * focal)
 
 
 def _with_grasps(
-    scaling: PixelScaling, rgb: np.ndarray, K: np.ndarray, grasps: Sequence[ImageGrasp]
+    scaling: PixelScaling,
+    picture: np.ndarray,
+    frame: RGBDFrame,
+    grasps: Sequence[Grasp],
+    colours: Sequence[tuple[int, int, int]],
 ) -> np.ndarray:
-    picture = scaling.image(rgb)
-    for rank, grasp in reversed(list(enumerate(grasps))):
-        angle = np.arctan2(np.sin(grasp.angle) * scaling.v, np.cos(grasp.angle) * scaling.u)
-        moved = ImageGrasp(
-            scaling.pixels(grasp.pixel), angle, grasp.depth, grasp.width, grasp.quality
-        )
-        color = SUCCESS_COLOR if rank == 0 else None
-        picture = draw_grasp(picture, moved, scaling.intrinsics(K), color)
+    """The scaled picture with the grasps, the first on top."""
+    for grasp, colour in reversed(list(zip(grasps, colours))):
+        seen = grasp_to_image(grasp, frame.K, frame.T_WC)
+        angle = np.arctan2(np.sin(seen.angle) * scaling.v, np.cos(seen.angle) * scaling.u)
+        moved = ImageGrasp(scaling.pixels(seen.pixel), angle, seen.depth, seen.width, seen.quality)
+        picture = draw_grasp(picture, moved, scaling.intrinsics(frame.K), colour)
     return picture
-
-
-def _nearest(scaling: PixelScaling, values: np.ndarray) -> np.ndarray:
-    """The scaled map without interpolation, which would invent angles across the seam."""
-    rows, columns = scaling.size(values.shape)
-    v = np.clip(np.rint((np.arange(rows) + 0.5) / scaling.v - 0.5), 0, values.shape[0] - 1)
-    u = np.clip(np.rint((np.arange(columns) + 0.5) / scaling.u - 0.5), 0, values.shape[1] - 1)
-    return values[v.astype(int)[:, None], u.astype(int)]
 
 
 def _number(axes: Axes, rank: int, pixel: np.ndarray) -> None:

@@ -175,6 +175,32 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     return np.where(known, values * np.float64(scale), 0).astype(np.float32)
 
 
+def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of a PNG or NPY of `shape`: True where it is not 0; of a colour image, where any
+    channel but alpha is not. Raises UserError for another size and for a mask without a pixel."""
+    if path.suffix.lower() == ".npy":
+        values = _load_array(path)
+    else:
+        image = open_image(path)
+        values = np.asarray(image.convert("RGB") if image.mode in ("RGBA", "LA", "P") else image)
+    if values.ndim == 3:
+        values = values.any(axis=2)
+    if values.ndim != 2 or values.dtype.kind not in "uifb":
+        raise UserError(
+            f"{path}: an array of shape {values.shape} of {values.dtype}, expected a mask (H, W) "
+            "of numbers, not 0 where the object is"
+        )
+    if values.shape != shape:
+        raise UserError(
+            f"{path}: a mask of {values.shape[1]}x{values.shape[0]} pixels, the image has "
+            f"{shape[1]}x{shape[0]}; give one of the same size"
+        )
+    mask = np.nan_to_num(values.astype(float)) != 0
+    if not mask.any():
+        raise UserError(f"{path}: the mask is empty: all pixels are 0; mark those of the object")
+    return mask
+
+
 INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
 
 
@@ -358,7 +384,9 @@ def overhead_view(
     table = seen & (depth > DISTANCE - ON_TABLE)
     if table.any():
         rgb = np.where(seen[..., None], rgb, nearest_values(rgb, table))
-    return replace(frame, rgb=rgb, depth=depth, K=K, T_WC=T_WC, segmentation=None, truth=None)
+    return replace(
+        frame, rgb=rgb, depth=depth, K=K, T_WC=T_WC, segmentation=None, truth=None, target=None
+    )
 
 
 def _points(frame: RGBDFrame) -> tuple[np.ndarray, np.ndarray]:

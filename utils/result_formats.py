@@ -176,6 +176,19 @@ COLUMNS = (
         ),
     ),
     TableColumn(
+        "target in hand",
+        lambda row: _share(
+            row.target_in_hand_rate, row.target_in_hand_ci95, row.targets_in_hand, row.targets
+        ),
+        known=lambda row: row.targets > 0,
+    ),
+    TableColumn(
+        "picks to it",
+        lambda row: _decimal(row.picks_to_target, 1),
+        number=True,
+        known=lambda row: row.targets > 0,
+    ),
+    TableColumn(
         "success, cleared of graspable",
         graspable_in_words,
         known=lambda row: row.graspable_total < row.objects_total,

@@ -46,6 +46,8 @@ ENDINGS = {  # why a round ended
     PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
     "lost": "the objects that were left fell off the table",
+    "target": "the target is in the bin",
+    "picks": "as many grasps as objects, and the target is still there",
     "physics": "the simulation blew up",
 }
 
@@ -123,6 +125,7 @@ class RoundRecord:
     depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
     calibration: slope and offset by which the grasps' qualities are chances of success
         (`utils.calibration`); None where they are scores.
+    target_in_hand: whether the one object that was wanted ended in the bin; None where all were.
     """
 
     policy: str
@@ -138,6 +141,7 @@ class RoundRecord:
     ungraspable: int = 0
     depth_noise: str = CLEAN
     calibration: tuple[float, float] | None = None
+    target_in_hand: bool | None = None
 
     def __post_init__(self) -> None:
         if self.ended not in ENDINGS:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from utils.calibration import calibration_error
@@ -40,6 +40,8 @@ class Row:
         the object that it held, or at which it aimed.
     calibration_error: expected calibration error of the grasps' qualities (`utils.calibration`);
         None where they are no chances.
+    targets, targets_in_hand: rounds in which one object was wanted, and those in which it ended in
+        the bin. picks_to_target: mean number of executed grasps of the latter.
     turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
         which the median over the attempts.
     """
@@ -72,6 +74,11 @@ class Row:
     graspable_successes: int = 0
     graspable_total: int = 0
     calibration_error: float | None = None
+    targets: int = 0
+    targets_in_hand: int = 0
+    target_in_hand_rate: float | None = None
+    target_in_hand_ci95: tuple[float, float] = (0.0, 1.0)
+    picks_to_target: float | None = None
 
 
 def summarise(rounds: Iterable[RoundRecord], seed: int) -> list[Row]:
@@ -95,6 +102,8 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
     seconds = sum(call.sim_seconds for call in calls)
     per_pick = seconds / successes if successes else None
     stated = stated_chances(rounds)
+    wanted = [record for record in rounds if record.target_in_hand is not None]
+    in_hand = [record.executed for record in wanted if record.target_in_hand]
     turns = [call.turn_ms for call in calls if call.turn_ms is not None]
     means = [call.turn_ms_mean for call in calls if call.turn_ms_mean is not None]
     return Row(
@@ -123,6 +132,11 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
         graspable_successes=sum(call.success for call in fitting),
         graspable_total=total - sum(record.ungraspable for record in rounds),
         calibration_error=None if stated is None else calibration_error(*stated),
+        targets=len(wanted),
+        targets_in_hand=len(in_hand),
+        target_in_hand_rate=len(in_hand) / len(wanted) if wanted else None,
+        target_in_hand_ci95=wilson_interval(len(in_hand), len(wanted)),
+        picks_to_target=mean(in_hand) if in_hand else None,
     )
 
 

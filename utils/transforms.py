@@ -144,6 +144,8 @@ class RGBDFrame:
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
         see only the depth image must not.
     truth: the scene's true geometry for planners that need it; otherwise None.
+    target: (H, W) bool, the visible pixels of the one object that is wanted, as a click or a
+        segmenter gives them; None: any object.
     """
 
     rgb: np.ndarray
@@ -152,6 +154,7 @@ class RGBDFrame:
     T_WC: np.ndarray
     segmentation: np.ndarray | None = None
     truth: SceneGeometry | None = None  # type: ignore[name-defined]  # noqa: F821 - utils.geometry
+    target: np.ndarray | None = None
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""

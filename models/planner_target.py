@@ -1,0 +1,203 @@
+"""One object among others: grasps of the target, or of what has to be moved aside first.
+
+`TargetPlanner` works on any planner that honours `RGBDFrame.target`. It asks for grasps of the
+target; where none is promising, for those of the neighbours, the one most in the way first. It
+knows the image and the planner's own segmentation only, and remembers where the target was last
+seen, so that it can uncover what is wholly hidden. This module knows no simulator and no arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from models.planners import Planner, calibration_of, needs_truth, reset_planner, takes_targets
+from utils.calibration import Calibration
+from utils.errors import UserError
+from utils.target import MOSTLY
+from utils.transforms import Grasp, RGBDFrame
+
+
+@dataclass(frozen=True)
+class ClearingSettings:
+    """When to take the target, and what is in its way; metres unless said.
+
+    promising: least chance of success with which the target, or what is in its way, is grasped
+    while there is an alternative. near: a surface at this distance from the target, seen from
+    above, counts exp(-1) of one right beside it. over: height over the target at which it counts in
+    full. beside: what a surface counts that is not over the target. in_the_way: cm2 of such surface
+    from which an object is in the way. covering: cm2 of surface over the target and half as near,
+    from which an object may rest on it, so that it goes first even where the target's grasps look
+    promising. points: of each object that are looked at. enough: objects with promising grasps
+    after which the search for others ends; one more than is needed, for the case that a grasp
+    fails.
+    """
+
+    promising: float = 0.9
+    near: float = 0.02
+    over: float = 0.02
+    beside: float = 0.2
+    in_the_way: float = 0.5
+    covering: float = 3.0
+    points: int = 2000
+    enough: int = 2
+
+
+class TargetPlanner:
+    """A planner whose grasps of the target come first, or, where none is promising, those that
+    move aside what is in its way; best first, so that qualities need not fall.
+
+    plan: honours targets. Frames carry the target's visible pixels (`RGBDFrame.target`), none where
+    it is hidden. Raises UserError for a planner that cannot tell objects apart.
+    """
+
+    def __init__(self, plan: Planner, settings: ClearingSettings = ClearingSettings()):
+        check_takes_targets(plan)
+        self.plan, self.settings = plan, settings
+        self.needs_truth = needs_truth(plan)
+        self.calibration: Calibration | None = calibration_of(plan)
+        self._last = np.empty((0, 3))  # where the target was last seen, in W
+
+    def reset(self, seed: int) -> None:
+        self._last = np.empty((0, 3))
+        reset_planner(self.plan, seed)
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        if frame.target is None:
+            return self.plan(frame)
+        grasps = self.plan(frame) if frame.target.any() else []
+        clearing, least = self.clearing(frame, grasps), self.settings.promising
+        first = [grasp for grasp in clearing if grasp.quality >= least]
+        others = [grasp for grasp in clearing if grasp.quality < least]
+        return [*first, *sorted([*grasps, *others], key=lambda grasp: -grasp.quality)]
+
+    def clearing(self, frame: RGBDFrame, grasps: list[Grasp]) -> list[Grasp]:
+        """Grasps that move aside what is in the way of the target, the promising ones of the object
+        most in the way first; where its own `grasps` are promising, only of what may rest on it."""
+        segments = self.plan.segments(frame)  # type: ignore[attr-defined]
+        objects = _Objects(frame, segments, self.settings)
+        shown = objects.surface(objects.target)
+        if len(shown):
+            self._last = shown
+        if self._promising(grasps):
+            return self._grasps_of(objects, objects.covering(self._last))[0]
+        promising, others = self._clearing(objects)
+        return [*promising, *sorted(others, key=lambda grasp: -grasp.quality)]
+
+    def _clearing(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
+        """Promising grasps and others of what is in the target's way, of the object most in the way
+        first; where none is promising, of what is in the way of these objects, and so on."""
+        ring, visited, others = [self._last], set(), []
+        while ring:
+            found = dict.fromkeys(n for place in ring for n in objects.in_the_way(place))
+            numbers = [number for number in found if number not in visited]
+            promising, more = self._grasps_of(objects, numbers)
+            others += more
+            if promising:
+                return promising, others
+            visited.update(numbers)
+            ring = [objects.surface(objects.labels == number) for number in numbers]
+        return [], others
+
+    def _grasps_of(self, objects: _Objects, numbers: list[int]) -> tuple[list[Grasp], list[Grasp]]:
+        """Promising grasps of objects, in their order, and the other ones."""
+        promising, others, enough = [], [], self.settings.enough
+        for number in numbers:
+            found = self.plan(replace(objects.frame, target=objects.labels == number))
+            least = self.settings.promising
+            promising += [grasp for grasp in found if grasp.quality >= least]
+            others += [grasp for grasp in found if grasp.quality < least]
+            enough -= self._promising(found)
+            if enough == 0:
+                break
+        return promising, others
+
+    def _promising(self, grasps: list[Grasp]) -> bool:
+        return bool(grasps) and grasps[0].quality >= self.settings.promising
+
+
+class _Objects:
+    """The objects of a frame but the target, as a planner tells them apart.
+
+    labels: (H, W) numbers of the objects, -1 elsewhere.
+    """
+
+    def __init__(self, frame: RGBDFrame, segments: np.ndarray, settings: ClearingSettings):
+        assert frame.target is not None
+        self.frame, self.settings = frame, settings
+        self.target = frame.target
+        self.labels = np.where(frame.target, -1, segments)
+        self._points = frame.points()
+        self._known = np.isfinite(self._points[..., 2])
+        # What a pixel shows of the scene, cm2.
+        self._area = 1e4 * frame.depth**2 / (frame.K[0, 0] * frame.K[1, 1])
+        numbers, counts = np.unique(self.labels[self.labels >= 0], return_counts=True)
+        whole = np.bincount(segments[segments >= 0], minlength=1)
+        # The rim of the target is none of the others.
+        self.numbers = [
+            int(number)
+            for number, count in zip(numbers, counts)
+            if count >= (1 - MOSTLY) * whole[number]
+        ]
+
+    def surface(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) points in W that some pixels (H, W) show, at most `points`, evenly."""
+        points = self._points[pixels & self._known]
+        return points[:: max(1, -(-len(points) // self.settings.points))]
+
+    def in_the_way(self, place: np.ndarray) -> list[int]:
+        """The objects in the way of a hand that goes to a surface (N, 3), which may be hidden now:
+        those with enough surface near it and over it, seen from above; the one with most first."""
+        settings = self.settings
+        return self._around(place, settings.near, settings.beside, settings.in_the_way)
+
+    def covering(self, place: np.ndarray) -> list[int]:
+        """The objects that may rest on what has a surface (N, 3)."""
+        return self._around(place, self.settings.near / 2, 0.0, self.settings.covering)
+
+    def _around(self, place: np.ndarray, near: float, beside: float, least: float) -> list[int]:
+        if len(place) == 0:
+            return []
+        tree, settings, found = cKDTree(place[:, :2]), self.settings, []
+        for number in self.numbers:
+            row, column = np.nonzero((self.labels == number) & self._known)
+            step = max(1, -(-len(row) // settings.points))
+            row, column = row[::step], column[::step]
+            surface = self._points[row, column]
+            apart, nearest = tree.query(surface[:, :2])
+            over = np.clip((surface[:, 2] - place[nearest, 2]) / settings.over, 0, 1)
+            weight = np.exp(-apart / near) * np.maximum(over, beside) * self._area[row, column]
+            if step * float(weight.sum()) > least:
+                found.append((step * float(weight.sum()), number))
+        return [number for _, number in sorted(found, key=lambda pair: -pair[0])]
+
+
+def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "do that") -> None:
+    """Raise UserError for a planner that does not honour `RGBDFrame.target`. name, task: of the
+    planner, and what it should do; for the error."""
+    if not takes_targets(plan):
+        raise UserError(
+            f"{name} does not tell objects apart (it has no method segments(frame), see "
+            f"docs/planner.md), so that it cannot {task}; heuristic, graspnet, oracle and their 6d "
+            "variants can"
+        )
+
+
+def check_reached(grasps: Sequence[Grasp], clearing: Sequence[Grasp]) -> list[str]:
+    """A remark on a target that is not free yet. Raises UserError for one that no grasp reaches,
+    and in whose way nothing lies that could be moved."""
+    if grasps and clearing:
+        return [
+            "something is in the target's way or may rest on it: `clearing` moves it aside first"
+        ]
+    if grasps:
+        return []
+    if not clearing:
+        raise UserError(
+            "no grasp reaches the target, and nothing beside it can be moved aside; try another "
+            "view or --planner graspnet6d, whose hand comes from any side"
+        )
+    return ["no grasp reaches the target yet; `clearing` moves aside what is in its way"]

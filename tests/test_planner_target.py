@@ -1,0 +1,87 @@
+"""What has to be moved aside before the target can be grasped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.planner_target import TargetPlanner
+from models.planners import make_planner
+from tests.helpers.box_frames import boxes_frame
+from utils.errors import UserError
+from utils.geometry import GripperGeometry, Workspace
+from utils.transforms import Grasp, RGBDFrame
+
+# A flat box between two walls of boxes: no finger fits beside it, whose long side is too wide.
+FLAT = ((0.03, 0.09, 0.03), 0.0, (0.5, 0.0))
+TALL = [((0.03, 0.09, 0.06), 0.0, (0.5 + side * 0.035, 0.0)) for side in (-1, 1)]
+FAR = ((0.04, 0.06, 0.05), 0.0, (0.5, 0.11))
+
+
+def plan_for(name: str = "heuristic") -> TargetPlanner:
+    return TargetPlanner(make_planner(name, GripperGeometry(), Workspace(), 0))
+
+
+def frame_of(boxes, wanted=FLAT) -> RGBDFrame:
+    """The frame of boxes, with the pixels of the wanted one as its target."""
+    frame = boxes_frame(boxes)
+    points = frame.points()
+    size, _, place = wanted
+    inside = (np.abs(points[..., :2] - place) < np.array(size[:2]) / 2 + 0.001).all(axis=-1)
+    return replace(
+        frame, target=inside & (points[..., 2] > 0.004) & (points[..., 2] < size[2] + 0.001)
+    )
+
+
+def is_of(grasp: Grasp, box) -> bool:
+    size, _, place = box
+    return bool((np.abs(grasp.position[:2] - place) < np.array(size[:2]) / 2 + 0.003).all())
+
+
+def test_a_free_target_is_grasped_as_the_planner_would() -> None:
+    plan, frame = plan_for(), frame_of([FLAT, FAR])
+    grasps = plan(frame)
+    assert grasps and [g.quality for g in grasps] == [g.quality for g in plan.plan(frame)]
+    assert all(is_of(grasp, FLAT) for grasp in grasps)
+
+
+@pytest.mark.parametrize("name", ["heuristic", "oracle"])
+def test_neighbours_in_the_way_come_first_and_the_target_when_they_are_gone(name: str) -> None:
+    plan = plan_for(name)
+    first = plan(frame_of([FLAT, *TALL, FAR]))[0]
+    assert any(is_of(first, box) for box in TALL)
+    # With both gone the target is free; the box 11 cm away is never touched.
+    assert is_of(plan(frame_of([FLAT, FAR]))[0], FLAT)
+
+
+def test_what_lies_where_the_target_was_last_seen_is_moved_aside() -> None:
+    plan = plan_for()
+    plan(frame_of([FLAT, *TALL, FAR]))
+    cover = ((0.04, 0.10, 0.06), 0.0, (0.5, 0.0))  # has fallen over it
+    hidden = boxes_frame([cover, FAR])
+    hidden = replace(hidden, target=np.zeros(hidden.depth.shape, bool))
+    assert is_of(plan(hidden)[0], cover)
+    plan.reset(1)  # another scene: the target has never been seen
+    assert plan(hidden) == []
+
+
+def test_of_what_cannot_be_grasped_yet_the_neighbours_are_moved_aside() -> None:
+    """The neighbours of the target are wider than the hand; a third object stands beside each."""
+    wide = [((0.085, 0.10, 0.05), 0.0, (0.5 + side * 0.0625, 0.0)) for side in (-1, 1)]
+    third = ((0.03, 0.05, 0.08), 0.0, (0.57, 0.085))
+    plan = plan_for()
+    frame = frame_of([FLAT, *wide, third])
+    assert plan.plan(frame) == []
+    assert is_of(plan(frame)[0], third)
+
+
+def test_a_frame_without_a_target_is_planned_as_ever() -> None:
+    plan, frame = plan_for(), boxes_frame([FLAT, FAR])
+    np.testing.assert_equal([g.quality for g in plan(frame)], [g.quality for g in plan.plan(frame)])
+
+
+def test_a_planner_that_cannot_tell_objects_apart_is_refused() -> None:
+    with pytest.raises(UserError, match=r"segments\(frame\)"):
+        plan_for("random")

@@ -1,0 +1,112 @@
+"""The part of a user's image to plan on, and whether it shows enough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from utils.errors import UserError
+from utils.geometry import Workspace
+from utils.transforms import RGBDFrame, look_at
+from utils.user_view import LARGEST, SMALLEST, check_view, given_workspace, workspace_of
+
+FOCAL, SIDE, UP = 300.0, 480, 1.5  # a camera 1.5 m over the table, which shows 2.4 m of it
+K = np.array([[FOCAL, 0, (SIDE - 1) / 2], [0, FOCAL, (SIDE - 1) / 2], [0, 0, 1.0]])
+T_WC = look_at((0.0, 0.0, UP), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # right is x, up in the image is y
+
+
+def scene(*boxes: tuple[float, float, float], height: float = 0.05) -> RGBDFrame:
+    """Squares (x, y, side) that are raised over the table, in metres; exact at their tops."""
+    v, u = np.mgrid[:SIDE, :SIDE]
+    depth = np.full((SIDE, SIDE), UP, np.float32)
+    for x, y, side in boxes:
+        at = UP - height
+        on_x, on_y = (u - K[0, 2]) / FOCAL * at, -(v - K[1, 2]) / FOCAL * at
+        depth[(np.abs(on_x - x) <= side / 2) & (np.abs(on_y - y) <= side / 2)] = at
+    return RGBDFrame(np.zeros((SIDE, SIDE, 3), np.uint8), depth, K, T_WC)
+
+
+def test_a_small_scene_gets_the_smallest_square_around_it() -> None:
+    workspace, remarks = workspace_of(scene((0.3, -0.2, 0.06)), 0.0)
+    np.testing.assert_allclose(workspace.centre, (0.3, -0.2), atol=0.01)
+    assert (workspace.size, workspace.table_height, remarks) == (SMALLEST, 0.0, [])
+
+
+def test_the_square_holds_all_matter_with_a_margin() -> None:
+    workspace, remarks = workspace_of(scene((-0.2, 0.1, 0.1), (0.4, 0.0, 0.1)), 0.0)
+    # From x = -0.25 to 0.45, and 2 cm more on both sides; y from -0.05 to 0.15.
+    np.testing.assert_allclose(workspace.centre, (0.1, 0.05), atol=0.01)
+    assert workspace.size == pytest.approx(0.74, abs=0.02) and remarks == []
+
+
+def test_single_pixels_of_noise_do_not_count() -> None:
+    frame = scene((0.3, -0.2, 0.06))
+    depth = frame.depth.copy()
+    depth[5, 5] = depth[400, 20] = 1.2
+    # A pixel spans 5 mm here, a quarter of the 1 cm squares that have to be filled by a fifth.
+    depth = np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1)
+    depth[11, 11] = depth[10, 11] = depth[11, 10] = UP  # 2.5 mm are left
+    depth[801, 41] = depth[800, 41] = depth[801, 40] = UP
+    fine = np.diag([2.0, 2.0, 1.0]) @ K
+    fine[:2, 2] += 0.5
+    workspace, _ = workspace_of(replace(frame, depth=depth, K=fine), 0.0)
+    np.testing.assert_allclose(workspace.centre, (0.3, -0.2), atol=0.01)
+
+
+def test_an_empty_table_is_searched_where_the_camera_looks() -> None:
+    workspace, _ = workspace_of(scene(), 0.0)
+    np.testing.assert_allclose(workspace.centre, (0, 0), atol=1e-6)
+    assert workspace.size == SMALLEST
+
+
+def test_of_a_scene_that_is_too_large_the_middle_or_the_place_of_the_target_is_searched() -> None:
+    frame = scene((-0.8, 0.0, 0.1), (0.0, 0.1, 0.1), (0.8, 0.0, 0.1))
+    workspace, remarks = workspace_of(frame, 0.0)
+    assert (
+        workspace.size == LARGEST
+        and len(remarks) == 1
+        and "1.7 m" in remarks[0]
+        and "middle of the view" in remarks[0]
+    )
+    np.testing.assert_allclose(workspace.centre, (0.0, 0.05), atol=0.01)
+    marked = np.zeros((SIDE, SIDE), bool)
+    marked[200:280, 390:] = True
+    workspace, remarks = workspace_of(frame, 0.0, marked)
+    # The square ends where the matter ends, at 0.85 and 2 cm of margin.
+    assert workspace.centre[0] == pytest.approx(0.87 - LARGEST / 2, abs=0.01)
+    assert "around the target" in remarks[0]
+
+
+def test_a_given_workspace() -> None:
+    assert given_workspace((0.5, 0.1, 0.3), 0.02) == Workspace((0.5, 0.1), 0.3, 0.02)
+    for size in (0.1, 1.2, np.nan):
+        with pytest.raises(UserError, match="a side of 0.15 to 1 m"):
+            given_workspace((0.5, 0.1, size), 0.02)
+
+
+@pytest.mark.parametrize(("degrees", "remarks"), [(0, 0), (40, 0), (60, 1), (80, None)])
+def test_an_oblique_view_is_named_and_a_very_oblique_one_refused(degrees, remarks) -> None:
+    tilt = np.deg2rad(degrees)
+    T_WC = look_at((-np.sin(tilt), 0, np.cos(tilt)), (0, 0, 0), (0, 1, 0))
+    frame = replace(scene(), T_WC=T_WC)
+    if remarks is None:
+        with pytest.raises(UserError, match=f"too oblique: the camera looks {degrees} degrees"):
+            check_view(frame, Workspace((0.0, 0.0)))
+    else:
+        assert len(check_view(frame, Workspace((0.0, 0.0)))) == remarks
+
+
+@pytest.mark.parametrize(("share", "remarks"), [(0.2, 0), (0.4, 1), (0.6, None)])
+def test_missing_depth_is_named_and_too_much_of_it_refused(share, remarks) -> None:
+    frame = scene()
+    depth = frame.depth.copy()
+    depth[np.random.default_rng(0).random(depth.shape) < share] = 0
+    depth[:, :100] = 0  # beside the workspace, which is 0.5 m away from there
+    frame = replace(frame, depth=depth)
+    if remarks is None:
+        with pytest.raises(UserError, match="too much is unseen"):
+            check_view(frame, Workspace((0.0, 0.0)))
+    else:
+        assert len(check_view(frame, Workspace((0.0, 0.0)))) == remarks

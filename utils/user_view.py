@@ -1,0 +1,124 @@
+"""What the image of any camera shows of a scene: the part to plan on, and whether it shows enough.
+
+A planner works on a square of the table. `workspace_of` finds the square that holds what stands on
+the table; `check_view` refuses an image that shows too little for grasps to be more than a guess.
+This module knows no planner and no file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from utils.depth import depth_of_plane
+from utils.errors import UserError
+from utils.geometry import Workspace
+from utils.transforms import RGBDFrame, deproject, known_depth
+
+LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
+SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
+MARGIN = 0.02  # m around what stands on the table
+_BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
+
+# The network has learned from above, and planners are measured up to 45 degrees off the vertical
+# (docs/six_dof.md). At 70 degrees an object hides the table behind it for 2.7 times its height.
+OBLIQUE, MOST_OBLIQUE = 45.0, 70.0  # degrees
+MANY_UNSEEN, MOST_UNSEEN = 0.25, 0.5  # shares of the workspace's pixels whose depth is unknown
+
+
+def workspace_of(
+    frame: RGBDFrame, table_height: float, marked: np.ndarray | None = None
+) -> tuple[Workspace, list[str]]:
+    """The square of the table that holds all matter that a frame shows above it, and remarks.
+
+    A square of SMALLEST at least; around where the optical axis meets the table where no matter is
+    seen. Where the matter is spread over more than LARGEST, the square has that side and lies
+    around the pixels that the user has `marked` (H, W), else around the optical axis, and a remark
+    says so.
+    """
+    points = frame.points()
+    raised = np.isfinite(points[..., 2]) & (points[..., 2] > table_height + LOWEST)
+    middle, place = _looked_at(frame, table_height), "in the middle of the view"
+    if marked is not None and (marked & raised).any():
+        middle, place = np.median(points[marked & raised][:, :2], axis=0), "around the target"
+    xy = points[raised][:, :2]
+    if len(xy):
+        cells, cell_of = np.unique(np.floor(xy / _BIN).astype(int), axis=0, return_inverse=True)
+        area = frame.depth[raised] ** 2 / (frame.K[0, 0] * frame.K[1, 1])
+        filled = np.bincount(cell_of.ravel(), area) > _FILLED * _BIN**2
+        xy = cells[filled] * _BIN + _BIN / 2
+    if len(xy) == 0:
+        return Workspace(_pair(middle), SMALLEST, table_height), []
+    low, high = xy.min(axis=0) - MARGIN, xy.max(axis=0) + MARGIN
+    size = float((high - low).max())
+    if size <= LARGEST:
+        return Workspace(_pair((low + high) / 2), max(size, SMALLEST), table_height), []
+    inwards = np.minimum(np.maximum(middle, low + LARGEST / 2), high - LARGEST / 2)
+    centre = np.where(high - low < LARGEST, (low + high) / 2, inwards)
+    remark = (
+        f"what is above the table is spread over {size:.1f} m, so that only the square of "
+        f"{LARGEST:g} m {place} was searched; give --workspace or crop the image"
+    )
+    return Workspace(_pair(centre), LARGEST, table_height), [remark]
+
+
+def given_workspace(numbers: Sequence[float], table_height: float) -> Workspace:
+    """The square of [x, y, size], metres in W. Raises UserError for one of another size than
+    SMALLEST / 2 to LARGEST."""
+    x, y, size = numbers
+    if not np.isfinite([x, y, size]).all() or not SMALLEST / 2 <= size <= LARGEST:
+        raise UserError(
+            f"--workspace {x:g} {y:g} {size:g}: expected the centre and a side of "
+            f"{SMALLEST / 2:g} to {LARGEST:g} m"
+        )
+    return Workspace((x, y), size, table_height)
+
+
+def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
+    """Remarks on a view that shows little. Raises UserError for one from which grasps would be
+    guessed: too oblique, or with too little of the workspace in the image or measured."""
+    tilt = float(np.rad2deg(np.arccos(np.clip(-frame.T_WC[2, 2], -1, 1))))
+    if tilt > MOST_OBLIQUE:
+        raise UserError(
+            f"the view is too oblique: the camera looks {tilt:.0f} degrees off the table's normal, "
+            f"at most {MOST_OBLIQUE:g} are allowed; look more from above"
+        )
+    remarks = []
+    if tilt > OBLIQUE:
+        remarks.append(
+            f"the camera looks {tilt:.0f} degrees off the table's normal; planners are measured up "
+            f"to {OBLIQUE:g} degrees alone"
+        )
+    unseen = unseen_share(frame, workspace)
+    if unseen > MOST_UNSEEN:
+        raise UserError(
+            f"too much is unseen: {unseen:.0%} of the place that was searched has no depth, at "
+            f"most {MOST_UNSEEN:.0%} are allowed; give a better depth image or another view"
+        )
+    if unseen > MANY_UNSEEN:
+        remarks.append(f"{unseen:.0%} of the place that was searched has no depth")
+    return remarks
+
+
+def unseen_share(frame: RGBDFrame, workspace: Workspace) -> float:
+    """Share of the pixels that look at the workspace, through it at the table's height, whose depth
+    is unknown; 1 where none does."""
+    depth = depth_of_plane(frame, workspace.table_height)
+    v, u = np.nonzero((depth > 0) & np.isfinite(depth))
+    foot = deproject(np.column_stack([u, v]), depth[v, u], frame.K, frame.T_WC)
+    inside = np.abs(foot[:, :2] - workspace.centre).max(axis=1) <= workspace.size / 2
+    known = known_depth(frame.depth)[v, u][inside]
+    return float(1 - known.mean()) if len(known) else 1.0
+
+
+def _looked_at(frame: RGBDFrame, table_height: float) -> np.ndarray:
+    """(2,) where the optical axis meets the table; the camera's foot where it does not."""
+    eye, axis = frame.T_WC[:3, 3], frame.T_WC[:3, 2]
+    if axis[2] > -0.1:
+        return eye[:2]
+    return (eye + axis * (table_height - eye[2]) / axis[2])[:2]
+
+
+def _pair(xy: np.ndarray) -> tuple[float, float]:
+    return float(xy[0]), float(xy[1])
