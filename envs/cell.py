@@ -19,8 +19,8 @@ from envs.board import Board
 from envs.cell_layout import EMPTY, Scene, on_table
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
-from envs.views import side_view
 from envs.robot_safety import ArmGate
+from envs.views import side_view
 from utils.config import CameraConfig, Config
 from utils.depth import NoiseStream, seeded_noise
 from utils.domain_randomization import Randomizable
@@ -122,11 +122,12 @@ class Cell(ABC):
 
     gui: show the cell in a window. dt: s, a physics step. home: (7,) rad. gripper: the robot's
     hand. has_arm: whether an arm carries it. robot, camera: see `envs.robot.Robot`, in whose place
-    a cell without an arm has an `envs.floating_hand.FloatingHand`, and `envs.cell.Camera`. bodies: the simulator's
-    numbers of the objects. remaining: numbers of the objects still in the round. steps, frames:
-    taken since the scene was built. Callbacks, each called with the cell: on_build when a scene has
-    been built and nothing has moved yet, before_step before every physics step (to disturb the
-    objects), on_step after it (to film). view: changes what cameras see; None changes nothing.
+    a cell without an arm has an `envs.floating_hand.FloatingHand`, and `envs.cell.Camera`. bodies:
+    the simulator's numbers of the objects. remaining: numbers of the objects still in the round.
+    steps, frames: taken since the scene was built. Callbacks, each called with the cell: on_build
+    when a scene has been built and nothing has moved yet, before_step before every physics step (to
+    disturb the objects), on_step after it (to film). view: changes what cameras see; None changes
+    nothing.
     sample: the randomisation drawn for this scene alone (`utils.domain_randomization`), None for a
     nominal cell. on_action: changes each action of a policy that moves the hand step by step; None
     leaves it as it is. taught: (4, 4) T_CE that `envs.scenarios.teach` has measured with this
@@ -352,7 +353,9 @@ class Cell(ABC):
             if camera.view == "fixed":
                 return look_at(camera.position, camera.target, camera.up)
             if self.scene is None:
-                raise ValueError("A side view follows the scene's seed; build or load a scene first")
+                raise ValueError(
+                    "A side view follows the scene's seed; build or load a scene first"
+                )
             return side_view(camera, self.config.workspace, self.scene.seed)
         return self.robot.encoder_pose() @ wrist_mount(camera)
 

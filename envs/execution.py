@@ -1,8 +1,9 @@
 """Execute planned grasps with the whole arm and judge them: the only place that says success.
 
 Labelling, evaluation and demonstrations all call `execute_grasp`, so they agree on what a
-successful grasp is; `envs.floating_execution` judges those of a hand without an arm. `utils.result_records.FAILURES` lists the reasons of failed attempts. This
-module does not know how grasps are planned.
+successful grasp is; `envs.floating_execution` judges those of a hand without an arm.
+`utils.result_records.FAILURES` lists the reasons of failed attempts. This module does not know how
+grasps are planned.
 """
 
 from __future__ import annotations

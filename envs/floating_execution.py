@@ -36,13 +36,13 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
 
     The hand is put PREGRASP before the grasp, as wide open as the gripper's `opens_fully` says, and
     moves at execution.approach_speed. A contact where it is put is a `collision`, and so is one on
-    its way in, unless execution.on_contact is `grip`: then the hand stops and closes there. Success:
-    after a retreat of RETREAT, along the approach or, from a side, straight up, both fingers grip
-    one object and are more than LEAST_WIDTH of the widest opening apart. `missed`: nothing was ever
-    between the fingers, or too narrow a thing. `slipped`: an object was, and was lost. A picked
-    object is removed. With execution.strict, an object may also not move in the hand. At the end of
-    an attempt the hand is away and the objects have come to rest. Raises PhysicsError when the
-    simulation blows up.
+    its way in, unless execution.on_contact is `grip`: then the hand stops and closes there.
+    Success: after a retreat of RETREAT, along the approach or, from a side, straight up, both
+    fingers grip one object and are more than LEAST_WIDTH of the widest opening apart. `missed`:
+    nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was, and was
+    lost. A picked object is removed. With execution.strict, an object may also not move in the
+    hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
+    PhysicsError when the simulation blows up.
     """
     hand = floating_hand(cell)
     cell.check_physics()
@@ -85,10 +85,10 @@ def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
         cell.step()
         if hand.contact_force() > 0.0:
             if cell.config.execution.on_contact == "grip":
-                break
+                hand.hold()
+                return
             left = float((grasp.position - hand.tip_pose()[:3, 3]) @ grasp.approach)
             raise GraspFailure("collision", f"{1000 * left:.0f} mm before the grasp")
-    hand.hold()
 
 
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:

@@ -176,7 +176,7 @@ class MujocoHand(Hand):
     carriers: names of the joints that carry the hand. The fingers have the last actuator.
     """
 
-    carriers: tuple[str, ...]
+    _carriers: tuple[str, ...]
 
     def _compile(self, spec: mujoco.MjSpec, substeps: int) -> None:
         self._mujoco = load_mujoco()
@@ -184,7 +184,7 @@ class MujocoHand(Hand):
         self.substeps = substeps
         self.model = spec.compile()
         self.data = self._mujoco.MjData(self.model)
-        joints = [self.model.joint(name) for name in (*self.carriers, *FINGER_JOINTS)]
+        joints = [self.model.joint(name) for name in (*self._carriers, *FINGER_JOINTS)]
         self._places = [joint.qposadr[0] for joint in joints]
         self._speeds = [joint.dofadr[0] for joint in joints]
         bodies = [self.model.body(i) for i in range(self.model.nbody)]
@@ -286,7 +286,7 @@ class MujocoPanda(MujocoHand, Robot):
     UserError without MuJoCo.
     """
 
-    carriers = ARM_JOINTS
+    _carriers = ARM_JOINTS
 
     def __init__(
         self,
@@ -395,7 +395,7 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
     """The hand without the arm in a model made from `floating_spec`; arguments as of
     `MujocoPanda`."""
 
-    carriers = CARRIAGE_JOINTS
+    _carriers = CARRIAGE_JOINTS
 
     def __init__(
         self,

@@ -40,15 +40,15 @@ class PybulletHand(Hand):
     fingers come after them. gripper_gain: factor on the fingers' motor gains, 1 unless changed.
     """
 
-    carriers: list[int]
+    _carriers: list[int]
 
     def _load(self, client: int, urdf: Path) -> None:
         """Load the body and make its joints' nature that of the real hand."""
         self.client = client
         self.gripper_gain = 1.0
-        self.palm = self.carriers[-1]
+        self.palm = self._carriers[-1]
         self.fingers = [self.palm + 1, self.palm + 2]
-        self.joints = [*self.carriers, *self.fingers]
+        self.joints = [*self._carriers, *self.fingers]
         self.body = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
         )
@@ -59,12 +59,16 @@ class PybulletHand(Hand):
             self.body, self.fingers[0], self.body, self.fingers[1], pybullet.JOINT_GEAR,
             [1, 0, 0], [0, 0, 0], [0, 0, 0], physicsClientId=self.client,
         )  # fmt: skip
-        pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=self.client)
+        pybullet.changeConstraint(
+            gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=self.client
+        )
         for link in self.joints:
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=self.client
             )
-        for link in self.fingers:  # Bullet has no inertia of a joint's own, so that the finger has it
+        for (
+            link
+        ) in self.fingers:  # Bullet has no inertia of a joint's own, so that the finger has it
             mass = pybullet.getDynamicsInfo(self.body, link, physicsClientId=self.client)[0]
             pybullet.changeDynamics(
                 self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=self.client
@@ -101,7 +105,10 @@ class PybulletHand(Hand):
 
     def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
         contacts = pybullet.getContactPoints(
-            bodyA=self.body, bodyB=body, linkIndexA=self.fingers[finger], physicsClientId=self.client
+            bodyA=self.body,
+            bodyB=body,
+            linkIndexA=self.fingers[finger],
+            physicsClientId=self.client,
         )
         for contact in contacts:
             x, y, z = contact[7]  # on the body, pointing at the finger
@@ -138,7 +145,7 @@ class PybulletPanda(PybulletHand, Robot):
     position_gain, velocity_gain: factors on the arm motors' gains, 1 unless changed.
     """
 
-    carriers = ARM
+    _carriers = ARM
 
     def __init__(
         self,
@@ -232,7 +239,7 @@ class PybulletPanda(PybulletHand, Robot):
 class PybulletFloatingHand(PybulletHand, FloatingHand):
     """The hand without the arm, on a carriage. urdf: written by `write_panda` with arm=False."""
 
-    carriers = CARRIAGE
+    _carriers = CARRIAGE
 
     def __init__(
         self, client: int, dt: float, urdf: Path, gripper: GripperGeometry, grip_force: float

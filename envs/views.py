@@ -1,4 +1,4 @@
-"""Views from the side, drawn for each scene: where the camera of clutter removal's protocols stands.
+"""Views from the side, drawn for each scene, as protocols of clutter removal have them.
 
 The ranges are keys of the config's section `camera`. This module knows no simulator.
 """
@@ -20,7 +20,8 @@ def side_view(camera: CameraConfig, workspace: WorkspaceConfig, seed: int) -> np
     """
     rng = np.random.default_rng([seed, _STREAM])
     tilt, azimuth = (
-        np.radians(rng.uniform(*bounds)) for bounds in (camera.side_tilt_deg, camera.side_azimuth_deg)
+        np.radians(rng.uniform(*bounds))
+        for bounds in (camera.side_tilt_deg, camera.side_azimuth_deg)
     )
     level, up = np.sin(tilt), np.cos(tilt)
     outwards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
