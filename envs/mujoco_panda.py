@@ -244,7 +244,7 @@ class MujocoHand(Hand):
 
     def palm_touches(self) -> bool:
         """Whether anything presses on the hand itself, not only on its fingers."""
-        hand = [self._links[name] for name in _HAND_LINKS]
+        hand = [number for name, number in self._links.items() if name in _HAND_LINKS]
         numbers = self._robot_contacts()
         bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
         palm = numbers[np.isin(bodies, hand).any(axis=1)]
