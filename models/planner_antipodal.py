@@ -314,9 +314,7 @@ def measure(
     gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
     left_over = left_over[gap >= settings.clearance - tip[left_over]]
     beside = opening[left_over]
-    if (
-        gripper.opens_fully
-    ):  # what may be hidden beside the contacts counts, wherever the fingers are
+    if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
         beside = np.minimum(beside, width[left_over] + 2 * settings.rooms[-1])
     under = gripper.finger_underside(near[left_over] - beside[:, None] / 2)
     over = heights.ceiling.take(where[left_over]) - under[:, None]

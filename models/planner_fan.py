@@ -156,7 +156,7 @@ class HeuristicFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         overhead = height_map_from_frame(frame, self.workspace)
-        filled, hiding = without_holes(frame)
+        filled, hiding = without_holes(frame, self.workspace)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)

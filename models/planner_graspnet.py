@@ -175,7 +175,7 @@ class GraspNetFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
-        filled, hiding = without_holes(seen.frame)
+        filled, hiding = without_holes(seen.frame, self.workspace)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(seen.heights, filled, hiding, T_WV)
