@@ -49,7 +49,9 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
         _approach(cell, hand, grasp)
+        hand.yield_to_fingers()
         close_fingers(cell, cell.step)
+        hand.hold()
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         _retreat(cell, hand, grasp)

@@ -23,6 +23,7 @@ from utils.geometry import GripperGeometry
 from utils.transforms import inverse_pose, top_down_pose, transform_points
 
 PARKED_HEIGHT = 1.2  # m over the workspace: above every camera that looks down at it
+YIELDING_FORCE = 2.0  # N, about the friction of a light object on the table
 _FASTEST = HAND_ACCELERATION[0], HAND_JERK[0]  # m/s^2, m/s^3
 
 
@@ -78,6 +79,16 @@ class FloatingHand(Hand):
     def hold(self) -> None:
         """Command the hand to stay where it is."""
         self._send_carriage(self.q, np.zeros(3))
+
+    @abstractmethod
+    def yield_to_fingers(self) -> None:
+        """From now until the next command to the carriage, let the hand give way along its closing
+        line to more than YIELDING_FORCE.
+
+        The fingers move together, and the object is seldom in their middle. One that comes first
+        then pulls the hand along until the other one comes, too, instead of jamming the object
+        against the table. So do the fingers of VGN's hand, each of which has a motor of its own.
+        """
 
     @abstractmethod
     def overlaps(self) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envs.floating_hand import FloatingHand
+from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import (
     ARM_JOINTS,
     ARM_LINKS,
@@ -413,6 +413,12 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
         """(3,) unit vector in W along E's y axis."""
         return self.tip_pose()[:3, 1]
 
+    def yield_to_fingers(self) -> None:
+        self._send(self._limit_force, YIELDING_FORCE)
+
+    def _limit_force(self, force: float) -> None:
+        self.model.actuator_forcerange[1] = [-force, force]
+
     def overlaps(self) -> bool:
         self._mujoco.mj_forward(self.model, self.data)
         return bool((self.data.contact.dist[self._robot_contacts()] <= 0).any())
@@ -438,4 +444,5 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
         self._send(self._follow, q + _DAMPING_RATIO_OF_STIFFNESS * velocity)
 
     def _follow(self, reference: np.ndarray) -> None:
+        self._limit_force(CARRIAGE_FORCE)
         self._reference = reference

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from envs.floating_hand import FloatingHand
+from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import CARRIAGE_FORCE, FINGER_DRIVE_INERTIA
 from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Hand, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
@@ -258,6 +258,12 @@ class PybulletFloatingHand(PybulletHand, FloatingHand):
     def _positions(self, joints: list[int]) -> list[float]:
         states = pybullet.getJointStates(self.body, joints, physicsClientId=self.client)
         return [state[0] for state in states]
+
+    def yield_to_fingers(self) -> None:
+        self._send(
+            pybullet.setJointMotorControl2, self.body, CARRIAGE[1], pybullet.VELOCITY_CONTROL,
+            targetVelocity=0.0, force=YIELDING_FORCE, physicsClientId=self.client,
+        )  # fmt: skip
 
     def overlaps(self) -> bool:
         pybullet.performCollisionDetection(physicsClientId=self.client)
