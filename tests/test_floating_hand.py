@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envs.cell import require_arm
-from envs.cell_layout import Placement, Scene
+from envs.cell_layout import Box, Placement, Scene
 from envs.execution import execute_grasp
 from envs.floating_execution import PREGRASP, clears_table, execute_floating, floating_hand
 from envs.floating_hand import lowest_point
@@ -95,8 +95,8 @@ def test_a_contact_where_the_hand_starts_or_on_its_way_is_a_collision(cell, box_
 
 
 def test_vgns_hand_stops_at_a_contact_and_closes_there(cell, box_set):
-    """2 mm off the middle plane of a cube 7.8 cm wide, a finger lands on its edge: with `grip` the
-    hand closes there, and where nothing is between the fingers it misses."""
+    """A finger lands on the corner of a cube that is too wide: with `grip` the hand closes there,
+    over the cube, and so it misses."""
     cell.load(cube_scene(box_set))
     cell.config = cell.config.model_copy(
         update={"execution": cell.config.execution.model_copy(update={"on_contact": "grip"})}
@@ -108,6 +108,24 @@ def test_vgns_hand_stops_at_a_contact_and_closes_there(cell, box_set):
         cell.config = cell.config.model_copy(
             update={"execution": cell.config.execution.model_copy(update={"on_contact": "fail"})}
         )
+
+
+def test_the_hand_gives_way_to_what_its_fingers_cannot_push(cell, box_set):
+    """A block of 6 cm that does not move, 8 mm off the middle: the hand moves there while it
+    closes, and stays when it is told to hold."""
+    block = Box(np.array([0.03, 0.03, 0.04]), np.array([0.5, 0.008, 0.04]))
+    cell.load(replace(cube_scene(box_set, position=(0.5, 0.14, 0.03)), walls=(block,)))
+    hand = floating_hand(cell)
+    hand.put(cube_grasp(np.pi / 2, offset=(0.0, 0.0, 0.03)).pose)
+    hand.yield_to_fingers()
+    hand.command_gripper(0.0)
+    cell.step(round(1.2 / cell.dt))
+    np.testing.assert_allclose(hand.tip_pose()[:3, 3], (0.5, 0.008, 0.06), atol=2e-3)
+    assert hand.opening == pytest.approx(0.06, abs=2.5e-3) and hand.contact_force() > 10
+    hand.hold()
+    before = hand.q
+    cell.step(60)
+    np.testing.assert_allclose(hand.q, before, atol=1e-3)
 
 
 def test_an_empty_hand_misses_and_so_does_a_thin_grip(cell, box_set):
