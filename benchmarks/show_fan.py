@@ -75,7 +75,7 @@ def views(planner: FanPlanner, frame: RGBDFrame) -> np.ndarray:
     """(H, W, 3) uint8: the frame's height maps in the views of the fan. Bright is near the hand;
     what the camera has not seen is red, up to where it may reach."""
     overhead = height_map_from_frame(frame, planner.workspace)
-    filled, hiding = without_holes(frame)
+    filled, hiding = without_holes(frame, planner.workspace)
     pictures, captions = [], []
     for approach in planner.fan.directions():
         T_WV = tilted_view(approach, planner.workspace)

@@ -18,8 +18,9 @@ from typing_extensions import Self
 from envs.board import Board
 from envs.cell_layout import EMPTY, Scene, on_table
 from envs.robot import Robot
-from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, forward_kinematics, tip_position
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
+from envs.views import side_view
 from utils.config import CameraConfig, Config
 from utils.depth import NoiseStream, seeded_noise
 from utils.domain_randomization import Randomizable
@@ -120,11 +121,13 @@ class Cell(ABC):
     """A simulated robot cell. Close it, or use it in a `with` block.
 
     gui: show the cell in a window. dt: s, a physics step. home: (7,) rad. gripper: the robot's
-    hand. robot, camera: see `envs.robot.Robot` and `envs.cell.Camera`. bodies: the simulator's
-    numbers of the objects. remaining: numbers of the objects still in the round. steps, frames:
-    taken since the scene was built. Callbacks, each called with the cell: on_build when a scene has
-    been built and nothing has moved yet, before_step before every physics step (to disturb the
-    objects), on_step after it (to film). view: changes what cameras see; None changes nothing.
+    hand. has_arm: whether an arm carries it. robot, camera: see `envs.robot.Robot`, in whose place
+    a cell without an arm has an `envs.floating_hand.FloatingHand`, and `envs.cell.Camera`. bodies:
+    the simulator's numbers of the objects. remaining: numbers of the objects still in the round.
+    steps, frames: taken since the scene was built. Callbacks, each called with the cell: on_build
+    when a scene has been built and nothing has moved yet, before_step before every physics step (to
+    disturb the objects), on_step after it (to film). view: changes what cameras see; None changes
+    nothing.
     sample: the randomisation drawn for this scene alone (`utils.domain_randomization`), None for a
     nominal cell. on_action: changes each action of a policy that moves the hand step by step; None
     leaves it as it is. taught: (4, 4) T_CE that `envs.scenarios.teach` has measured with this
@@ -153,6 +156,7 @@ class Cell(ABC):
             )
         config.make_cache_folder()
         self.gripper = config.gripper.geometry
+        self.has_arm = config.robot.arm != "none"
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
         self.steps = self.frames = 0
@@ -346,8 +350,14 @@ class Cell(ABC):
         """(4, 4) T_WC of the overhead or the wrist camera."""
         camera = self.config.camera
         if (mount or camera.mount) == "overhead":
-            return look_at(camera.position, camera.target, camera.up)
-        return forward_kinematics(self.robot.q) @ wrist_mount(camera)
+            if camera.view == "fixed":
+                return look_at(camera.position, camera.target, camera.up)
+            if self.scene is None:
+                raise ValueError(
+                    "A side view follows the scene's seed; build or load a scene first"
+                )
+            return side_view(camera, self.config.workspace, self.scene.seed)
+        return self.robot.encoder_pose() @ wrist_mount(camera)
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:
         """The configured camera's frame; `with_truth` adds the true geometry.
@@ -413,6 +423,12 @@ class Cell(ABC):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def require_arm(config: Config, what: str) -> None:
+    """Raise UserError where the cell has a hand without an arm."""
+    if config.robot.arm == "none":
+        raise UserError(f"robot.arm=none: {what} needs the whole arm; set robot.arm=panda")
 
 
 def not_randomizable(config: Config) -> UserError:

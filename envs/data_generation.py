@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from envs.cell import Cell, PhysicsError, camera_intrinsics
+from envs.cell import Cell, PhysicsError, camera_intrinsics, require_arm
 from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
@@ -94,10 +94,16 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     """Write the shards that the data set of a config still lacks; returns its folder.
 
     rank, ranks: this process makes every ranks-th shard (`torchrun`).
-    Raises UserError if the folder holds data of another config, if labels cannot be executed, or if
-    the workers died or wrote elsewhere. However the generation ends, it finishes the shards under
-    way and begins no others.
+    Raises UserError if the folder holds data of another config, if labels cannot be executed, if
+    robot or camera are not those of training data, or if the workers died or wrote elsewhere.
+    However the generation ends, it finishes the shards under way and begins no others.
     """
+    require_arm(config, "the generation of training data")
+    if config.camera.view != "fixed":
+        raise UserError(
+            f"camera.view={config.camera.view}: training images are taken around camera.position; "
+            "set camera.view=fixed"
+        )
     folder = data_folder(config)
     _claim(folder, config)
     missing = missing_shards(config, folder, rank, ranks)

@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from envs.cell import require_arm
 from envs.cell_scenes import TARGET_LAYOUT, make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
@@ -58,7 +59,10 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     for name in config.evaluate.policies:
         controllers = {controller for _, controller in policies_of(config)}
         planner = None if is_learned(name) else new_planner(name, config, key)
+        if controllers != {OPEN_LOOP}:
+            require_arm(config, "a closed loop")
         if planner is None:
+            require_arm(config, f"{key}: {name}")
             check_learned(name, config.evaluate.scenarios, sorted(controllers), config)
         elif tilts(planner) and controllers != {OPEN_LOOP}:
             raise UserError(
@@ -74,7 +78,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
                 f"{', '.join(calibrations())}, or evaluate.abstain=0"
             )
     make_cell(config).close()
-    check_bin(config)
+    if config.robot.arm != "none":
+        check_bin(config)
     sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
     with open_executor(config.compute, config.evaluate.workers) as workers:
         for name, objects in sets.items():

@@ -1,8 +1,9 @@
 """Execute planned grasps with the whole arm and judge them: the only place that says success.
 
 Labelling, evaluation and demonstrations all call `execute_grasp`, so they agree on what a
-successful grasp is. `utils.result_records.FAILURES` lists the reasons of failed attempts. This
-module does not know how grasps are planned.
+successful grasp is; `envs.floating_execution` judges those of a hand without an arm.
+`utils.result_records.FAILURES` lists the reasons of failed attempts. This module does not know how
+grasps are planned.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.cell import Cell
+from envs.cell import Cell, require_arm
 from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
 from envs.panda_model import FINGER_FORCE
 from envs.robot import Robot
@@ -146,7 +147,7 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     corner = _farther_than(settings.pregrasp_height - _CORNER, target, down)
     way = cell.robot.blended_moves(start, reach, down, corner, **_scales(cell))
 
-    cell.robot.command_gripper(grasp.width)
+    cell.robot.command_gripper(cell.gripper.opening_before(grasp.width))
     above = len(way) - len(down)
     _follow(cell, way[:above])
     _follow(cell, way[above:], partial(cell.robot.stop_on_contact, settings.contact_stop))
@@ -239,6 +240,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
 
     approach: moves the open gripper around the object; everything after it is the same for all.
     """
+    require_arm(cell.config, "execute_grasp")
     cell.check_physics()
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
@@ -267,7 +269,7 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
     """Approach and close: (4, 4) T_WE to which the arm lifts what it feels between the fingers.
     Raises GraspFailure."""
     result = approach(cell, grasp)
-    _close(cell, result.wait)
+    close_fingers(cell, result.wait)
     cell.robot.hold()  # a closed loop sends nothing from here on
     if not cell.robot.grips():
         raise GraspFailure("missed")
@@ -322,7 +324,7 @@ def _carry_to_bin(
         raise GraspFailure(moved[0])
 
 
-def _close(cell: Cell, wait: Callable[[int], None]) -> None:
+def close_fingers(cell: Cell, wait: Callable[[int], None]) -> None:
     """Close the fingers until they stop moving."""
     cell.robot.command_gripper(0.0)
     before = cell.robot.opening

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
-from envs.cell import Cell, PhysicsError
+from envs.cell import Cell, PhysicsError, require_arm
 from envs.cell_layout import on_table
 from envs.cell_scenes import make_scene
 from envs.env_actions import (
@@ -156,6 +156,7 @@ class RobotGraspingEnv(gymnasium.Env):
         config = config if isinstance(config, Config) else load_config(config)
         self.config = _camera_of_env(with_settings(config, "env", settings))
         self.settings = self.config.env
+        require_arm(self.config, "RobotGraspingEnv")
         self.render_mode = render_mode
         self.metadata = self.metadata | {
             "render_fps": round(self.config.sim.frequency / self.settings.substeps)

@@ -22,6 +22,7 @@ from envs.cell_layout import (
     bin_walls,
     table_box,
 )
+from envs.floating_hand import park
 from envs.mujoco_bodies import (
     CONTACT_TIME,
     NO_FRICTION,
@@ -35,7 +36,15 @@ from envs.mujoco_bodies import (
     wake,
 )
 from envs.mujoco_camera import MujocoCamera, Window, add_view
-from envs.mujoco_panda import FINGERS, MujocoPanda, load_mujoco, panda_spec
+from envs.mujoco_panda import (
+    FINGERS,
+    MujocoFloatingHand,
+    MujocoHand,
+    MujocoPanda,
+    floating_spec,
+    load_mujoco,
+    panda_spec,
+)
 from envs.mujoco_randomization import MujocoRandomizable
 from envs.panda_model import FINGER_SURFACE
 from utils.config import Config
@@ -46,12 +55,13 @@ if TYPE_CHECKING:
     import mujoco
 
 
-def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
+def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujoco.MjSpec:
     """A model of Panda, table, bin and the scene's objects at their resting poses, with a camera.
 
-    Bodies are called `table`, `bin0` to `bin3` and `object0` on. Raises UserError without MuJoCo.
+    arm: False for the hand alone. Bodies are called `table`, `bin0` to `bin3` and `object0` on.
+    Raises UserError without MuJoCo.
     """
-    spec = set_up_physics(panda_spec(gripper))
+    spec = set_up_physics(panda_spec(gripper) if arm else floating_spec(gripper))
     for name in FINGERS:
         for geom in spec.body(name).geoms:
             geom.friction = [NO_FRICTION, 0.0, ROLLING]
@@ -60,9 +70,9 @@ def scene_spec(scene: Scene, gripper: GripperGeometry) -> mujoco.MjSpec:
         add_boxes(spec, f"bin{i}", [wall], BIN_COLOUR)
     for i, placed in enumerate(scene.placements):
         add_object(spec, f"object{i}", placed.model, placed.position, placed.quaternion)
-    # The base stands on the table.
-    exclude = spec.add_exclude()
-    exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
+    if arm:  # whose base stands on the table
+        exclude = spec.add_exclude()
+        exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
     for geom in spec.geoms:
         geom.solref[0] = CONTACT_TIME
     _add_pairs(spec, len(scene.placements))
@@ -112,14 +122,17 @@ class MujocoCell(Cell):
 
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
         self._free_camera()
-        spec = scene_spec(scene, self.gripper)
+        spec = scene_spec(scene, self.gripper, self.has_arm)
         if board is not None:
             add_board(spec, board, T_WO)
         self.robot = self._make_robot(spec)
         model = self.robot.model
         # `check_physics` reports a diverged simulation, which MuJoCo would silently reset.
         model.opt.disableflags |= self._mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.robot.place(self.home)
+        if self.has_arm:
+            self.robot.place(self.home)
+        else:
+            park(self.robot, self.config.workspace)
         names = [f"object{i}" for i in range(len(scene.placements))]
         self.bodies = [model.body(name).id for name in names]
         self._places = [model.joint(name).qposadr[0] for name in names]
@@ -129,9 +142,11 @@ class MujocoCell(Cell):
         if self._window is not None:
             self._window.show(model, self.robot.data)
 
-    def _make_robot(self, spec: mujoco.MjSpec) -> MujocoPanda:
-        grip_force = self.config.robot.grip_force
-        return MujocoPanda(spec, self.dt, SUBSTEPS, self.gripper, grip_force, self._new_gate())
+    def _make_robot(self, spec: mujoco.MjSpec) -> MujocoHand:
+        known = spec, self.dt, SUBSTEPS, self.gripper, self.config.robot.grip_force
+        if not self.has_arm:
+            return MujocoFloatingHand(*known)
+        return MujocoPanda(*known, self._new_gate())
 
     def randomizable(self) -> MujocoRandomizable:
         if self._randomizable is None:

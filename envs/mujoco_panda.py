@@ -1,4 +1,4 @@
-"""The Panda in MuJoCo: the links of `envs.panda_model`, servos, gripper and contacts.
+"""The Panda in MuJoCo, and its hand without the arm: links, servos, gripper and contacts.
 
 This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "mujoco>=3.12,<4".
 """
@@ -6,23 +6,28 @@ This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import (
     ARM_JOINTS,
     ARM_LINKS,
     BASE,
+    CARRIAGE_BASE,
+    CARRIAGE_FORCE,
+    CARRIAGE_JOINTS,
     FINGER_DRIVE_INERTIA,
     FINGER_FORCE,
     FINGER_JOINTS,
     FINGERS,
     HAND,
     Link,
+    floating_links,
     panda_links,
 )
-from envs.robot import DRIVE_GAIN, FINGER_SPEED, Contact, Robot
+from envs.robot import DRIVE_GAIN, FINGER_SPEED, Contact, Hand, Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
     JOINT_TORQUE,
@@ -45,6 +50,7 @@ _HAND_LINKS = (ARM_LINKS[-1], HAND)  # one link in PyBullet's cell
 _STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 _DAMPING_RATIO_OF_STIFFNESS = 0.1  # s
 _ARMATURE = 0.1
+_CARRIAGE_STIFFNESS = 20_000.0  # N/m
 _FINGER_STIFFNESS, _FINGER_DAMPING = 4000.0, 100.0  # N/m, N s/m
 
 
@@ -65,18 +71,45 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     Actuators: seven position servos in radians, and the distance between the fingertips in metres.
     One motor drives both fingers, as in the real hand. Raises UserError without MuJoCo.
     """
-    mujoco = load_mujoco()
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    for link in panda_links(gripper):
-        _add_link(mujoco, spec, link)
+    mujoco, spec = _linked(panda_links(gripper))
     for i, name in enumerate(ARM_JOINTS):
         joint = spec.joint(name)
         joint.armature = _ARMATURE
-        stiffness, torque = _STIFFNESS[i], JOINT_TORQUE[i]
-        _servo(mujoco, spec, name, mujoco.mjtTrn.mjTRN_JOINT, (
-            stiffness, -stiffness, -_DAMPING_RATIO_OF_STIFFNESS * stiffness,
-        ), torque)  # fmt: skip
+        _joint_servo(mujoco, spec, name, _STIFFNESS[i], JOINT_TORQUE[i])
+    _add_gripper(mujoco, spec, gripper)
+    # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
+    for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
+        exclude = spec.add_exclude()
+        exclude.bodyname1, exclude.bodyname2 = one, other
+    return spec
+
+
+def floating_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
+    """A model of the hand without the arm, on its carriage.
+
+    Actuators: three position servos in metres, and the distance between the fingertips. Raises
+    UserError without MuJoCo.
+    """
+    mujoco, spec = _linked(floating_links(gripper))
+    spec.body(CARRIAGE_BASE).mocap = True  # what can be put elsewhere at any time
+    for name in CARRIAGE_JOINTS:
+        _joint_servo(mujoco, spec, name, _CARRIAGE_STIFFNESS, CARRIAGE_FORCE)
+    _add_gripper(mujoco, spec, gripper)
+    return spec
+
+
+def _linked(links: tuple[Link, ...]) -> tuple[Any, mujoco.MjSpec]:
+    """The `mujoco` module and a model of links alone."""
+    mujoco = load_mujoco()
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    for link in links:
+        _add_link(mujoco, spec, link)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return mujoco, spec
+
+
+def _add_gripper(mujoco, spec: mujoco.MjSpec, gripper: GripperGeometry) -> None:
     for name in FINGER_JOINTS:
         spec.joint(name).armature = FINGER_DRIVE_INERTIA
     equal = spec.add_equality()
@@ -93,12 +126,6 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
     fingers = spec.actuator("opening")
     fingers.ctrlrange = [-_beyond(FINGER_FORCE), gripper.max_opening]
     fingers.ctrllimited = True
-    # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
-    for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
-        exclude = spec.add_exclude()
-        exclude.bodyname1, exclude.bodyname2 = one, other
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    return spec
 
 
 def _add_link(mujoco, spec: mujoco.MjSpec, link: Link) -> None:
@@ -124,6 +151,11 @@ def _beyond(force: float) -> float:
     return force / _FINGER_STIFFNESS
 
 
+def _joint_servo(mujoco, spec, name: str, stiffness: float, force: float) -> None:
+    gains = stiffness, -stiffness, -_DAMPING_RATIO_OF_STIFFNESS * stiffness
+    _servo(mujoco, spec, name, mujoco.mjtTrn.mjTRN_JOINT, gains, force)
+
+
 def _servo(mujoco, spec, target: str, kind, gains, force: float) -> None:
     """force = gain x control + position gain x position + velocity gain x velocity, limited.
 
@@ -137,13 +169,124 @@ def _servo(mujoco, spec, target: str, kind, gains, force: float) -> None:
     actuator.forcerange, actuator.forcelimited = [-force, force], True
 
 
-class MujocoPanda(Robot):
+class MujocoHand(Hand):
+    """What hand and fingers do in a MuJoCo model, whatever carries them; `model` and `data` are
+    MuJoCo's.
+
+    carriers: names of the joints that carry the hand. The fingers have the last actuator.
+    """
+
+    _carriers: tuple[str, ...]
+
+    def _compile(self, spec: mujoco.MjSpec, substeps: int) -> None:
+        self._mujoco = load_mujoco()
+        spec.option.timestep = self.dt / substeps
+        self.substeps = substeps
+        self.model = spec.compile()
+        self.data = self._mujoco.MjData(self.model)
+        joints = [self.model.joint(name) for name in (*self._carriers, *FINGER_JOINTS)]
+        self._places = [joint.qposadr[0] for joint in joints]
+        self._speeds = [joint.dofadr[0] for joint in joints]
+        bodies = [self.model.body(i) for i in range(self.model.nbody)]
+        self._links = {body.name: body.id for body in bodies if body.name.startswith("panda_")}
+        self.links = list(self._links.values())
+        self._is_robot = np.isin(self.model.geom_bodyid, self.links)
+
+    @property
+    def q(self) -> np.ndarray:
+        """(N,) positions of the joints that carry the hand, rad or m."""
+        return self.data.qpos[self._places[:-2]].copy()
+
+    @property
+    def opening(self) -> float:
+        """Distance between the fingertips, m."""
+        return float(self.data.qpos[self._places[-2:]].sum())
+
+    def pose(self, body: str) -> np.ndarray:
+        """(4, 4) pose in W of a link's frame, by its name in the URDF."""
+        T, found = np.eye(4), self.data.body(body)
+        T[:3, :3], T[:3, 3] = found.xmat.reshape(3, 3), found.xpos
+        return T
+
+    def _send_gripper(self, opening: float, force: float) -> None:
+        self._send(self._drive_fingers, opening, force)
+
+    def _drive_fingers(self, opening: float, force: float) -> None:
+        self.model.actuator_forcerange[-1] = [-force, force]
+        # A closing hand aims beyond closed, so that it also grips a thin object with all its force.
+        self._opening = opening or -_beyond(force)
+
+    def _move_fingers(self) -> None:
+        """The fingers' target of one period."""
+        control, reach = self.data.ctrl, 2 * FINGER_SPEED * self.dt
+        # Fingers that an object has stopped open from where they are.
+        control[-1] = max(control[-1], min(self._opening, self.opening))
+        control[-1] += min(max(self._opening - control[-1], -reach), reach)
+
+    def finger_force(self) -> float:
+        """Newtons a finger with which the motor closes it."""
+        return -float(self.data.actuator_force[-1])
+
+    # --- Contacts -----------------------------------------------------------------------------
+
+    def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
+        for number, normal in self._contacts_between(self._links[FINGERS[finger]], body):
+            yield tuple(normal.tolist()), self._normal_force(number)
+
+    def touches(self) -> bool:
+        """Whether anything touches the robot."""
+        return len(self._robot_contacts()) > 0
+
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body, by MuJoCo's number, are in contact."""
+        touching = self.data.contact.geom[self._robot_contacts()]
+        return bool((self.model.geom_bodyid[touching] == body).any())
+
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        hand = [number for name, number in self._links.items() if name in _HAND_LINKS]
+        numbers = self._robot_contacts()
+        bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
+        palm = numbers[np.isin(bodies, hand).any(axis=1)]
+        return any(self._normal_force(number) > 0 for number in palm)
+
+    def contact_force(self) -> float:
+        """Sum of the normal forces in newtons on the robot by what is not the robot."""
+        return sum(map(self._normal_force, self._robot_contacts()))
+
+    def meet(self, one: int, other: int) -> bool:
+        """Whether two bodies, by MuJoCo's numbers, touch."""
+        return any(True for _ in self._contacts_between(one, other))
+
+    def _robot_contacts(self) -> np.ndarray:
+        """Numbers of the contacts between the robot and anything else."""
+        ours = self._is_robot[self.data.contact.geom]
+        return np.flatnonzero(ours[:, 0] != ours[:, 1])
+
+    def _contacts_between(self, one: int, other: int):
+        """Number of each contact of two bodies, and its normal (3,) in W, into `other`."""
+        contact = self.data.contact
+        for number, bodies in enumerate(self.model.geom_bodyid[contact.geom].tolist()):
+            if bodies == [one, other]:
+                yield number, contact.frame[number, :3]
+            elif bodies == [other, one]:
+                yield number, -contact.frame[number, :3]
+
+    def _normal_force(self, number: int) -> float:
+        force = np.zeros(6)
+        self._mujoco.mj_contactForce(self.model, self.data, number, force)
+        return float(force[0])
+
+
+class MujocoPanda(MujocoHand, Robot):
     """The Panda in a MuJoCo model; `model` and `data` are MuJoCo's.
 
     spec: a model made from `panda_spec`. dt: s, a control period, in which MuJoCo takes `substeps`
     steps of its own. damping_time: s, the arm's servos' damping over their stiffness. Raises
     UserError without MuJoCo.
     """
+
+    _carriers = ARM_JOINTS
 
     def __init__(
         self,
@@ -155,44 +298,17 @@ class MujocoPanda(Robot):
         gate: ArmGate,
     ):
         super().__init__(dt, gripper, grip_force, gate)
-        self._mujoco = load_mujoco()
-        spec.option.timestep = dt / substeps
-        self.substeps = substeps
         self.damping_time = _DAMPING_RATIO_OF_STIFFNESS
-        self.model = spec.compile()
-        self.data = self._mujoco.MjData(self.model)
-        joints = [self.model.joint(name) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
-        self._places = [joint.qposadr[0] for joint in joints]
-        self._speeds = [joint.dofadr[0] for joint in joints]
-        bodies = [self.model.body(i) for i in range(self.model.nbody)]
-        self._links = {body.name: body.id for body in bodies if body.name.startswith("panda_")}
-        self.links = list(self._links.values())
-        self._is_robot = np.isin(self.model.geom_bodyid, self.links)
+        self._compile(spec, substeps)
         self.limit_speed(JOINT_VELOCITY.max())
         self.place(np.zeros(7))
 
     # --- State --------------------------------------------------------------------------------
 
-    @property
-    def q(self) -> np.ndarray:
-        """(7,) joint positions, rad."""
-        return self.data.qpos[self._places[:7]].copy()
-
-    @property
-    def opening(self) -> float:
-        """Distance between the fingertips, m."""
-        return float(self.data.qpos[self._places[7:]].sum())
-
     def state(self) -> list[float]:
         """Joint positions (7, rad), joint velocities (7, rad/s) and the gripper's opening (m)."""
         velocity = self.data.qvel[self._speeds[:7]]
         return [*self.q.tolist(), *velocity.tolist(), self.opening]
-
-    def pose(self, body: str) -> np.ndarray:
-        """(4, 4) pose in W of a link's frame, by its name in the URDF."""
-        T, found = np.eye(4), self.data.body(body)
-        T[:3, :3], T[:3, 3] = found.xmat.reshape(3, 3), found.xpos
-        return T
 
     def tip_pose(self) -> np.ndarray:
         """(4, 4) T_WE."""
@@ -233,23 +349,12 @@ class MujocoPanda(Robot):
         self._goal = q
         self._reference, self._speed = self.q, np.minimum(self._fastest, speeds)
 
-    def _send_gripper(self, opening: float, force: float) -> None:
-        self._send(self._drive_fingers, opening, force)
-
-    def _drive_fingers(self, opening: float, force: float) -> None:
-        self.model.actuator_forcerange[7] = [-force, force]
-        # A closing hand aims beyond closed, so that it also grips a thin object with all its force.
-        self._opening = opening or -_beyond(force)
-
     def step(self, count: int = 1) -> None:
         """Advance by so many control periods."""
         for _ in range(count):
             self.receive(1)
-            control, reach = self.data.ctrl, 2 * FINGER_SPEED * self.dt
-            # Fingers that an object has stopped open from where they are.
-            control[7] = max(control[7], min(self._opening, self.opening))
-            control[7] += min(max(self._opening - control[7], -reach), reach)
-            control[:7] = self._arm_target()
+            self._move_fingers()
+            self.data.ctrl[:7] = self._arm_target()
             self._mujoco.mj_step(self.model, self.data, self.substeps)
             if self._speed is not None:
                 self._hold_back()
@@ -285,56 +390,59 @@ class MujocoPanda(Robot):
         torques = inertial + data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator
         return torques[self._speeds[:7]]
 
-    def finger_force(self) -> float:
-        """Newtons a finger with which the motor closes it."""
-        return -float(self.data.actuator_force[7])
 
-    # --- Contacts -----------------------------------------------------------------------------
+class MujocoFloatingHand(MujocoHand, FloatingHand):
+    """The hand without the arm in a model made from `floating_spec`; arguments as of
+    `MujocoPanda`."""
 
-    def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
-        for number, normal in self._contacts_between(self._links[FINGERS[finger]], body):
-            yield tuple(normal.tolist()), self._normal_force(number)
+    _carriers = CARRIAGE_JOINTS
 
-    def touches(self) -> bool:
-        """Whether anything touches the robot."""
-        return len(self._robot_contacts()) > 0
+    def __init__(
+        self,
+        spec: mujoco.MjSpec,
+        dt: float,
+        substeps: int,
+        gripper: GripperGeometry,
+        grip_force: float,
+    ):
+        super().__init__(dt, gripper, grip_force)
+        self._compile(spec, substeps)
+        self._reference = np.zeros(3)
 
-    def touches_body(self, body: int) -> bool:
-        """Whether the robot and a body, by MuJoCo's number, are in contact."""
-        touching = self.data.contact.geom[self._robot_contacts()]
-        return bool((self.model.geom_bodyid[touching] == body).any())
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis."""
+        return self.tip_pose()[:3, 1]
 
-    def palm_touches(self) -> bool:
-        """Whether anything presses on the hand itself, not only on its fingers."""
-        hand = [self._links[name] for name in _HAND_LINKS]
-        numbers = self._robot_contacts()
-        bodies = self.model.geom_bodyid[self.data.contact.geom[numbers]]
-        palm = numbers[np.isin(bodies, hand).any(axis=1)]
-        return any(self._normal_force(number) > 0 for number in palm)
+    def yield_to_fingers(self) -> None:
+        self._send(self._limit_force, YIELDING_FORCE)
 
-    def contact_force(self) -> float:
-        """Sum of the normal forces in newtons on the robot by what is not the robot."""
-        return sum(map(self._normal_force, self._robot_contacts()))
+    def _limit_force(self, force: float) -> None:
+        self.model.actuator_forcerange[1] = [-force, force]
 
-    def meet(self, one: int, other: int) -> bool:
-        """Whether two bodies, by MuJoCo's numbers, touch."""
-        return any(True for _ in self._contacts_between(one, other))
+    def overlaps(self) -> bool:
+        self._mujoco.mj_forward(self.model, self.data)
+        return bool((self.data.contact.dist[self._robot_contacts()] <= 0).any())
 
-    def _robot_contacts(self) -> np.ndarray:
-        """Numbers of the contacts between the robot and anything else."""
-        ours = self._is_robot[self.data.contact.geom]
-        return np.flatnonzero(ours[:, 0] != ours[:, 1])
+    def step(self, count: int = 1) -> None:
+        """Advance by so many control periods."""
+        for _ in range(count):
+            self.receive(1)
+            self._move_fingers()
+            self.data.ctrl[:3] = self._reference
+            self._mujoco.mj_step(self.model, self.data, self.substeps)
 
-    def _contacts_between(self, one: int, other: int):
-        """Number of each contact of two bodies, and its normal (3,) in W, into `other`."""
-        contact = self.data.contact
-        for number, bodies in enumerate(self.model.geom_bodyid[contact.geom].tolist()):
-            if bodies == [one, other]:
-                yield number, contact.frame[number, :3]
-            elif bodies == [other, one]:
-                yield number, -contact.frame[number, :3]
+    def _put(self, T_WE: np.ndarray, opening: float) -> None:
+        position, quaternion = position_quaternion(T_WE)
+        self.data.mocap_pos[0], self.data.mocap_quat[0] = position, np.roll(quaternion, 1)
+        self.data.qpos[self._places] = [0.0, 0.0, 0.0, opening / 2, opening / 2]
+        self.data.qvel[self._speeds] = 0.0
+        self.data.ctrl[-1] = opening
+        self._mujoco.mj_forward(self.model, self.data)
 
-    def _normal_force(self, number: int) -> float:
-        force = np.zeros(6)
-        self._mujoco.mj_contactForce(self.model, self.data, number, force)
-        return float(force[0])
+    def _send_carriage(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        # The servo's damping brakes the desired motion, too, see `MujocoPanda`.
+        self._send(self._follow, q + _DAMPING_RATIO_OF_STIFFNESS * velocity)
+
+    def _follow(self, reference: np.ndarray) -> None:
+        self._limit_force(CARRIAGE_FORCE)
+        self._reference = reference

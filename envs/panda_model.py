@@ -21,6 +21,7 @@ from envs.robot_kinematics import (
     FLANGE_LENGTH,
     GRASP_DEPTH,
     HAND_TURN,
+    HAND_VELOCITY,
     JOINT_LOWER,
     JOINT_TORQUE,
     JOINT_UPPER,
@@ -36,6 +37,13 @@ HAND = "panda_hand"
 FINGERS = ("panda_leftfinger", "panda_rightfinger")
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+
+# What carries a hand without an arm; the third joint moves the hand itself.
+CARRIAGE_BASE = "panda_carriage"
+_CARRIAGE_LINKS = ("panda_carriage_x", "panda_carriage_y")
+CARRIAGE_JOINTS = ("panda_carriage_joint1", "panda_carriage_joint2", "panda_carriage_joint3")
+CARRIAGE_REACH = 0.3  # m either way along each axis
+CARRIAGE_FORCE = 300.0  # N, of each of its motors: much more than objects on a table push back
 
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's product manual
 
@@ -99,6 +107,9 @@ INERTIALS = {
         FINGERS, Inertial(0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0.0, 0.0, 0.0))
     ),
 }  # fmt: skip
+
+# Of each part of the carriage: a number near the hand's, so that the solver's steps stay good.
+_CARRIAGE_INERTIAL = Inertial(0.5, (0.0, 0.0, 0.0), (0.001, 0.001, 0.001, 0.0, 0.0, 0.0))
 
 
 # --- Surfaces -------------------------------------------------------------------------------------
@@ -350,8 +361,29 @@ def panda_links(gripper: GripperGeometry) -> tuple[Link, ...]:
         T = _pose(*joint_origin(i + 1))
         links.append(Link(name, links[-1].name, T, joint, INERTIALS[name], (shape,)))
     flange = _pose((0.0, 0.0, FLANGE_LENGTH), HAND_TURN, "z")
+    return (*links, *_hand_links(gripper, ARM_LINKS[-1], flange, None))
+
+
+@functools.cache
+def floating_links(gripper: GripperGeometry) -> tuple[Link, ...]:
+    """The hand without the arm: a base that has E's frame, a carriage of three straight joints
+    along its axes, and at the last one hand, left and right finger."""
+    links = [Link(CARRIAGE_BASE, None, np.eye(4), None, _CARRIAGE_INERTIAL, ())]
+    limits = -CARRIAGE_REACH, CARRIAGE_REACH, HAND_VELOCITY[0], CARRIAGE_FORCE
+    axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    joints = [Joint(name, "prismatic", axis, *limits) for name, axis in zip(CARRIAGE_JOINTS, axes)]
+    for name, joint in zip(_CARRIAGE_LINKS, joints):
+        links.append(Link(name, links[-1].name, np.eye(4), joint, _CARRIAGE_INERTIAL, ()))
+    behind = _pose((0.0, 0.0, -GRASP_DEPTH))
+    return (*links, *_hand_links(gripper, links[-1].name, behind, joints[-1]))
+
+
+def _hand_links(
+    gripper: GripperGeometry, parent: str, T: np.ndarray, joint: Joint | None
+) -> list[Link]:
+    """Hand, left and right finger; T: (4, 4) pose of the hand's frame in its parent's."""
     palm = Shape("hand", np.eye(4), palm_hull(gripper))
-    links.append(Link(HAND, ARM_LINKS[-1], flange, None, INERTIALS[HAND], (palm,)))
+    links = [Link(HAND, parent, T, joint, INERTIALS[HAND], (palm,))]
     hull, length = finger_hull(gripper), gripper.finger_outline[-1][1]
     T = _pose((0.0, 0.0, GRASP_DEPTH + gripper.tip_below_centre - length))
     for name, joint_name, side, turn in zip(FINGERS, FINGER_JOINTS, (1.0, -1.0), (0.0, np.pi)):
@@ -361,7 +393,7 @@ def panda_links(gripper: GripperGeometry) -> tuple[Link, ...]:
         )  # fmt: skip
         shape = Shape("finger", _pose(turn=turn, axis="z"), hull)
         links.append(Link(name, HAND, T, joint, INERTIALS[name], (shape,), FINGER_SURFACE))
-    return tuple(links)
+    return links
 
 
 def _pose(offset=(0.0, 0.0, 0.0), turn: float = 0.0, axis: str = "x") -> np.ndarray:

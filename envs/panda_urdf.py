@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from envs.panda_model import Inertial, Joint, Link, Shape, Surface, panda_links
+from envs.panda_model import Inertial, Joint, Link, Shape, Surface, floating_links, panda_links
 from utils.geometry import GripperGeometry
 from utils.runs import write_atomic
 from utils.transforms import transform_points
@@ -36,16 +36,18 @@ def write_panda(
     gripper: GripperGeometry,
     fine: bool = False,
     meshes: Mapping[str, Path] | None = None,
+    arm: bool = True,
 ) -> Path:
     """Write the robot with welded links into the cache folder; the URDF's path.
 
     fine: for pictures, which show `meshes`, the detailed mesh of each part, or the shapes of the
     physics in the real robot's colours where a part has none. Otherwise those shapes are white.
+    arm: False for the hand alone (`floating_links`).
     """
     shown = meshes if fine and meshes else {}
     files: dict[str, bytes] = {}
     robot = ElementTree.Element("robot", name="panda")
-    for link in welded(panda_links(gripper)):
+    for link in welded(panda_links(gripper) if arm else floating_links(gripper)):
         element = _add(robot, "link", name=link.name)
         _add_inertial(element, link.inertial)
         if link.surface is not None:

@@ -13,6 +13,7 @@ import pybullet
 from envs.board import Board
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import CERTAIN_REST_CHECKS, Scene
+from envs.floating_hand import park
 from envs.panda_urdf import write_panda
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
@@ -25,7 +26,7 @@ from envs.pybullet_bodies import (
 )
 from envs.pybullet_camera import PybulletCamera, load_renderer
 from envs.pybullet_files import panda_meshes
-from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
+from envs.pybullet_panda import PybulletFloatingHand, PybulletHand, PybulletPanda
 from envs.pybullet_randomization import PybulletRandomizable
 from utils.config import Config
 from utils.transforms import position_quaternion
@@ -49,7 +50,7 @@ class PybulletCell(Cell):
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         self.camera = PybulletCamera(self.client, load_renderer(self.client, config.sim.renderer))
         meshes = panda_meshes() if fine else None
-        self._urdf = write_panda(config.cache_folder, self.gripper, fine, meshes)
+        self._urdf = write_panda(config.cache_folder, self.gripper, fine, meshes, self.has_arm)
 
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
         # Resetting states alone would leave the solver's memory behind (bullet3 #2442). A build
@@ -57,11 +58,7 @@ class PybulletCell(Cell):
         set_up_physics(self.client, self.config.sim)
         self.table = add_table(self.client, scene.walls)
         self.bin = add_bin(self.client)
-        self.robot = PybulletPanda(
-            self.client, self.dt, self._urdf, self.gripper, self.config.robot.grip_force,
-            self._new_gate(),
-        )  # fmt: skip
-        self.robot.place(self.home)
+        self.robot = self._make_robot()
         self.bodies = [
             spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)
             for p in scene.placements
@@ -70,6 +67,14 @@ class PybulletCell(Cell):
         if board is not None:
             add_board(self.client, board, T_WO)
 
+    def _make_robot(self) -> PybulletHand:
+        known = self.client, self.dt, self._urdf, self.gripper, self.config.robot.grip_force
+        if not self.has_arm:
+            return park(PybulletFloatingHand(*known), self.config.workspace)
+        robot = PybulletPanda(*known, self._new_gate())
+        robot.place(self.home)
+        return robot
+
     def detailed_twin(self) -> PybulletCell:
         return PybulletCell(self.config, fine=True)
 
@@ -77,10 +82,7 @@ class PybulletCell(Cell):
         """Show another cell's scene, with robot and objects where they are there now."""
         if self.scene is not cell.scene:
             self.build(cell.scene)
-        joints = [*ARM, *FINGERS]
-        states = pybullet.getJointStates(cell.robot.body, joints, physicsClientId=cell.client)
-        for joint, state in zip(joints, states):
-            pybullet.resetJointState(self.robot.body, joint, state[0], physicsClientId=self.client)
+        self.robot.mirror(cell.robot)
         for body, copy in zip(cell.bodies, self.bodies):
             pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=cell.client)
             pybullet.resetBasePositionAndOrientation(copy, *pose, physicsClientId=self.client)

@@ -1,4 +1,4 @@
-"""The Panda in PyBullet: model, motors, gripper and contacts.
+"""The Panda in PyBullet, and its hand without the arm: model, motors, gripper and contacts.
 
 This module knows nothing of objects, cameras or grasps; `envs.robot_kinematics` works out where to
 move.
@@ -13,15 +13,18 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from envs.panda_model import FINGER_DRIVE_INERTIA
-from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Robot
+from envs.floating_hand import YIELDING_FORCE, FloatingHand
+from envs.panda_model import CARRIAGE_FORCE, FINGER_DRIVE_INERTIA
+from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Hand, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
 from utils.geometry import GripperGeometry
+from utils.transforms import position_quaternion
 
 # Link numbers in the URDF of `envs.panda_urdf`; the hand is part of the last arm link.
 ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
+CARRIAGE = list(range(3))  # of the hand without the arm, which is part of the last of these
 
 _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_INERTIA_FROM_FILE
 _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
@@ -30,12 +33,119 @@ _STATE_JOINTS = [*ARM, *FINGERS]
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 
 
-class PybulletPanda(Robot):
+class PybulletHand(Hand):
+    """What hand and fingers do in a physics client, whatever carries them.
+
+    carriers: numbers of the joints that carry the hand, which is part of the last one's link; the
+    fingers come after them. gripper_gain: factor on the fingers' motor gains, 1 unless changed.
+    """
+
+    _carriers: list[int]
+
+    def _load(self, client: int, urdf: Path) -> None:
+        """Load the body and make its joints' nature that of the real hand."""
+        self.client = client
+        self.gripper_gain = 1.0
+        self.palm = self._carriers[-1]
+        self.fingers = [self.palm + 1, self.palm + 2]
+        self.joints = [*self._carriers, *self.fingers]
+        self.body = pybullet.loadURDF(
+            str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
+        )
+        self.links = [self.body]
+        # In the real hand one motor drives both fingers. Here each has its share, and a gear keeps
+        # them together: without it they drift off centre (bullet3 #2101).
+        gear = pybullet.createConstraint(
+            self.body, self.fingers[0], self.body, self.fingers[1], pybullet.JOINT_GEAR,
+            [1, 0, 0], [0, 0, 0], [0, 0, 0], physicsClientId=self.client,
+        )  # fmt: skip
+        pybullet.changeConstraint(
+            gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=self.client
+        )
+        for link in self.joints:
+            pybullet.changeDynamics(
+                self.body, link, linearDamping=0, angularDamping=0, physicsClientId=self.client
+            )
+        for (
+            link
+        ) in self.fingers:  # Bullet has no inertia of a joint's own, so that the finger has it
+            mass = pybullet.getDynamicsInfo(self.body, link, physicsClientId=self.client)[0]
+            pybullet.changeDynamics(
+                self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=self.client
+            )
+
+    def mirror(self, other: PybulletHand) -> None:
+        """Be where another cell's robot is now."""
+        states = pybullet.getJointStates(other.body, self.joints, physicsClientId=other.client)
+        for joint, state in zip(self.joints, states):
+            pybullet.resetJointState(self.body, joint, state[0], physicsClientId=self.client)
+
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis, read from the physics."""
+        state = pybullet.getLinkState(self.body, self.fingers[LEFT], physicsClientId=self.client)
+        x, y, z, w = state[5]
+        return np.array([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)])
+
+    def _send_gripper(self, opening: float, force: float) -> None:
+        for finger in self.fingers:
+            self._send(
+                pybullet.setJointMotorControl2, self.body, finger, pybullet.POSITION_CONTROL,
+                targetPosition=opening / 2, force=force,
+                positionGain=self.gripper_gain * _GRIPPER_GAIN, velocityGain=1.0,
+                maxVelocity=FINGER_SPEED,
+                physicsClientId=self.client,
+            )  # fmt: skip
+
+    def finger_force(self) -> float:
+        """Newtons a finger with which the motors close it."""
+        states = pybullet.getJointStates(self.body, self.fingers, physicsClientId=self.client)
+        return -sum(state[3] for state in states) / 2
+
+    # --- Contacts -----------------------------------------------------------------------------
+
+    def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body,
+            bodyB=body,
+            linkIndexA=self.fingers[finger],
+            physicsClientId=self.client,
+        )
+        for contact in contacts:
+            x, y, z = contact[7]  # on the body, pointing at the finger
+            yield (-x, -y, -z), contact[9]
+
+    def touches(self) -> bool:
+        """Whether anything touches the robot, or is so near that Bullet already looks at it."""
+        return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
+
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body are in contact."""
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body, bodyB=body, physicsClientId=self.client
+        )
+        return any(contact[8] <= 0.0 for contact in contacts)
+
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+        contacts = pybullet.getContactPoints(
+            bodyA=self.body, linkIndexA=self.palm, physicsClientId=self.client
+        )
+        return any(contact[9] > 0 for contact in contacts)
+
+    def contact_force(self) -> float:
+        """Sum of the normal forces in newtons on the whole robot."""
+        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
+        return sum(contact[9] for contact in contacts)
+
+
+class PybulletPanda(PybulletHand, Robot):
     """The robot's body in one physics client.
 
     urdf: the model that `envs.panda_urdf.write_panda` has written for this gripper.
-    position_gain, velocity_gain, gripper_gain: factors on the motors' gains, 1 unless changed.
+    position_gain, velocity_gain: factors on the arm motors' gains, 1 unless changed.
     """
+
+    _carriers = ARM
 
     def __init__(
         self,
@@ -47,28 +157,8 @@ class PybulletPanda(Robot):
         gate: ArmGate,
     ):
         super().__init__(dt, gripper, grip_force, gate)
-        self.client = client
-        self.position_gain = self.velocity_gain = self.gripper_gain = 1.0
-        self.body = pybullet.loadURDF(
-            str(urdf), useFixedBase=True, flags=_URDF_FLAGS, physicsClientId=client
-        )
-        self.links = [self.body]
-        # In the real hand one motor drives both fingers. Here each has its share, and a gear keeps
-        # them together: without it they drift off centre (bullet3 #2101).
-        gear = pybullet.createConstraint(
-            self.body, LEFT_FINGER, self.body, RIGHT_FINGER, pybullet.JOINT_GEAR,
-            [1, 0, 0], [0, 0, 0], [0, 0, 0], physicsClientId=client,
-        )  # fmt: skip
-        pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=client)
-        for link in [*ARM, *FINGERS]:
-            pybullet.changeDynamics(
-                self.body, link, linearDamping=0, angularDamping=0, physicsClientId=client
-            )
-        for link in FINGERS:  # Bullet has no inertia of a joint's own, so that the finger has it
-            mass = pybullet.getDynamicsInfo(self.body, link, physicsClientId=client)[0]
-            pybullet.changeDynamics(
-                self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=client
-            )
+        self.position_gain = self.velocity_gain = 1.0
+        self._load(client, urdf)
         self.limit_speed(JOINT_VELOCITY.max())
         self._felt: tuple[int, tuple, tuple] | None = None  # the clock, positions and velocities
 
@@ -89,12 +179,6 @@ class PybulletPanda(Robot):
             for x, y, z, p in ((*R[:3], px), (*R[3:6], py), (*R[6:], pz))
         ]
         return np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
-
-    def closing_direction(self) -> np.ndarray:
-        """(3,) unit vector in W along E's y axis, read from the physics."""
-        state = pybullet.getLinkState(self.body, LEFT_FINGER, physicsClientId=self.client)
-        x, y, z, w = state[5]
-        return np.array([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)])
 
     def place(self, q: np.ndarray, opening: float | None = None) -> None:
         """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""
@@ -134,16 +218,6 @@ class PybulletPanda(Robot):
                 physicsClientId=self.client,
             )  # fmt: skip
 
-    def _send_gripper(self, opening: float, force: float) -> None:
-        for finger in FINGERS:
-            self._send(
-                pybullet.setJointMotorControl2, self.body, finger, pybullet.POSITION_CONTROL,
-                targetPosition=opening / 2, force=force,
-                positionGain=self.gripper_gain * _GRIPPER_GAIN, velocityGain=1.0,
-                maxVelocity=FINGER_SPEED,
-                physicsClientId=self.client,
-            )  # fmt: skip
-
     # --- What the robot feels -----------------------------------------------------------------
 
     def external_torques(self) -> np.ndarray:
@@ -161,41 +235,58 @@ class PybulletPanda(Robot):
         )  # fmt: skip
         return np.array(expected[:7]) - motors[:7]
 
-    def finger_force(self) -> float:
-        """Newtons a finger with which the motors close it."""
-        states = pybullet.getJointStates(self.body, FINGERS, physicsClientId=self.client)
-        return -sum(state[3] for state in states) / 2
 
-    # --- Contacts -----------------------------------------------------------------------------
+class PybulletFloatingHand(PybulletHand, FloatingHand):
+    """The hand without the arm, on a carriage. urdf: written by `write_panda` with arm=False."""
 
-    def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
-        link = LEFT_FINGER if finger == LEFT else RIGHT_FINGER
-        contacts = pybullet.getContactPoints(
-            bodyA=self.body, bodyB=body, linkIndexA=link, physicsClientId=self.client
-        )
-        for contact in contacts:
-            x, y, z = contact[7]  # on the body, pointing at the finger
-            yield (-x, -y, -z), contact[9]
+    _carriers = CARRIAGE
 
-    def touches(self) -> bool:
-        """Whether anything touches the robot, or is so near that Bullet already looks at it."""
-        return bool(pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client))
+    def __init__(
+        self, client: int, dt: float, urdf: Path, gripper: GripperGeometry, grip_force: float
+    ):
+        super().__init__(dt, gripper, grip_force)
+        self._load(client, urdf)
 
-    def touches_body(self, body: int) -> bool:
-        """Whether the robot and a body are in contact."""
-        contacts = pybullet.getContactPoints(
-            bodyA=self.body, bodyB=body, physicsClientId=self.client
-        )
+    @property
+    def q(self) -> np.ndarray:
+        return np.array(self._positions(CARRIAGE))
+
+    @property
+    def opening(self) -> float:
+        return sum(self._positions(self.fingers))
+
+    def _positions(self, joints: list[int]) -> list[float]:
+        states = pybullet.getJointStates(self.body, joints, physicsClientId=self.client)
+        return [state[0] for state in states]
+
+    def yield_to_fingers(self) -> None:
+        self._send(
+            pybullet.setJointMotorControl2, self.body, CARRIAGE[1], pybullet.VELOCITY_CONTROL,
+            targetVelocity=0.0, force=YIELDING_FORCE, physicsClientId=self.client,
+        )  # fmt: skip
+
+    def overlaps(self) -> bool:
+        pybullet.performCollisionDetection(physicsClientId=self.client)
+        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
         return any(contact[8] <= 0.0 for contact in contacts)
 
-    def palm_touches(self) -> bool:
-        """Whether anything presses on the hand itself, not only on its fingers."""
-        contacts = pybullet.getContactPoints(
-            bodyA=self.body, linkIndexA=ARM[-1], physicsClientId=self.client
-        )
-        return any(contact[9] > 0 for contact in contacts)
+    def mirror(self, other: PybulletHand) -> None:
+        super().mirror(other)
+        place = pybullet.getBasePositionAndOrientation(other.body, physicsClientId=other.client)
+        pybullet.resetBasePositionAndOrientation(self.body, *place, physicsClientId=self.client)
 
-    def contact_force(self) -> float:
-        """Sum of the normal forces in newtons on the whole robot."""
-        contacts = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
-        return sum(contact[9] for contact in contacts)
+    def _put(self, T_WE: np.ndarray, opening: float) -> None:
+        position, quaternion = position_quaternion(T_WE)
+        pybullet.resetBasePositionAndOrientation(
+            self.body, position, quaternion, physicsClientId=self.client
+        )
+        for joint, value in zip(self.joints, [0.0, 0.0, 0.0, opening / 2, opening / 2]):
+            pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
+
+    def _send_carriage(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        self._send(
+            pybullet.setJointMotorControlArray, self.body, CARRIAGE, pybullet.POSITION_CONTROL,
+            targetPositions=q, targetVelocities=velocity, forces=[CARRIAGE_FORCE] * 3,
+            positionGains=[_POSITION_GAIN] * 3, velocityGains=[1.0] * 3,
+            physicsClientId=self.client,
+        )  # fmt: skip

@@ -1,8 +1,9 @@
 """The abstract robot: a Panda arm with a gripper and contacts, whatever simulates it.
 
-`envs.pybullet_panda` and `envs.mujoco_panda` implement it. A simulator brings the state, the
-motors and the contacts; motions, grips and the gate that every command to the arm passes are the
-same for all. This module knows no simulator, object, camera or task.
+`Hand` is what the arm's hand and a hand without an arm (`envs.floating_hand`) have in common,
+`Robot` is the whole arm. `envs.pybullet_panda` and `envs.mujoco_panda` implement them. A simulator
+brings the state, the motors and the contacts; motions, grips and the gate that every command to the
+arm passes are the same for all. This module knows no simulator, object, camera or task.
 """
 
 from __future__ import annotations
@@ -43,23 +44,153 @@ _NEARLY_SINGULAR = 1e-9  # added to J J^T, whose least eigenvalue is 0.02 around
 Contact = tuple[tuple[float, float, float], float]  # normal in W, and newtons along it
 
 
-class Robot(ABC):
-    """A robot in one cell. Bodies are the simulator's numbers.
+class Hand(ABC):
+    """A Panda hand in one cell, on an arm or without one. Bodies are the simulator's numbers.
 
-    dt: s, a control period. grip_force: N a finger, unless a command names another force. gate:
-    every command to the arm passes it. gripper: the hand. links: the numbers under which the robot
-    appears in an `Image`. latency: physics steps after which a motor command arrives, 0 unless
-    changed.
+    dt: s, a control period. grip_force: N a finger, unless a command names another force. gripper:
+    its shape. links: the numbers under which the hand, and the arm if it has one, appear in an
+    `Image`. latency: physics steps after which a motor command arrives, 0 unless changed.
     """
 
     links: list[int]
 
-    def __init__(self, dt: float, gripper: GripperGeometry, grip_force: float, gate: ArmGate):
-        self.dt, self.gripper, self.grip_force, self.gate = dt, gripper, grip_force, gate
+    def __init__(self, dt: float, gripper: GripperGeometry, grip_force: float):
+        self.dt, self.gripper, self.grip_force = dt, gripper, grip_force
         self.latency = 0
         self._clock = 0  # physics steps
         self._told_force = grip_force  # N a finger, of the last command to the gripper
         self._underway: deque[tuple[int, Callable[[], object]]] = deque()  # by time of arrival
+
+    # --- State --------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def q(self) -> np.ndarray:
+        """(N,) positions of the joints that carry the hand, rad or m."""
+
+    @property
+    @abstractmethod
+    def opening(self) -> float:
+        """Distance between the fingertips in metres."""
+
+    @property
+    def max_opening(self) -> float:
+        """Widest distance between the fingertips in metres."""
+        return self.gripper.max_opening
+
+    @abstractmethod
+    def tip_pose(self) -> np.ndarray:
+        """(4, 4) T_WE."""
+
+    @abstractmethod
+    def encoder_pose(self) -> np.ndarray:
+        """(4, 4) T_WE by the joints' positions."""
+
+    @abstractmethod
+    def closing_direction(self) -> np.ndarray:
+        """(3,) unit vector in W along E's y axis, from the right finger to the left one."""
+
+    # --- Latency ------------------------------------------------------------------------------
+
+    def receive(self, count: int) -> int:
+        """Carry out the commands that have arrived, and advance the motors' clock by up to `count`
+        physics steps; returns by how many, because no command arrives in between."""
+        while self._underway and self._underway[0][0] <= self._clock:
+            self._underway.popleft()[1]()
+        if self._underway:
+            count = min(count, self._underway[0][0] - self._clock)
+        self._clock += count
+        return count
+
+    def _send(self, command: Callable[..., object], *args: Any, **kwargs: Any) -> None:
+        """Give a motor command, or delay it by the latency; commands arrive in the order given."""
+        if self.latency or self._underway:
+            due = self._clock + self.latency
+            self._underway.append((due, partial(command, *args, **kwargs)))
+        else:
+            command(*args, **kwargs)
+
+    # --- Gripper ------------------------------------------------------------------------------
+
+    def command_gripper(self, opening: float, force: float | None = None) -> None:
+        """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
+        opening = min(max(float(opening), 0.0), self.max_opening)
+        self._told_force = self.grip_force if force is None else force
+        self._send_gripper(opening, self._told_force)
+
+    def open_gripper(self) -> None:
+        """Drive both fingers apart as far as they get."""
+        self.command_gripper(self.max_opening)
+
+    @abstractmethod
+    def _send_gripper(self, opening: float, force: float) -> None:
+        """Give the fingers' motor its goal in metres, FINGER_SPEED a finger being the fastest."""
+
+    def grip_forces(self, body: int) -> tuple[float, float]:
+        """Newtons with which the left and the right finger press a body towards each other; zero
+        where one of them does not touch the body.
+
+        A contact counts only where its normal lies within 70 degrees of the closing line and points
+        inwards: a body that lies on the fingers, or is pushed down by a fist, is not gripped.
+        """
+        contacts = [list(self._finger_contacts(finger, body)) for finger in (LEFT, RIGHT)]
+        if not (contacts[LEFT] and contacts[RIGHT]):
+            return 0.0, 0.0
+        x, y, z = self.closing_direction().tolist()
+        inwards = []
+        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
+        for sign, touching in zip((-1.0, 1.0), contacts):
+            force = 0.0
+            for normal, newtons in touching:
+                share = sign * (normal[0] * x + normal[1] * y + normal[2] * z)
+                if share > GRIP_COSINE:
+                    force += share * newtons
+            inwards.append(force)
+        return inwards[LEFT], inwards[RIGHT]
+
+    def holds(self, body: int, min_force: float = 0.1) -> bool:
+        """Whether both fingers grip the body with at least `min_force` newtons each."""
+        return min(self.grip_forces(body)) >= min_force
+
+    @abstractmethod
+    def _finger_contacts(self, finger: int, body: int) -> Iterable[Contact]:
+        """Contacts of a finger, LEFT or RIGHT, with a body; their normals point into the body."""
+
+    def grips(self) -> bool:
+        """Whether the fingers feel something between them: they are apart, and their motor presses
+        with half of what it was told at least. True contacts are not asked."""
+        pressing = self.finger_force() >= GRIPPED_SHARE * self._told_force
+        return pressing and self.opening > GRIPPED_OPENING
+
+    @abstractmethod
+    def finger_force(self) -> float:
+        """Newtons a finger with which the hand's motor closes it; negative where it opens it."""
+
+    # --- Contacts -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def contact_force(self) -> float:
+        """Sum of the normal forces in newtons on the whole robot, by the true contacts."""
+
+    @abstractmethod
+    def touches(self) -> bool:
+        """Whether anything touches the robot, or is so near that contact is looked for."""
+
+    @abstractmethod
+    def touches_body(self, body: int) -> bool:
+        """Whether the robot and a body are in contact."""
+
+    @abstractmethod
+    def palm_touches(self) -> bool:
+        """Whether anything presses on the hand itself, not only on its fingers."""
+
+
+class Robot(Hand):
+    """A robot in one cell: the hand on the arm. gate: every command to the arm passes it."""
+
+    def __init__(self, dt: float, gripper: GripperGeometry, grip_force: float, gate: ArmGate):
+        super().__init__(dt, gripper, grip_force)
+        self.gate = gate
 
     # --- State --------------------------------------------------------------------------------
 
@@ -82,23 +213,14 @@ class Robot(ABC):
         """Distance between the fingertips in metres."""
         return self.joint_state()[2]
 
-    @property
-    def max_opening(self) -> float:
-        """Widest distance between the fingertips in metres."""
-        return self.gripper.max_opening
-
-    @abstractmethod
-    def tip_pose(self) -> np.ndarray:
-        """(4, 4) T_WE."""
-
-    @abstractmethod
-    def closing_direction(self) -> np.ndarray:
-        """(3,) unit vector in W along E's y axis, from the right finger to the left one."""
-
     @abstractmethod
     def place(self, q: np.ndarray, opening: float | None = None) -> None:
         """Put the robot at joint positions q (7,), rad, with the gripper at `opening` metres, at
         rest; None opens it as wide as it gets."""
+
+    def encoder_pose(self) -> np.ndarray:
+        """(4, 4) T_WE by forward kinematics of the joints' positions."""
+        return forward_kinematics(self.q)
 
     # --- Commands to the arm ------------------------------------------------------------------
 
@@ -150,26 +272,6 @@ class Robot(ABC):
     def _drive_arm(self, q: np.ndarray, speeds: list[float]) -> None:
         """Let the motors go to q (7,), rad, at up to `speeds`, seven in rad/s."""
 
-    # --- Latency ------------------------------------------------------------------------------
-
-    def receive(self, count: int) -> int:
-        """Carry out the commands that have arrived, and advance the motors' clock by up to `count`
-        physics steps; returns by how many, because no command arrives in between."""
-        while self._underway and self._underway[0][0] <= self._clock:
-            self._underway.popleft()[1]()
-        if self._underway:
-            count = min(count, self._underway[0][0] - self._clock)
-        self._clock += count
-        return count
-
-    def _send(self, command: Callable[..., object], *args: Any, **kwargs: Any) -> None:
-        """Give a motor command, or delay it by the latency; commands arrive in the order given."""
-        if self.latency or self._underway:
-            due = self._clock + self.latency
-            self._underway.append((due, partial(command, *args, **kwargs)))
-        else:
-            command(*args, **kwargs)
-
     def _stay_placed(self, q: np.ndarray, opening: float) -> None:
         """Have the motors stay where `place` has put the robot, at once whatever the latency; what
         was underway never arrives."""
@@ -200,16 +302,6 @@ class Robot(ABC):
     def external_torques(self) -> np.ndarray:
         """(7,) N m on the arm's joints in the last physics step that neither the motors nor the
         motion of the nominal robot explain; zero where there is no step to compare with."""
-
-    def grips(self) -> bool:
-        """Whether the fingers feel something between them: they are apart, and their motor presses
-        with half of what it was told at least. True contacts are not asked."""
-        pressing = self.finger_force() >= GRIPPED_SHARE * self._told_force
-        return pressing and self.opening > GRIPPED_OPENING
-
-    @abstractmethod
-    def finger_force(self) -> float:
-        """Newtons a finger with which the hand's motor closes it; negative where it opens it."""
 
     # --- Motions ------------------------------------------------------------------------------
 
@@ -252,67 +344,3 @@ class Robot(ABC):
         """Two moves, the corner between them cut by up to `most` control periods, see
         `envs.robot_motion.blended`."""
         return blended(start, first, second, self.dt, Limits(**scales), most)
-
-    # --- Gripper ------------------------------------------------------------------------------
-
-    def command_gripper(self, opening: float, force: float | None = None) -> None:
-        """Drive both fingers towards `opening` metres with at most `force` newtons a finger."""
-        opening = min(max(float(opening), 0.0), self.max_opening)
-        self._told_force = self.grip_force if force is None else force
-        self._send_gripper(opening, self._told_force)
-
-    def open_gripper(self) -> None:
-        """Drive both fingers apart as far as they get."""
-        self.command_gripper(self.max_opening)
-
-    @abstractmethod
-    def _send_gripper(self, opening: float, force: float) -> None:
-        """Give the fingers' motor its goal in metres, FINGER_SPEED a finger being the fastest."""
-
-    def grip_forces(self, body: int) -> tuple[float, float]:
-        """Newtons with which the left and the right finger press a body towards each other; zero
-        where one of them does not touch the body.
-
-        A contact counts only where its normal lies within 70 degrees of the closing line and points
-        inwards: a body that lies on the fingers, or is pushed down by a fist, is not gripped.
-        """
-        contacts = [list(self._finger_contacts(finger, body)) for finger in (LEFT, RIGHT)]
-        if not (contacts[LEFT] and contacts[RIGHT]):
-            return 0.0, 0.0
-        x, y, z = self.closing_direction().tolist()
-        inwards = []
-        # The left finger is on the side of E's +y axis, so its contacts push the body along -y.
-        for sign, touching in zip((-1.0, 1.0), contacts):
-            force = 0.0
-            for normal, newtons in touching:
-                share = sign * (normal[0] * x + normal[1] * y + normal[2] * z)
-                if share > GRIP_COSINE:
-                    force += share * newtons
-            inwards.append(force)
-        return inwards[LEFT], inwards[RIGHT]
-
-    def holds(self, body: int, min_force: float = 0.1) -> bool:
-        """Whether both fingers grip the body with at least `min_force` newtons each."""
-        return min(self.grip_forces(body)) >= min_force
-
-    @abstractmethod
-    def _finger_contacts(self, finger: int, body: int) -> Iterable[Contact]:
-        """Contacts of a finger, LEFT or RIGHT, with a body; their normals point into the body."""
-
-    # --- Contacts -----------------------------------------------------------------------------
-
-    @abstractmethod
-    def contact_force(self) -> float:
-        """Sum of the normal forces in newtons on the whole robot, by the true contacts."""
-
-    @abstractmethod
-    def touches(self) -> bool:
-        """Whether anything touches the robot, or is so near that contact is looked for."""
-
-    @abstractmethod
-    def touches_body(self, body: int) -> bool:
-        """Whether the robot and a body are in contact."""
-
-    @abstractmethod
-    def palm_touches(self) -> bool:
-        """Whether anything presses on the hand itself, not only on its fingers."""

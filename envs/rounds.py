@@ -26,8 +26,8 @@ from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop, reaches
+from envs.floating_execution import clears_table, execute_floating
 from envs.objects import fits
-from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
@@ -145,7 +145,11 @@ def run_round(
                 approach = approach_by
             aim = nearest_object(cell, grasp) if too_large else None
             with disturbed(cell, conditions.motion(cell, len(attempts))):
-                outcome = execute_grasp(cell, grasp, approach)
+                outcome = (
+                    execute_grasp(cell, grasp, approach)
+                    if cell.has_arm
+                    else execute_floating(cell, grasp)
+                )
             if approach_by is not None and approach_by.closed_at is not None:
                 grasp = approach_by.closed_at
             held = outcome.object_index
@@ -225,7 +229,7 @@ def checked_grasps(grasps: object, planar: bool = False) -> Sequence[Grasp]:
 def calibrated(cell: Cell, calibration: CameraCalibration, frame: RGBDFrame) -> RGBDFrame:
     """A frame of the camera, taken now, with the camera pose of the calibration. An image
     in which no table is found cannot be levelled."""
-    mount, T_WE = cell.config.camera.mount, forward_kinematics(cell.robot.q)
+    mount, T_WE = cell.config.camera.mount, cell.robot.encoder_pose()
     try:
         return calibration.frame(frame, mount, T_WE)
     except TargetLostError:
@@ -265,10 +269,12 @@ def _abstained(grasps: Sequence[Grasp], least: float) -> str:
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
     """The grasps that the arm can go to, in their order; those from straight above are not asked,
-    because nearly all are. The first of all where the arm reaches none."""
+    because nearly all are. The first of all where the arm reaches none. A floating hand reaches all
+    that are above the table."""
+    reachable = reaches if cell.has_arm else clears_table
     nothing = True
     for grasp in grasps:
-        if grasp.tilt < PLANAR or reaches(cell, grasp):
+        if grasp.tilt < PLANAR or reachable(cell, grasp):
             nothing = False
             yield grasp
     if nothing:

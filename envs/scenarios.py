@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.board import Board
-from envs.cell import Cell, Intrinsics, wrist_mount
+from envs.cell import Cell, Intrinsics, require_arm, wrist_mount
 from envs.robot_kinematics import forward_kinematics
 from utils.table_plane import fit_table_plane
 from utils.transforms import RGBDFrame, inverse_pose, planar
@@ -94,6 +94,7 @@ def teach(cell: Cell) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: from the board's pose in one image, taken
     while the jig holds the board at a known pose in E. The first call with a cell empties it and
     keeps the pose as `cell.taught`; later calls return that."""
+    require_arm(cell.config, "a closed loop")
     if cell.taught is None:
         cell.taught = _measure_mount(cell)
     return cell.taught

@@ -13,7 +13,7 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from envs.cell import Cell, not_randomizable
+from envs.cell import Cell, not_randomizable, require_arm
 from envs.cell_layout import Box, LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
@@ -102,6 +102,10 @@ def check_simulator(config: Config) -> None:
     cell = cell_class(config.simulator)
     if config.evaluate.randomise and not cell.can_be_randomized():
         raise not_randomizable(config)
+    if config.evaluate.randomise:
+        require_arm(config, "evaluate.randomise=true")
+    if config.camera.mount == "wrist":
+        require_arm(config, "camera.mount=wrist")
 
 
 def _simulator(name: str, key: str) -> Simulator:

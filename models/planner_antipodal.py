@@ -131,7 +131,7 @@ def dense_candidates(
     matter = np.argwhere(on_objects)[:, ::-1]
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
-    beside = max(settings.rooms) + 2 * thickness
+    beside = (gripper.max_opening if gripper.opens_fully else max(settings.rooms)) + 2 * thickness
     if (heights.label == OTHER_LABEL).any():  # what is not to be grasped may be under the palm
         beside += gripper.palm_half_length
     half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
@@ -169,7 +169,10 @@ def dense_candidates(
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
         limit = tip - settings.clearance
         free = np.zeros(len(tip), bool)
-        for room in settings.rooms:  # a sloping flank needs more room
+        rooms = settings.rooms  # a sloping flank needs more room
+        if gripper.opens_fully:
+            rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
+        for room in rooms:
             offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
             left, right = (
                 np.clip(np.rint(at).astype(int), 0, size - 1)
@@ -333,7 +336,10 @@ def measure(
     left_over = left_over[opening[left_over] > 0]
     gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
     left_over = left_over[gap >= settings.clearance - tip[left_over]]
-    under = gripper.finger_underside(near[left_over] - opening[left_over, None] / 2)
+    beside = opening[left_over]
+    if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
+        beside = np.minimum(beside, width[left_over] + 2 * settings.rooms[-1])
+    under = gripper.finger_underside(near[left_over] - beside[:, None] / 2)
     over = heights.ceiling.take(where[left_over]) - under[:, None]
     covered[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
 
@@ -376,7 +382,8 @@ def _widest_opening(
     gripper: GripperGeometry,
     settings: SearchSettings,
 ) -> np.ndarray:
-    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is.
+    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is. Of a
+    gripper that opens fully only the widest of all counts.
 
     obstacles, near: (N, U) heights along the closing line and their distances from the middle.
     """
@@ -385,7 +392,7 @@ def _widest_opening(
         near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
     )
     opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
-    for room in reversed(settings.rooms):
+    for room in (np.inf,) if gripper.opens_fully else reversed(settings.rooms):
         half = np.minimum(width[open_yet] / 2 + room, gripper.max_opening / 2)
         outward = near[open_yet] - half[:, None]
         below_finger = gripper.finger_underside(np.maximum(outward, 0))

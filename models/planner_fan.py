@@ -163,7 +163,7 @@ class HeuristicFanPlanner(FanPlanner):
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
         overhead = only_target(self.heights(frame), frame)
-        filled, hiding = without_holes(frame)
+        filled, hiding = without_holes(frame, self.workspace)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)

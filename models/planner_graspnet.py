@@ -241,7 +241,7 @@ class GraspNetFanPlanner(FanPlanner):
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         seen = NetworkView(self.network, frame, self.workspace)
         overhead = only_target(seen.heights, frame)
-        filled, hiding = without_holes(seen.frame)
+        filled, hiding = without_holes(seen.frame, self.workspace)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
@@ -306,14 +306,10 @@ def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     if width == 0:
         return frame
     margin = reach_in_pixels(frame, CROP_MARGIN)
-    left, top, right, bottom = (
-        max(left - margin, 0), max(top - margin, 0), left + width + margin, top + height + margin
-    )  # fmt: skip
-    K = frame.K.copy()
-    K[:2, 2] -= left, top
-    window = np.s_[top:bottom, left:right]
-    part = replace(frame, rgb=frame.rgb[window], depth=frame.depth[window], K=K)
-    return replace(part, segmentation=None, target=None)
+    return frame.part(
+        slice(max(top - margin, 0), top + height + margin),
+        slice(max(left - margin, 0), left + width + margin),
+    )
 
 
 def quality_between(

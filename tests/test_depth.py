@@ -20,6 +20,7 @@ from utils.config import ConfigError, changed_keys, load_config, with_settings
 from utils.depth import (
     DEPTH_NOISES,
     GammaNoise,
+    GaussianNoise,
     KinectNoise,
     RealSenseNoise,
     depth_of_plane,
@@ -275,7 +276,19 @@ def test_gamma_noise_has_the_mean_and_variance_of_dex_net():
     assert spread_and_correlation(error, 6)[1] == pytest.approx(0, abs=0.02)
 
 
-@pytest.mark.parametrize("noise", [RealSenseNoise(), GammaNoise()])
+def test_gaussian_noise_is_independent_and_the_same_at_every_distance():
+    for distance in (0.3, 1.2):
+        error = GaussianNoise()(plane(distance, 500), np.random.default_rng(0)) - distance
+        spread, correlation = spread_and_correlation(error, 1)
+        assert spread == pytest.approx(0.0008, rel=0.01)
+        assert correlation == pytest.approx(0, abs=0.01)
+        assert abs(error.mean()) < 4 * 0.0008 / 500
+    # By Gauss's own table, 31.7 % lie outside of one standard deviation and 4.55 % outside of two.
+    for sigmas, share in ((1, 0.317), (2, 0.0455)):
+        assert (abs(error) > sigmas * 0.0008).mean() == pytest.approx(share, abs=0.005)
+
+
+@pytest.mark.parametrize("noise", [RealSenseNoise(), GammaNoise(), GaussianNoise()])
 def test_every_noise_is_seeded_keeps_its_input_and_the_unknown(noise):
     depth = steps_and_slopes(64)
     first = seeded(noise, depth)
@@ -299,6 +312,7 @@ def test_every_noise_is_seeded_keeps_its_input_and_the_unknown(noise):
         ("realsense", {"subpixel": -1}, "RealSenseNoise.subpixel must be in"),
         ("gamma", {"shape": 0}, "GammaNoise.shape must be > 0"),
         ("gamma", {"sigma": -1}, "GammaNoise.sigma must be >= 0"),
+        ("gaussian", {"sigma": -1}, "GaussianNoise.sigma must be >= 0"),
     ],
 )
 def test_wrong_parameters_of_a_profile_are_refused(name, wrong, message):
@@ -322,7 +336,7 @@ def gaussian(image_focal: float, sigma: float = 0.001):
 def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
     assert make_depth_noise("none", 480.0, {"ignored": 1}) is None
     assert make_depth_noise("kinect", 390.0, {"step": 0.25}) == KinectNoise(390.0, step=0.25)
-    assert set(DEPTH_NOISES) == {"kinect", "realsense", "gamma"}
+    assert set(DEPTH_NOISES) == {"kinect", "realsense", "gamma", "gaussian"}
     own = make_depth_noise("tests.test_depth:gaussian", 480.0, {"sigma": 0.1})
     assert own(plane(0.8), np.random.default_rng(0)).std() == pytest.approx(0.1, rel=0.02)
 
@@ -333,7 +347,7 @@ def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
         (
             "kinec",
             {},
-            "gamma, kinect, module:name, none, realsense; did you mean kinect",
+            "gamma, gaussian, kinect, module:name, none, realsense; did you mean kinect",
         ),
         ("kinect", {"nois": 1}, "depth_noise_args: 'kinect' does not take them.*'nois'"),
         ("kinect", {"noise": -1}, "KinectNoise.noise must be >= 0"),

@@ -131,7 +131,7 @@ def test_a_tilted_map_of_an_image_is_that_of_the_solids(tilt) -> None:
     frame = boxes_frame([((0.06, 0.08, 0.05), 0.4, (0.5, 0.0))])
     T_WV = tilted_view(approach(tilt, 30), workspace)
     overhead = height_map_from_frame(frame, workspace)
-    seen = tilted_height_map(overhead, *without_holes(frame), T_WV)
+    seen = tilted_height_map(overhead, *without_holes(frame, workspace), T_WV)
     exact = height_map_from_scene(frame.truth, workspace, cell=0.002, T_WV=T_WV)
     row, column = np.indices(exact.height.shape)
     place = exact.origin + exact.cell * np.stack([column, row], axis=-1)
@@ -156,7 +156,7 @@ def test_no_matter_reaches_above_the_ceiling(tilt, height) -> None:
     frame = boxes_frame([((0.06, 0.06, height), 0.0, (0.5, 0.0))])
     T_WV = tilted_view(approach(tilt, 90), workspace)
     overhead = height_map_from_frame(frame, workspace)
-    seen = tilted_height_map(overhead, *without_holes(frame), T_WV)
+    seen = tilted_height_map(overhead, *without_holes(frame, workspace), T_WV)
     exact = height_map_from_scene(frame.truth, workspace, cell=0.002, T_WV=T_WV)
     box = exact.label == 0
     assert (seen.ceiling[box] > exact.height[box] - 0.006).mean() > 0.99
@@ -278,3 +278,22 @@ def test_a_wall_beside_one_object_is_measured_and_infeasible() -> None:
     )
     found = measure(on_wall, heights, GripperGeometry(), SearchSettings())
     assert found.label == [WALL_LABEL] and found.score == [0]
+
+
+def test_what_a_camera_sees_far_from_the_workspace_costs_nothing_and_changes_nothing() -> None:
+    """The same camera with a wider image: K's centre moves, and all that is added lies outside."""
+    workspace = Workspace()
+    frame = boxes_frame([((0.06, 0.08, 0.05), 0.4, (0.5, 0.0))])
+    edge, K = 40, frame.K + np.array([[0, 0, 40], [0, 0, 40], [0, 0, 0]])
+    depth = np.pad(frame.depth, edge, constant_values=0.8)
+    rgb = np.pad(frame.rgb, ((edge, edge), (edge, edge), (0, 0)))
+    wide = replace(frame, rgb=rgb, depth=depth, K=K, segmentation=None)
+    part, _ = without_holes(wide, workspace)
+    width = part.depth.shape[1]
+    # Over the table 0.46 m, 0.8 m away; over the box's top the same pixels see less.
+    assert width == pytest.approx(0.46 / 0.8 * K[0, 0], abs=6)
+    assert width < depth.shape[1]
+    seen = height_map_from_frame(wide, workspace)
+    narrow = height_map_from_frame(frame, workspace)
+    inside = np.s_[60:-60, 60:-60]
+    np.testing.assert_allclose(seen.height[inside], narrow.height[inside], atol=1e-6)

@@ -201,6 +201,30 @@ def test_a_crumb_is_nothing_to_grasp(name: str) -> None:
     assert planner(name)(boxes_frame([((0.004, 0.006, 0.012), 0.0, (0.5, 0.0))])) == []
 
 
+def test_planners_run_on_a_bare_frame_without_a_simulator(tmp_path) -> None:
+    """A script of one's own that has the image of a box: depth, colours, K and T_WC alone."""
+    frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.5, 0.0))])
+    files = {"depth": frame.depth, "rgb": frame.rgb, "K": frame.K, "T_WC": frame.T_WC}
+    np.savez(tmp_path / "frame.npz", **files)
+    names = [name for name, kind in PLANNERS.items() if not needs_truth(kind)]
+    check = (
+        "import sys; import numpy as np\n"
+        "from models.planners import make_planner\n"
+        "from utils.geometry import GripperGeometry, Workspace\n"
+        "from utils.transforms import RGBDFrame\n"
+        "frame = RGBDFrame(**np.load('frame.npz'))\n"
+        f"for name in {names}:\n"
+        "    assert make_planner(name, GripperGeometry(), Workspace(), seed=0)(frame), name\n"
+        "assert not {'pybullet', 'mujoco', 'envs'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert {"heuristic", "graspnet", "heuristic6d", "graspnet6d"} <= set(names)
+
+
 def test_the_planner_of_the_docs_runs_without_a_simulator(tmp_path, monkeypatch) -> None:
     """Its box is 4 cm wide along the image's rows, which run along the world's x axis."""
     text = (ROOT / "docs" / "planner.md").read_text(encoding="utf-8")

@@ -55,6 +55,7 @@ class SimConfig(Section):
 
 
 class RobotConfig(Section):
+    arm: Literal["panda", "none"]
     home: JointVector
     grip_force: Annotated[float, Field(gt=0, le=70)]  # the Franka Hand's own limit
     velocity_scale: Share
@@ -63,11 +64,12 @@ class RobotConfig(Section):
 
 class GripperConfig(Section):
     max_opening: Annotated[float, Field(ge=0.02, le=0.2)]
+    opens_fully: bool
 
     @property
     def geometry(self) -> GripperGeometry:
         """The hand: the shapes of its fingers and palm are the Panda's, the opening is its own."""
-        return GripperGeometry(max_opening=self.max_opening)
+        return GripperGeometry(max_opening=self.max_opening, opens_fully=self.opens_fully)
 
 
 class CameraConfig(Section):
@@ -78,6 +80,10 @@ class CameraConfig(Section):
     position: Vector3
     target: Vector3
     up: Vector3
+    view: Literal["fixed", "side"]
+    side_tilt_deg: Vector2
+    side_distance: Vector2
+    side_azimuth_deg: Vector2
     near: Positive
     far: Positive
     depth_noise: Name
@@ -92,6 +98,19 @@ class CameraConfig(Section):
         if self.near >= self.far:
             raise ValueError(f"near ({self.near}) must be smaller than far ({self.far})")
         look_at(self.position, self.target, self.up)  # raises ValueError where that is undefined
+        return self
+
+    @model_validator(mode="after")
+    def _ranges_of_side_views(self) -> CameraConfig:
+        for name, least, most in (
+            ("side_tilt_deg", 1, 89), ("side_distance", 0.05, 5), ("side_azimuth_deg", -360, 360),
+        ):  # fmt: skip
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise ValueError(
+                    f"{name} must be a range [low, high] within [{least}, {most}], got "
+                    f"[{low:g}, {high:g}]"
+                )
         return self
 
     def make_noise(self, image_focal: float) -> DepthNoise | None:
@@ -134,6 +153,7 @@ class ExecutionConfig(Section):
     hold_seconds: Annotated[float, Field(ge=0)]
     contact_stop: Positive
     strict: bool
+    on_contact: Literal["fail", "grip"]
 
 
 class SafetyConfig(Section):

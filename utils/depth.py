@@ -11,7 +11,8 @@ lists who draws them.
 reconstruction and SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single
 RGB-D image" (CVPR 2013), and Bohg et al., "Robot arm pose estimation through pixel-wise part
 classification" (ICRA 2014), whose window of projected dots makes the holes. `RealSenseNoise` is an
-active stereo camera, `GammaNoise` the noise with which Dex-Net 2.0 and GIGA were trained.
+active stereo camera, `GammaNoise` the noise with which Dex-Net 2.0 and GIGA were trained,
+`GaussianNoise` that of the Edge Grasp Network's tests.
 
 Holes (pixels without a depth) lie at the edges of whatever stands up, in its shadow, and cover thin
 parts. `near_side`, `table_in_holes`, `surfaces_in_holes` and `fill_holes` fill them, each for
@@ -341,6 +342,27 @@ class GammaNoise:
         return np.where(known_depth(depth) & (measured > 0), measured, np.float32(0))
 
 
+@dataclass(frozen=True)
+class GaussianNoise:
+    """An error of mean 0 and standard deviation `sigma` (metres) at each pixel, independent of all
+    others: the noise of clutter removal in Huang et al., "Edge Grasp Network" (ICRA 2023), and
+    Hu et al., "OrbitGrasp" (CoRL 2024). image_focal is ignored.
+    """
+
+    image_focal: float = 0.0
+    sigma: float = 0.0008
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sigma < np.inf:
+            raise ValueError(f"GaussianNoise.sigma must be >= 0, got {self.sigma}")
+
+    def __call__(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) float32 metres; unknown pixels (0 or NaN) are 0. Draws H x W normal deviates."""
+        depth = _depth_image(depth, "GaussianNoise")
+        measured = depth + np.float32(self.sigma) * rng.standard_normal(depth.shape, np.float32)
+        return np.where(known_depth(depth) & (measured > 0), measured, np.float32(0))
+
+
 _BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue; ITU-R BT.601
 
 
@@ -378,6 +400,7 @@ DEPTH_NOISES: dict[str, Callable[..., DepthNoise]] = {
     "kinect": KinectNoise,
     "realsense": RealSenseNoise,
     "gamma": GammaNoise,
+    "gaussian": GaussianNoise,
 }
 
 

@@ -139,6 +139,7 @@ class GripperGeometry:
     """
 
     max_opening: float = 0.08  # two finger joints of 0.04 each
+    opens_fully: bool = False  # whether the hand comes to every grasp as wide open as it gets
     tip_below_centre: float = 0.0072  # 0.1122 - 0.105: how far the tips reach below E
     finger_half_width: float = 0.0105  # across, at the widest
     pad_half_width: float = 0.0087  # across, the flat face that touches the object
@@ -156,6 +157,10 @@ class GripperGeometry:
     palm_outline: tuple[tuple[float, float], ...] = (
         (0.0, 0.0460), (0.0160, 0.0470), (0.0172, 0.0485), (0.0192, 0.0565), (0.0316, 0.1055),
     )  # fmt: skip
+
+    def opening_before(self, width: float) -> float:
+        """Metres between the fingertips on the way to a grasp of this width."""
+        return self.max_opening if self.opens_fully else width
 
     @property
     def palm_height(self) -> float:

@@ -40,6 +40,7 @@ HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
+MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
@@ -141,7 +142,7 @@ def table_slope(
 
 
 def height_map_from_frame(
-    frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = 0.08
+    frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = MARGIN
 ) -> HeightMap:
     """The height map of a depth image from above; uses nothing of the frame but depth, K and T_WC.
 
@@ -152,7 +153,7 @@ def height_map_from_frame(
     """
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
-    seen = _seen(*without_holes(frame), np.eye(4), grid.shape[:2], origin, cell, table)
+    seen = _seen(*without_holes(frame, workspace), np.eye(4), grid.shape[:2], origin, cell, table)
     label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
     centres = _column_centroids(seen.height - table, label, grid, table)
     return HeightMap(*seen.walled(), label, centres, origin, cell, table)
@@ -199,15 +200,37 @@ class _Seen(NamedTuple):
         return height, np.maximum(self.ceiling, height)
 
 
-def without_holes(frame: RGBDFrame) -> tuple[RGBDFrame, np.ndarray]:
+def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
     """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
-    which of them (H, W) may hide matter: those that are not `at_edges`."""
+    which of them (H, W) may hide matter: those that are not `at_edges`. Both without the rows and
+    columns in which nothing lies over or around the workspace."""
     measured = known_depth(frame.depth)
     hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
         reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))
-    return frame, hiding
+    rows, columns = _around(frame, workspace)
+    return frame.part(rows, columns), hiding[rows, columns]
+
+
+def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
+    """The rows and the columns whose points lie over the grid; what has no depth counts as
+    table."""
+    known = known_depth(frame.depth)
+    depth = np.where(known, frame.depth, depth_of_plane(frame, workspace.table_height))
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    ahead = np.isfinite(depth) & (depth > 0)
+    places = deproject(np.stack([u, v], axis=-1), np.where(ahead, depth, 0), frame.K, frame.T_WC)
+    apart = np.abs(places[..., :2] - workspace.centre).max(axis=-1)
+    near = ahead & (apart <= workspace.size / 2 + MARGIN)
+    if not near.any():
+        return slice(0, depth.shape[0]), slice(0, depth.shape[1])
+    # Two pixels more: the rays that graze an edge pass between a pixel and the next.
+    rows, columns = (
+        slice(max(int(found[0]) - 2, 0), min(int(found[-1]) + 3, side))
+        for found, side in zip((np.flatnonzero(near.any(axis=k)) for k in (1, 0)), depth.shape)
+    )
+    return rows, columns
 
 
 def _seen(
@@ -249,7 +272,7 @@ def height_map_from_scene(
     scene: SceneGeometry,
     workspace: Workspace,
     cell: float = 0.0015,
-    margin: float = 0.08,
+    margin: float = MARGIN,
     T_WV: np.ndarray | None = None,
 ) -> HeightMap:
     """Exact height map: vertical lines through the cells' centres against every convex solid.

@@ -167,6 +167,14 @@ class RGBDFrame:
         """The same frame as an unprivileged planner may see it."""
         return replace(self, segmentation=None, truth=None)
 
+    def part(self, rows: slice, columns: slice) -> RGBDFrame:
+        """Some rows and columns of the image, both without a step, as a frame of its own. What
+        else is known of its pixels (segmentation, target) stays behind."""
+        K = self.K.copy()
+        K[:2, 2] -= columns.start, rows.start
+        rgb, depth = self.rgb[rows, columns], self.depth[rows, columns]
+        return replace(self, rgb=rgb, depth=depth, K=K, segmentation=None, target=None)
+
 
 def known_depth(depth: np.ndarray) -> np.ndarray:
     """(...) bool, True where a depth is known: 0, negative and not finite mean unknown."""

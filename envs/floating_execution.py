@@ -1,0 +1,134 @@
+"""Execute planned grasps with a floating hand and judge them, as VGN's clutter removal does.
+
+The sibling of `envs.execution` for cells without an arm (Breyer et al., "Volumetric Grasping
+Network", CoRL 2020, whose protocol GIGA, Edge Grasp Network, OrbitGrasp and others share). This
+module does not know how grasps are planned.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from envs.cell import Cell
+from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED
+from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers
+from envs.floating_hand import FloatingHand, lowest_point, park
+from utils.result_records import loose
+from utils.transforms import Grasp
+
+PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
+RETREAT = 0.10  # m, VGN's
+LEAST_WIDTH = 0.1  # of the widest opening: narrower objects do not count as held; VGN's
+SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
+_HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
+
+
+def clears_table(cell: Cell, grasp: Grasp) -> bool:
+    """Whether the whole hand is above the table on its way to a grasp."""
+    opening = cell.gripper.opening_before(grasp.width)
+    return lowest_point(cell.gripper, grasp.pose, opening) > 0.0
+
+
+def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
+    """Put the hand before a grasp, approach, close, retreat, and judge.
+
+    The hand is put PREGRASP before the grasp, as wide open as the gripper's `opens_fully` says, and
+    moves at execution.approach_speed. A contact where it is put is a `collision`, and so is one on
+    its way in, unless execution.on_contact is `grip`: then the hand stops and closes there.
+    Success: after a retreat of RETREAT, along the approach or, from a side, straight up, both
+    fingers grip one object and are more than LEAST_WIDTH of the widest opening apart. `missed`:
+    nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was, and was
+    lost. A picked object is removed. With execution.strict, an object may also not move in the
+    hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
+    PhysicsError when the simulation blows up.
+    """
+    hand = floating_hand(cell)
+    cell.check_physics()
+    start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
+    try:
+        _approach(cell, hand, grasp)
+        hand.yield_to_fingers()
+        close_fingers(cell, cell.step)
+        hand.hold()
+        held = cell.held_object()
+        motion = None if held is None else InHandMotion(cell, held)
+        _retreat(cell, hand, grasp)
+        _judge(cell, hand, held, motion)
+    except GraspFailure as failure:
+        reason, detail = failure.reason, failure.detail
+    stopped_at = None
+    if reason == "collision" and hand.palm_touches():
+        stopped_at = hand.tip_pose()[:3, 3].copy()
+    if reason == "success":
+        _remove(cell, held)
+    park(hand, cell.config.workspace)
+    _let_rest(cell)
+    cell.check_physics()
+    cell.retire_lost_objects()
+    return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
+
+
+def floating_hand(cell: Cell) -> FloatingHand:
+    """The robot of a cell without an arm."""
+    return cast(FloatingHand, cell.robot)
+
+
+def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
+    """Raises GraspFailure where the hand meets something."""
+    pregrasp = grasp.pose
+    pregrasp[:3, 3] -= PREGRASP * grasp.approach
+    hand.put(pregrasp, cell.gripper.opening_before(grasp.width))
+    if hand.overlaps():
+        raise GraspFailure("collision", "there is something where the hand starts")
+    for q, velocity in zip(*hand.line(grasp.position, cell.config.execution.approach_speed)):
+        hand.command(q, velocity)
+        cell.step()
+        if hand.contact_force() > 0.0:
+            if cell.config.execution.on_contact == "grip":
+                hand.hold()
+                return
+            left = float((grasp.position - hand.tip_pose()[:3, 3]) @ grasp.approach)
+            raise GraspFailure("collision", f"{1000 * left:.0f} mm before the grasp")
+
+
+def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
+    away = np.array([0.0, 0.0, 1.0]) if grasp.tilt > SIDEWAYS + 1e-6 else -grasp.approach
+    goal = hand.tip_pose()[:3, 3] + RETREAT * away
+    for q, velocity in zip(*hand.line(goal, cell.config.execution.approach_speed)):
+        hand.command(q, velocity)
+        cell.step()
+
+
+def _judge(
+    cell: Cell, hand: FloatingHand, gripped: int | None, motion: InHandMotion | None
+) -> None:
+    """Raises GraspFailure unless the object that was gripped is held after the retreat."""
+    if gripped is None or motion is None:
+        raise GraspFailure("missed")
+    if cell.held_object() != gripped:
+        raise GraspFailure("slipped")
+    least = LEAST_WIDTH * hand.max_opening
+    if hand.opening <= least:
+        raise GraspFailure("missed", f"{1000 * hand.opening:.1f} mm wide, under {1000 * least:g}")
+    motion.look()
+    moved = loose(motion.turned, motion.slid)
+    if moved and cell.config.execution.strict:
+        raise GraspFailure(moved[0])
+
+
+def _remove(cell: Cell, index: int) -> None:
+    """Take an object out of the round and out of sight."""
+    T = cell.object_pose(index)
+    T[2, 3] = -_HIDDEN_DEPTH
+    cell.carry(index, T, np.zeros(3), 0.0)
+    cell.retire(index)
+
+
+def _let_rest(cell: Cell) -> None:
+    """Wait until the objects rest, for at most scene.settle_seconds."""
+    for _ in range(int(cell.config.scene.settle_seconds / (REST_CHECK_STEPS * cell.dt))):
+        cell.step(REST_CHECK_STEPS)
+        if all(cell.speed(index) < REST_SPEED for index in cell.remaining):
+            return
