@@ -343,10 +343,11 @@ class Cell(ABC):
     # --- Camera -------------------------------------------------------------------------------
 
     def camera_pose(self, mount: str | None = None) -> np.ndarray:
-        """(4, 4) T_WC of the overhead or the wrist camera."""
+        """(4, 4) T_WC of the overhead or the wrist camera; a scene may place the overhead one."""
         camera = self.config.camera
         if (mount or camera.mount) == "overhead":
-            return look_at(camera.position, camera.target, camera.up)
+            fixed = (self.scene and self.scene.viewpoint) or camera
+            return look_at(fixed.position, fixed.target, fixed.up)
         return forward_kinematics(self.robot.q) @ wrist_mount(camera)
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:

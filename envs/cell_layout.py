@@ -147,15 +147,27 @@ class Placement:
 
 
 @dataclass(frozen=True)
+class Viewpoint:
+    """Where a fixed camera stands, in W: position and target in metres, and the direction that
+    points up in its image."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
     drawn. walls: stand on the table and are part of it: of its colour and friction, and what
-    touches them touches the table."""
+    touches them touches the table. viewpoint: of the fixed camera where the configured one would
+    not see what matters; None is the configured one."""
 
     layout: str
     seed: int
     placements: tuple[Placement, ...]
     walls: tuple[Box, ...] = ()
+    viewpoint: Viewpoint | None = None
 
 
 EMPTY = Scene("isolated", 0, ())

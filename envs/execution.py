@@ -40,6 +40,7 @@ _LEAST_FRICTION = 0.4  # that a grip counts on
 _HOLD_MARGIN = 1.5  # times the force that this friction needs
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
+_LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
 
@@ -279,7 +280,7 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
 def _raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
     """The pose (4, 4) at which an object is lifted high enough that the hand gripped at T_WE."""
     lifted = T_WE.copy()
-    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + 0.05
+    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + _LIFT_MARGIN
     return lifted
 
 
@@ -297,7 +298,9 @@ def _carry_to_bin(
     believes that it holds one."""
     settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
     lift = _line(cell, start, lifted)
-    posture = choose_posture(top_down_pose(OVER_BIN, -np.pi / 2), cell.home)
+    over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
+    over_bin[2] = max(over_bin[2], lifted[2, 3] - _LIFT_MARGIN)
+    posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
     carry = robot.joint_move(lift.positions[-1], posture, **_scales(cell))
     corner = _higher_than(lifted[2, 3] - _CORNER, lift)
     way = robot.blended_moves(start, lift, carry, corner, **_scales(cell))

@@ -43,7 +43,7 @@ class FanSettings:
     m across, and m above the fingertips.
     """
 
-    rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8))
+    rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8), (85.0, 4))
     tilt_scale: float = 1.2
     returned: int = 40
     distinct_distance: float = 0.01
