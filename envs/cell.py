@@ -380,8 +380,9 @@ class Cell(ABC):
         `envs.cell.DEFAULT_LIGHT`."""
         image = self.image(intrinsics, T_WC, light)
         truth = self.truth() if with_truth else None
+        fixtures = () if self.scene is None else self.scene.fixtures
         return RGBDFrame(
-            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
+            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth, fixtures
         )
 
     def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:

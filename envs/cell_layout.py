@@ -160,14 +160,21 @@ class Viewpoint:
 class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
     drawn. walls: stand on the table and are part of it: of its colour and friction, and what
-    touches them touches the table. viewpoint: of the fixed camera where the configured one would
+    touches them touches the table. fixed: whether the walls are fixtures of the cell, whose place
+    planners know, or stand there like a box that somebody has brought. viewpoint: of the fixed camera where the configured one would
     not see what matters; None is the configured one."""
 
     layout: str
     seed: int
     placements: tuple[Placement, ...]
     walls: tuple[Box, ...] = ()
+    fixed: bool = False
     viewpoint: Viewpoint | None = None
+
+    @property
+    def fixtures(self) -> tuple[ConvexSolid, ...]:
+        """Solids in W whose place planners know."""
+        return tuple(wall.solid() for wall in self.walls) if self.fixed else ()
 
 
 EMPTY = Scene("isolated", 0, ())

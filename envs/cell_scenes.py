@@ -94,7 +94,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
-            return Scene(layout, seed, placements, walls, _viewpoint(layout, config))
+            fixed = layout in _FIXED
+            return Scene(layout, seed, placements, walls, fixed, _viewpoint(layout, config))
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
         f"inside the {config.workspace.size} m workspace in {_TRIES} tries; use smaller objects "
@@ -346,6 +347,7 @@ _ARRANGEMENTS = {
     "bin": _pile_up, "household": _pile_up, "tall": _stand_close, "wall": _lean, "flat": _overhang,
 }  # fmt: skip
 _WALLS = {"bin": _walls_around, "wall": _wall_behind, "flat": _block}
+_FIXED = ("wall", "flat")  # whose walls are fixtures of the cell
 # By an object's sides, the shortest first; and in words.
 _SUITED = {
     "tall": (lambda sides: sides[2] >= _TALL, f"{_TALL} m long"),

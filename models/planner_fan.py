@@ -60,6 +60,7 @@ class FanSettings:
         return fan
 
 
+_TILTED = np.deg2rad(60)  # beyond which a tilt costs no more
 # Fewer angles and candidates in each view than in one view alone: there are many views.
 SEARCH = SearchSettings(angles=9, shortlist=80, finalists=60, covered_weight=2.0)
 
@@ -114,7 +115,7 @@ class FanPlanner(SearchPlanner):
         found = self.judged(heights, found).distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
-        factor = np.exp(-((tilt / self.fan.tilt_scale) ** 2))
+        factor = np.exp(-((min(tilt, _TILTED) / self.fan.tilt_scale) ** 2))
         return [
             Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
             for grasp in found.grasps(self.gripper)

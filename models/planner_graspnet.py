@@ -33,6 +33,7 @@ from utils.depth import surfaces_in_holes, table_in_holes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
+    base_heights,
     height_map_from_frame,
     local_maxima,
     tilted_height_map,
@@ -87,9 +88,12 @@ def labelled_by_centres(
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
 
-    rise = height - heights.table_height
+    rise, base = height - heights.table_height, 0.0
+    if heights.ground is not None:
+        base = base_heights(label, heights.ground)[:count] - heights.table_height
+        rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
     total = np.bincount(owner, rise, count)[:count]
-    mean = np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
+    mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
     ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
     eye = frame.T_WC[:3, 3]
     share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])

@@ -24,7 +24,7 @@ from utils.depth import (
     nearest_values,
     reach_in_pixels,
 )
-from utils.geometry import SceneGeometry, Workspace, intersect_lines
+from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_lines
 from utils.transforms import (
     RGBDFrame,
     deproject,
@@ -40,6 +40,9 @@ HOLE_RISE = 0.015  # m
 WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+# Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
+_RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.03, 0.7  # m, m
+_LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
@@ -59,6 +62,8 @@ class HeightMap:
     centres: (M, 3) each label's centre of mass in V, or an estimate of it.
     table_height: metres in W.
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.
+    ground: (R, C) metres, the top of table and fixtures in a map from above; None where there is
+        nothing but the table.
     """
 
     height: np.ndarray
@@ -69,6 +74,7 @@ class HeightMap:
     cell: float
     table_height: float
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
+    ground: np.ndarray | None = None
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,9 +158,52 @@ def height_map_from_frame(
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
     seen = _seen(*without_holes(frame), np.eye(4), grid.shape[:2], origin, cell, table)
-    label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
-    centres = _column_centroids(seen.height - table, label, grid, table)
-    return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+    if not frame.fixtures:
+        label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
+        centres = _column_centroids(seen.height - table, label, grid, table)
+        return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+    fixed = _tops(frame.fixtures, grid, origin, cell)
+    bare = _bare(seen.height, fixed)
+    label = label_pieces(np.where(bare, table, seen.height), table, cell)
+    label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
+    ground = np.maximum(fixed, table)
+    base = base_heights(label, ground)
+    on = np.where(label >= 0, base[label], table)
+    centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
+    centres[:, 2] += base
+    height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, ground=ground)
+
+
+def base_heights(label: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """(M,) metres in W of what each label (R, C) rests on: of a fixture where most of it lies over
+    one, of the lowest ground under it otherwise. ground: (R, C), see `HeightMap`."""
+    on = label >= 0
+    return np.array(
+        [np.median(ground[on & (label == number)]) for number in range(label.max() + 1)]
+    )
+
+
+def without_rims(
+    label: np.ndarray, height: np.ndarray, fixed: np.ndarray, cell: float
+) -> np.ndarray:
+    """The labels (R, C) with WALL_LABEL on pieces that lie along a fixture's edge and hardly rise
+    over it: depth cameras round edges off. fixed: (R, C) the fixtures' tops, -inf beside them."""
+    reach = 2 * int(_RIM_REACH / cell) + 1
+    window = np.ones((reach, reach))
+    near = cv2.dilate(fixed, window)
+    edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
+    edge &= height < near + _RIM_RISE
+    count = np.bincount(label[label >= 0], minlength=label.max() + 1)
+    on_edge = np.bincount(label[(label >= 0) & edge], minlength=label.max() + 1)
+    kept = on_edge < _RIM_SHARE * count
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, WALL_LABEL), (WALL_LABEL, -1))
+    return number[label]
+
+
+def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """(R, C) bool: the surface there is that of a fixture. fixed: (R, C) the fixtures' tops."""
+    return height < cv2.dilate(fixed, np.ones((5, 5))) + _LABEL_FLOOR
 
 
 def tilted_height_map(
@@ -181,7 +230,14 @@ def tilted_height_map(
     if rim.any():
         label = np.where(rim, nearest_values(label, known), label)
     centres = transform_points(inverse_pose(T_WV), overhead.centres)
-    return HeightMap(*seen.walled(), label, centres, origin, cell, overhead.table_height, T_WV)
+    height, ceiling = seen.walled()
+    if filled.fixtures:
+        grid = np.stack(surface[:2], axis=-1)
+        turned = [solid.transformed(inverse_pose(T_WV)) for solid in filled.fixtures]
+        fixed = _tops(turned, grid, origin, cell)
+        label = np.where(_bare(height, fixed), WALL_LABEL, label)
+        height, ceiling = np.maximum(height, fixed), np.maximum(ceiling, fixed)
+    return HeightMap(height, ceiling, label, centres, origin, cell, overhead.table_height, T_WV)
 
 
 class _Seen(NamedTuple):
@@ -263,23 +319,41 @@ def height_map_from_scene(
     scene = scene.transformed(inverse_pose(T_WV))
     bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
     for number, solids in [*bodies, (WALL_LABEL, scene.walls)]:
-        for solid in solids:
-            low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
-            high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
-            low, high = np.maximum(low, 0), np.maximum(high, 0)
-            window = np.s_[low[1] : high[1], low[0] : high[0]]
-            base = grid[window]
-            if base.size == 0:
-                continue
-            origins = np.concatenate(
-                [base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1
-            )
-            top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
+        for window, top in _columns(solids, grid, origin, cell):
             label[window] = np.where(top > height[window], number, label[window])
             height[window] = np.maximum(top, height[window])
     height = height.astype(np.float32)
     centres = np.array([item.centre_of_mass for item in scene.objects]).reshape(-1, 3)
     return HeightMap(height, height, label, centres, origin, cell, table, T_WV)
+
+
+def _columns(
+    solids: Iterable[ConvexSolid], grid: np.ndarray, origin: np.ndarray, cell: float
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """For each solid the window of a grid (R, C, 2) over which it lies, and its highest point there
+    on the line through each cell's centre; -inf where the line misses it."""
+    for solid in solids:
+        low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
+        high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
+        low, high = np.maximum(low, 0), np.maximum(high, 0)
+        window = np.s_[low[1] : high[1], low[0] : high[0]]
+        base = grid[window]
+        if base.size == 0:
+            continue
+        origins = np.concatenate([base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1)
+        top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
+        yield window, top
+
+
+def _tops(
+    solids: Iterable[ConvexSolid], grid: np.ndarray, origin: np.ndarray, cell: float
+) -> np.ndarray:
+    """(R, C) float32 highest point of solids on the line through each cell of a grid (R, C, 2);
+    -inf where it misses them all."""
+    tops = np.full(grid.shape[:2], -np.inf, np.float32)
+    for window, top in _columns(solids, grid, origin, cell):
+        tops[window] = np.maximum(tops[window], top)
+    return tops
 
 
 def label_pieces(

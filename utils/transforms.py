@@ -144,6 +144,8 @@ class RGBDFrame:
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
         see only the depth image must not.
     truth: the scene's true geometry for planners that need it; otherwise None.
+    fixtures: solids in W that stand in the cell for good and whose place every planner may know,
+        such as shelves.
     """
 
     rgb: np.ndarray
@@ -152,6 +154,7 @@ class RGBDFrame:
     T_WC: np.ndarray
     segmentation: np.ndarray | None = None
     truth: SceneGeometry | None = None  # type: ignore[name-defined]  # noqa: F821 - utils.geometry
+    fixtures: tuple[ConvexSolid, ...] = ()  # type: ignore[name-defined]  # noqa: F821 - as above
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
