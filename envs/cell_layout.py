@@ -161,8 +161,8 @@ class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
     drawn. walls: stand on the table and are part of it: of its colour and friction, and what
     touches them touches the table. fixed: whether the walls are fixtures of the cell, whose place
-    planners know, or stand there like a box that somebody has brought. viewpoint: of the fixed camera where the configured one would
-    not see what matters; None is the configured one."""
+    planners know, or stand there like a box that somebody has brought. viewpoint: of the fixed
+    camera where the configured one would not see what matters; None is the configured one."""
 
     layout: str
     seed: int

@@ -33,7 +33,6 @@ from envs.objects import ObjectSet
 from envs.simulators import make_layout_table
 from utils.config import Config
 from utils.errors import UserError
-from utils.geometry import ConvexSolid
 from utils.grasp_quality import RELAXED
 
 # Their places are part of the scenes' seeds.
@@ -140,11 +139,11 @@ def _walls_around(config: Config) -> tuple[Box, ...]:
     return tuple(square_walls(centre, half_size, _WALL_HEIGHT, _WALL_THICKNESS))
 
 
-def _wall_behind(config: Config) -> tuple[Box, ...]:
-    """One wall along the workspace's far edge, beyond which the arm need not go."""
-    half = np.array([_WALL_THICKNESS, config.workspace.size + 0.1, _WALL_HEIGHT]) / 2
+def _wall_beside(config: Config) -> tuple[Box, ...]:
+    """One wall along the workspace's left edge, away from the bin."""
+    half = np.array([config.workspace.size + 0.1, _WALL_THICKNESS, _WALL_HEIGHT]) / 2
     x, y = config.workspace.center
-    return (Box(half, np.array([x + config.workspace.size / 2 + half[0], y, half[2]])),)
+    return (Box(half, np.array([x, y + config.workspace.size / 2 + half[1], half[2]])),)
 
 
 def _block(config: Config) -> tuple[Box, ...]:
@@ -241,19 +240,19 @@ def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) ->
     """Each object on its longest side's end, its thinnest side towards the wall, leaning over;
     None if one finds no place or does not stay so."""
     bodies: list[int] = []
-    face = config.workspace.center[0] + config.workspace.size / 2  # x of the wall
+    face = config.workspace.center[1] + config.workspace.size / 2  # y of the wall
     for model in models:
         thin, _, long = np.eye(3)[np.argsort(model.extents, kind="stable")]
-        upright = Rotation.align_vectors([[0, 0, 1], [1, 0, 0]], [long, thin])[0]
-        rotation = Rotation.from_euler("y", rng.uniform(*_LEAN)) * upright
+        upright = Rotation.align_vectors([[0, 0, 1], [0, 1, 0]], [long, thin])[0]
+        rotation = Rotation.from_euler("x", -rng.uniform(*_LEAN)) * upright
         corners = rotation.apply(np.concatenate(model.parts))
         # It comes to lean on the wall's upper edge where it is higher, on its face otherwise.
         low = corners[:, 2].min()
         farthest = _reach_below(corners, low + _WALL_HEIGHT)
         for _ in range(_TRIES):
             reach = config.workspace.size / 2 - 0.03
-            y = config.workspace.center[1] + rng.uniform(-reach, reach)
-            position = np.array([face - 0.001 - farthest, y, 0.001 - low])
+            x = config.workspace.center[0] + rng.uniform(-reach, reach)
+            position = np.array([x, face - 0.001 - farthest, 0.001 - low])
             body = table.put(model, position, rotation.as_quat())
             if not table.is_near(body, bodies, _PACKED_GAP):
                 break
@@ -272,18 +271,15 @@ def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) ->
 
 
 def _reach_below(corners: np.ndarray, height: float) -> float:
-    """Greatest x of a hull's points (N, 3) that are no higher than `height`."""
-    hull = ConvexSolid.from_vertices(corners)
-    below = hull.vertices[hull.vertices[:, 2] <= height, 0].max()
-    low, high = (
-        hull.vertices[side]
-        for side in (hull.vertices[:, 2] <= height, hull.vertices[:, 2] > height)
-    )
+    """Greatest y of the convex hull of points (N, 3), no higher than `height`."""
+    low = corners[corners[:, 2] <= height]
+    high = corners[corners[:, 2] > height]
+    farthest = low[:, 1].max()
     if len(high) == 0:
-        return float(below)
-    pairs = [(a, b) for a in low for b in high]
-    shares = [(height - a[2]) / (b[2] - a[2]) for a, b in pairs]
-    return float(max(below, *(a[0] + t * (b[0] - a[0]) for (a, b), t in zip(pairs, shares))))
+        return float(farthest)
+    share = (height - low[:, None, 2]) / (high[:, 2] - low[:, None, 2])
+    crossing = low[:, None, 1] + share * (high[:, 1] - low[:, None, 1])
+    return float(max(farthest, crossing.max()))
 
 
 def _overhang(
@@ -321,9 +317,9 @@ def _viewpoint(layout: str, config: Config) -> Viewpoint | None:
     """Of the layout wall from over the objects, of flat from the side of the block's edge; the
     configured camera serves the others."""
     x, y = config.workspace.center
-    edge = config.workspace.size / 2
     if layout == "wall":
-        return Viewpoint((x + edge - 0.07, y, 0.8), (x + edge - 0.07, y, 0.0), (1.0, 0.0, 0.0))
+        y += config.workspace.size / 2 - 0.07
+        return Viewpoint((x, y, 0.8), (x, y, 0.0), (1.0, 0.0, 0.0))
     if layout == "flat":
         return Viewpoint((x, y + 0.61, 0.66), (x, y + 0.04, 0.12), (0.0, 0.0, 1.0))
     return None
@@ -346,7 +342,7 @@ _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
     "bin": _pile_up, "household": _pile_up, "tall": _stand_close, "wall": _lean, "flat": _overhang,
 }  # fmt: skip
-_WALLS = {"bin": _walls_around, "wall": _wall_behind, "flat": _block}
+_WALLS = {"bin": _walls_around, "wall": _wall_beside, "flat": _block}
 _FIXED = ("wall", "flat")  # whose walls are fixtures of the cell
 # By an object's sides, the shortest first; and in words.
 _SUITED = {

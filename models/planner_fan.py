@@ -9,7 +9,7 @@ decides later what it can reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,6 +61,8 @@ class FanSettings:
 
 
 _TILTED = np.deg2rad(60)  # beyond which a tilt costs no more
+_LEVEL = np.cos(np.deg2rad(75))  # of a view that counts as level
+_LEVEL_FROM = 0.09  # m over the table of the highest matter, from which level views are searched
 # Fewer angles and candidates in each view than in one view alone: there are many views.
 SEARCH = SearchSettings(angles=9, shortlist=80, finalists=60, covered_weight=2.0)
 
@@ -93,7 +95,7 @@ class FanPlanner(SearchPlanner):
         maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
         margins, relaxed ones serve.
         """
-        views = [maps(tilted_view(approach, self.workspace)) for approach in self.fan.directions()]
+        views = list(self._views(maps))
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
@@ -102,6 +104,19 @@ class FanPlanner(SearchPlanner):
                 best = distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
                 return with_chances(best, self.calibration)
         return []
+
+    def _views(self, maps: Callable[[np.ndarray], HeightMap]) -> Iterator[HeightMap]:
+        """The maps of the fan, the one from above first. Those of a hand that comes nearly level
+        are left out where nothing is high enough for it."""
+        over_table = -np.inf
+        for approach in self.fan.directions():
+            if over_table < _LEVEL_FROM and approach[2] > -_LEVEL:
+                continue
+            heights = maps(tilted_view(approach, self.workspace))
+            if approach[2] == -1.0:
+                rises = heights.height[heights.label >= 0] - heights.table_height
+                over_table = rises.max(initial=-np.inf)
+            yield heights
 
     def _search_view(
         self, heights: HeightMap, settings: SearchSettings, value: Value | None

@@ -89,8 +89,9 @@ def labelled_by_centres(
     label[row, column] = owner
 
     rise, base = height - heights.table_height, 0.0
-    if heights.ground is not None:
-        base = base_heights(label, heights.ground)[:count] - heights.table_height
+    if heights.fixed is not None:
+        base = base_heights(label, heights.fixed, heights.table_height)[:count]
+        base = base - heights.table_height
         rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
     total = np.bincount(owner, rise, count)[:count]
     mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))

@@ -62,8 +62,8 @@ class HeightMap:
     centres: (M, 3) each label's centre of mass in V, or an estimate of it.
     table_height: metres in W.
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.
-    ground: (R, C) metres, the top of table and fixtures in a map from above; None where there is
-        nothing but the table.
+    fixed: (R, C) metres in V, the tops of fixtures (`RGBDFrame.fixtures`), -inf beside them; None
+        where nothing is known of any.
     """
 
     height: np.ndarray
@@ -74,7 +74,7 @@ class HeightMap:
     cell: float
     table_height: float
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
-    ground: np.ndarray | None = None
+    fixed: np.ndarray | None = None
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,9 @@ class HeightMap:
             np.ascontiguousarray(part[::stride, ::stride])
             for part in (self.height, self.ceiling, self.label)
         )
-        return replace(self, height=height, ceiling=ceiling, label=label, cell=stride * self.cell)
+        fixed = None if self.fixed is None else self.fixed[::stride, ::stride]
+        cell = stride * self.cell
+        return replace(self, height=height, ceiling=ceiling, label=label, cell=cell, fixed=fixed)
 
     def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
         """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
@@ -166,22 +168,20 @@ def height_map_from_frame(
     bare = _bare(seen.height, fixed)
     label = label_pieces(np.where(bare, table, seen.height), table, cell)
     label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
-    ground = np.maximum(fixed, table)
-    base = base_heights(label, ground)
-    on = np.where(label >= 0, base[label], table)
+    base = base_heights(label, fixed, table)
+    on = np.append(base, (table, table))[label]  # the last two are of walls and of the table
     centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
-    return HeightMap(height, ceiling, label, centres, origin, cell, table, ground=ground)
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
 
 
-def base_heights(label: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """(M,) metres in W of what each label (R, C) rests on: of a fixture where most of it lies over
-    one, of the lowest ground under it otherwise. ground: (R, C), see `HeightMap`."""
-    on = label >= 0
-    return np.array(
-        [np.median(ground[on & (label == number)]) for number in range(label.max() + 1)]
-    )
+def base_heights(label: np.ndarray, fixed: np.ndarray, table: float) -> np.ndarray:
+    """(M,) metres in W of what each label (R, C) rests on: a fixture where most of it lies over
+    one, the table otherwise. fixed: (R, C) of a map from above, see `HeightMap`."""
+    on = np.flatnonzero(label >= 0)
+    ground, owner = np.maximum(fixed.take(on), table), label.take(on)
+    return np.array([np.median(ground[owner == number]) for number in range(label.max() + 1)])
 
 
 def without_rims(
@@ -237,7 +237,10 @@ def tilted_height_map(
         fixed = _tops(turned, grid, origin, cell)
         label = np.where(_bare(height, fixed), WALL_LABEL, label)
         height, ceiling = np.maximum(height, fixed), np.maximum(ceiling, fixed)
-    return HeightMap(height, ceiling, label, centres, origin, cell, overhead.table_height, T_WV)
+    else:
+        fixed = None
+    table = overhead.table_height
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed)
 
 
 class _Seen(NamedTuple):
