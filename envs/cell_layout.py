@@ -84,6 +84,12 @@ def square_walls(
             yield Box(size, position)
 
 
+def distance_to_box(points: np.ndarray, box: Box) -> np.ndarray:
+    """(...) metres from points (..., 3) in W to a box, 0 within it."""
+    beyond = np.abs(points - box.position) - box.half_size
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+
+
 def on_table(position: np.ndarray) -> bool:
     """Whether a point (3,) in W is over the table and not below its top."""
     x, y, z = position
