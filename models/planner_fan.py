@@ -39,8 +39,8 @@ class FanSettings:
     rings: tilt from the vertical and number of directions around it, for each ring of the fan.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
     room. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
-    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside a tilted hand:
-    m across, and m above the fingertips.
+    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
+    m above the fingertips.
     """
 
     rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8), (85.0, 4))
@@ -85,7 +85,7 @@ class FanPlanner(SearchPlanner):
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.fan = fan
-        self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
+        self._with_wrist = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
 
     def search_fan(
         self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
@@ -122,10 +122,9 @@ class FanPlanner(SearchPlanner):
         self, heights: HeightMap, settings: SearchSettings, value: Value | None
     ) -> list[Grasp]:
         tilt = np.arccos(np.clip(heights.T_WV[2, 2], -1.0, 1.0))
-        hand = self._tilted_gripper if tilt > 0 else self.gripper
         on_map = None if value is None else lambda candidates: value(heights, candidates)
         found = search_once(
-            heights, hand, self.workspace, settings, on_map, stride=2 if tilt > 0 else 1
+            heights, self._with_wrist, self.workspace, settings, on_map, 2 if tilt > 0 else 1
         )
         found = self.judged(heights, found).distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn

@@ -41,7 +41,7 @@ WALL = 0.05  # m over all that is known: height assumed in holes that are too wi
 WALL_LABEL = -2
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
-_RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.03, 0.7  # m, m
+_RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
@@ -191,6 +191,7 @@ def without_rims(
     over it: depth cameras round edges off. fixed: (R, C) the fixtures' tops, -inf beside them."""
     reach = 2 * int(_RIM_REACH / cell) + 1
     window = np.ones((reach, reach))
+    fixed = np.maximum(fixed, -FARTHEST)  # so that heights can be subtracted
     near = cv2.dilate(fixed, window)
     edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
     edge &= height < near + _RIM_RISE
