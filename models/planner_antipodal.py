@@ -304,7 +304,8 @@ def measure(
     if heights.fixed is not None:  # a fixture under an object that leans over it
         between = (u > left[:, None]) & (u < right[:, None])
         fixed = heights.fixed.take(where).max(axis=1)
-        left_over &= (np.where(between, fixed, -np.inf) < tip[:, None]).all(axis=1)
+        under = (tip - settings.clearance)[:, None]
+        left_over &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
     near, opening, covered = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
     opening[left_over] = _widest_opening(

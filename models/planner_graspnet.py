@@ -88,7 +88,7 @@ def labelled_by_centres(
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
 
-    rise, base = height - heights.table_height, 0.0
+    rise, base = height - heights.table_height, np.zeros(count)
     if heights.fixed is not None:
         base = base_heights(label, heights.fixed, heights.table_height)[:count]
         base = base - heights.table_height

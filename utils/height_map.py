@@ -62,8 +62,8 @@ class HeightMap:
     centres: (M, 3) each label's centre of mass in V, or an estimate of it.
     table_height: metres in W.
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.
-    fixed: (R, C) metres in V, the tops of fixtures (`RGBDFrame.fixtures`), -inf beside them; None
-        where nothing is known of any.
+    fixed: (R, C) metres in V, the tops of fixtures (`RGBDFrame.fixtures`) or true walls, -inf
+        beside them; None where nothing is known of any.
     """
 
     height: np.ndarray
@@ -327,8 +327,9 @@ def height_map_from_scene(
             label[window] = np.where(top > height[window], number, label[window])
             height[window] = np.maximum(top, height[window])
     height = height.astype(np.float32)
+    fixed = _tops(scene.walls, grid, origin, cell) if scene.walls else None
     centres = np.array([item.centre_of_mass for item in scene.objects]).reshape(-1, 3)
-    return HeightMap(height, height, label, centres, origin, cell, table, T_WV)
+    return HeightMap(height, height, label, centres, origin, cell, table, T_WV, fixed)
 
 
 def _columns(
