@@ -347,16 +347,17 @@ class Cell(ABC):
     # --- Camera -------------------------------------------------------------------------------
 
     def camera_pose(self, mount: str | None = None) -> np.ndarray:
-        """(4, 4) T_WC of the overhead or the wrist camera."""
+        """(4, 4) T_WC of the overhead or the wrist camera; a scene may place the overhead one."""
         camera = self.config.camera
         if (mount or camera.mount) == "overhead":
-            if camera.view == "fixed":
-                return look_at(camera.position, camera.target, camera.up)
-            if self.scene is None:
-                raise ValueError(
-                    "A side view follows the scene's seed; build or load a scene first"
-                )
-            return side_view(camera, self.config.workspace, self.scene.seed)
+            if camera.view == "side":
+                if self.scene is None:
+                    raise ValueError(
+                        "A side view follows the scene's seed; build or load a scene first"
+                    )
+                return side_view(camera, self.config.workspace, self.scene.seed)
+            fixed = (self.scene and self.scene.viewpoint) or camera
+            return look_at(fixed.position, fixed.target, fixed.up)
         return self.robot.encoder_pose() @ wrist_mount(camera)
 
     def frame(self, with_truth: bool = False) -> RGBDFrame:
@@ -389,8 +390,9 @@ class Cell(ABC):
         `envs.cell.DEFAULT_LIGHT`."""
         image = self.image(intrinsics, T_WC, light)
         truth = self.truth() if with_truth else None
+        fixtures = () if self.scene is None else self.scene.fixtures
         return RGBDFrame(
-            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth
+            image.rgb, image.depth, intrinsics.K, T_WC, self._segmentation(image), truth, fixtures
         )
 
     def image(self, intrinsics: Intrinsics, T_WC: np.ndarray, light: dict | None = None) -> Image:

@@ -84,6 +84,12 @@ def square_walls(
             yield Box(size, position)
 
 
+def distance_to_box(points: np.ndarray, box: Box) -> np.ndarray:
+    """(...) metres from points (..., 3) in W to a box, 0 within it."""
+    beyond = np.abs(points - box.position) - box.half_size
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+
+
 def on_table(position: np.ndarray) -> bool:
     """Whether a point (3,) in W is over the table and not below its top."""
     x, y, z = position
@@ -147,17 +153,36 @@ class Placement:
 
 
 @dataclass(frozen=True)
+class Viewpoint:
+    """Where a fixed camera stands, in W: position and target in metres, and the direction that
+    points up in its image."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class Scene:
     """Objects at rest. layout: one of `envs.cell_scenes.LAYOUTS`. seed: from which the scene was
     drawn. walls: stand on the table and are part of it: of its colour and friction, and what
-    touches them touches the table. target: number of the one object that is to be retrieved, None
-    where all are to be picked."""
+    touches them touches the table. fixed: whether the walls are fixtures of the cell, whose place
+    planners know, or stand there like a box that somebody has brought. viewpoint: of the fixed
+    camera where the configured one would not see what matters; None is the configured one. target:
+    number of the one object that is to be retrieved, None where all are to be picked."""
 
     layout: str
     seed: int
     placements: tuple[Placement, ...]
     walls: tuple[Box, ...] = ()
+    fixed: bool = False
+    viewpoint: Viewpoint | None = None
     target: int | None = None
+
+    @property
+    def fixtures(self) -> tuple[ConvexSolid, ...]:
+        """Solids in W whose place planners know."""
+        return tuple(wall.solid() for wall in self.walls) if self.fixed else ()
 
 
 EMPTY = Scene("isolated", 0, ())

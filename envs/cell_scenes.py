@@ -3,8 +3,10 @@
 `isolated`: one object, dropped. `packed`: objects standing upright side by side. `pile`: objects
 dropped through a box whose walls are then taken away. `dense`: a pile of DENSE_COUNT objects,
 whatever `scene.count` says. `bin`: a pile between walls that stand around the workspace.
-`household`: a pile of objects as different in size as the set has them, see `_mixed`. `retrieve`: a
-pile of RETRIEVE_COUNT objects, one of which, partly covered by others, is wanted, see `_covered`.
+`household`: a pile of objects as different in size as the set has them, see `_mixed`.
+`tall`: things higher than the fingers are long, upright and close together. `wall`: things that
+lean against a wall. `flat`: things wider than the hand at the edge of a block. `retrieve`: a pile
+of RETRIEVE_COUNT objects, one of which, partly covered by others, is wanted, see `_covered`.
 `packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
 
 The objects come to rest in the simulator `scene.simulator`, whichever simulator the scene is for,
@@ -14,12 +16,20 @@ so that all simulators start from the same poses. The scene itself is data
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.cell_layout import Box, LayoutTable, ObjectModel, Placement, Scene, square_walls
+from envs.cell_layout import (
+    Box,
+    LayoutTable,
+    ObjectModel,
+    Placement,
+    Scene,
+    Viewpoint,
+    square_walls,
+)
 from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
 from models.planner_contacts import buried_share
@@ -31,9 +41,12 @@ from utils.height_map import height_map_from_scene
 from utils.transforms import pose_matrix
 
 # Their places are part of the scenes' seeds.
-LAYOUTS = ("isolated", "packed", "pile", "dense", "bin", "household", "retrieve")
+LAYOUTS = (
+    "isolated", "packed", "pile", "dense", "bin", "household", "tall", "wall", "flat", "retrieve",
+)  # fmt: skip
 TARGET_LAYOUT = "retrieve"  # of whose objects one is wanted
 DENSE_COUNT, RETRIEVE_COUNT = 15, 8
+WALL_COUNT, FLAT_COUNT = 3, 2  # wide things, which need room beside each other
 # Of the object to retrieve: what others cover of it, seen from above, and what shows of it.
 LEAST_COVERED, LEAST_SHOWN, LEAST_AREA = 0.2, 0.2, 2e-4  # shares, m2
 
@@ -47,6 +60,14 @@ _WALL_HEIGHT, _WALL_THICKNESS, _WALL_GAP = 0.10, 0.01, 0.02
 _PACKED_REGION = 0.07  # m, half side of the square of centres: VGN's 14 cm
 _PACKED_GAP = 0.004  # m, least distance between neighbours
 _TRIES = 50
+_TALL = 0.12  # m, least height of what stands in the layout tall; a finger is 0.045 m long
+_TALL_GAP = 0.015  # m, most between neighbours: a finger with its room needs 0.02 m
+_LEANER = (0.10, 0.115)  # m, of the layout wall: least longest side, and greatest second one
+_LEAN = np.radians((12, 28))  # rad from the vertical, when put down
+_LEANS = np.radians((8, 35))  # rad, at rest
+_FLAT, _SPAN = 0.016, 0.085  # m, of the layout flat: greatest thickness, least second longest side
+_BLOCK = np.array([0.34, 0.16, 0.15])  # m, on which flat things lie; half a hand high and more
+_OVERHANG = (0.02, 0.06)  # m
 
 
 class SceneError(UserError):
@@ -64,12 +85,14 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         raise SceneError(f"unknown scene layout {layout!r}; allowed are {', '.join(LAYOUTS)}")
     rng = np.random.default_rng([seed, LAYOUTS.index(layout)])
     arrange = _ARRANGEMENTS[layout]
-    fixed = {"isolated": 1, "dense": DENSE_COUNT, "retrieve": RETRIEVE_COUNT}
-    count = fixed.get(layout, config.scene.count)
-    walls = tuple(_walls_around(config)) if layout == "bin" else ()
+    count = _COUNTS.get(layout, config.scene.count)
+    walls = _WALLS[layout](config) if layout in _WALLS else ()
+    fixed, viewpoint = layout in _FIXED, _viewpoint(layout, config)
     for _ in range(_TRIES):
         if layout == "household":
             chosen = _mixed(objects, count, rng, config)
+        elif layout in _SUITED:
+            chosen = _suited(objects, count, rng, layout)
         else:
             chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
@@ -82,7 +105,7 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
             target = _covered(placements, config) if layout == TARGET_LAYOUT else None
             if layout != TARGET_LAYOUT or target is not None:
-                return Scene(layout, seed, placements, walls, target)
+                return Scene(layout, seed, placements, walls, fixed, viewpoint, target)
     covering = " with one under others" if layout == TARGET_LAYOUT else ""
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
@@ -129,10 +152,38 @@ def _covered(placements: tuple[Placement, ...], config: Config) -> int | None:
     return int(covered.argmax()) if covered.max() >= LEAST_COVERED else None
 
 
-def _walls_around(config: Config) -> Iterator[Box]:
+def _suited(objects: ObjectSet, count: int, rng, layout: str) -> np.ndarray:
+    """Numbers (count,) of objects of a shape that belongs into the layout, drawn without repetition
+    while the set has enough of them."""
+    suits, what = _SUITED[layout]
+    found = list(itertools.islice(
+        (index for index in rng.permutation(len(objects)).tolist()
+         if suits(np.sort(objects[index].extents))), count
+    ))  # fmt: skip
+    if not found:
+        raise SceneError(
+            f"no object of {objects.name!r} is {what}, as the layout {layout} needs it; use the "
+            f"set {'flat' if layout == 'flat' else 'tall'}"
+        )
+    return np.resize(found, count)
+
+
+def _walls_around(config: Config) -> tuple[Box, ...]:
     """Walls around the workspace, _WALL_GAP from its edges."""
     centre, half_size = np.array(config.workspace.center), config.workspace.size / 2 + _WALL_GAP
-    return square_walls(centre, half_size, _WALL_HEIGHT, _WALL_THICKNESS)
+    return tuple(square_walls(centre, half_size, _WALL_HEIGHT, _WALL_THICKNESS))
+
+
+def _wall_beside(config: Config) -> tuple[Box, ...]:
+    """One wall along the workspace's left edge, away from the bin."""
+    half = np.array([config.workspace.size + 0.1, _WALL_THICKNESS, _WALL_HEIGHT]) / 2
+    x, y = config.workspace.center
+    return (Box(half, np.array([x, y + config.workspace.size / 2 + half[1], half[2]])),)
+
+
+def _block(config: Config) -> tuple[Box, ...]:
+    """A block in the middle of the workspace."""
+    return (Box(_BLOCK / 2, np.append(config.workspace.center, _BLOCK[2] / 2)),)
 
 
 def _inside(position: np.ndarray, config: Config) -> bool:
@@ -196,6 +247,119 @@ def _stand_one(
     return None
 
 
+def _stand_close(
+    table: LayoutTable, models: list[ObjectModel], rng, config: Config
+) -> list[int] | None:
+    """Each object on its longest side's end, near another one; None if one finds no place."""
+    bodies: list[int] = []
+    for model in models:
+        upright = Rotation.align_vectors([[0, 0, 1]], [np.eye(3)[np.argmax(model.extents)]])[0]
+        for _ in range(_TRIES):
+            rotation = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * upright
+            place = config.workspace.center + rng.uniform(-_PACKED_REGION, _PACKED_REGION, 2)
+            position = np.append(place, 0.001 - _lowest(model, rotation))
+            body = table.put(model, position, rotation.as_quat())
+            near = not bodies or table.is_near(body, bodies, _TALL_GAP)
+            if near and not table.is_near(body, bodies, _PACKED_GAP):
+                break
+            table.remove(body)
+        else:
+            return None
+        if not _stands(table, body, rotation, bodies):
+            return None
+        bodies.append(body)
+    return bodies
+
+
+def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int] | None:
+    """Each object on its longest side's end, its thinnest side towards the wall, leaning over;
+    None if one finds no place or does not stay so."""
+    bodies: list[int] = []
+    face = config.workspace.center[1] + config.workspace.size / 2  # y of the wall
+    for model in models:
+        thin, _, long = np.eye(3)[np.argsort(model.extents, kind="stable")]
+        upright = Rotation.align_vectors([[0, 0, 1], [0, 1, 0]], [long, thin])[0]
+        rotation = Rotation.from_euler("x", -rng.uniform(*_LEAN)) * upright
+        corners = rotation.apply(np.concatenate(model.parts))
+        # It comes to lean on the wall's upper edge where it is higher, on its face otherwise.
+        low = corners[:, 2].min()
+        farthest = _reach_below(corners, low + _WALL_HEIGHT)
+        for _ in range(_TRIES):
+            reach = config.workspace.size / 2 - 0.03
+            x = config.workspace.center[0] + rng.uniform(-reach, reach)
+            position = np.array([x, face - 0.001 - farthest, 0.001 - low])
+            body = table.put(model, position, rotation.as_quat())
+            if not table.is_near(body, bodies, _PACKED_GAP):
+                break
+            table.remove(body)
+        else:
+            return None
+        bodies.append(body)
+        if not table.settle(bodies):
+            return None
+    for model, body in zip(models, bodies):
+        turn = Rotation.from_quat(table.pose(body)[1]).as_matrix()
+        lean = np.arccos(abs(turn[2, np.argmax(model.extents)]))
+        if not _LEANS[0] <= lean <= _LEANS[1]:
+            return None
+    return bodies
+
+
+def _reach_below(corners: np.ndarray, height: float) -> float:
+    """Greatest y of the convex hull of points (N, 3), no higher than `height`."""
+    low = corners[corners[:, 2] <= height]
+    high = corners[corners[:, 2] > height]
+    farthest = low[:, 1].max()
+    if len(high) == 0:
+        return float(farthest)
+    share = (height - low[:, None, 2]) / (high[:, 2] - low[:, None, 2])
+    crossing = low[:, None, 1] + share * (high[:, 1] - low[:, None, 1])
+    return float(max(farthest, crossing.max()))
+
+
+def _overhang(
+    table: LayoutTable, models: list[ObjectModel], rng, config: Config
+) -> list[int] | None:
+    """Each object flat on the block, some of it beyond the edge towards +y; None if one finds no
+    place or falls."""
+    bodies: list[int] = []
+    x, y = config.workspace.center
+    for model in models:
+        level = Rotation.align_vectors([[0, 0, 1]], [np.eye(3)[np.argmin(model.extents)]])[0]
+        for _ in range(_TRIES):
+            rotation = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * level
+            corners = rotation.apply(np.concatenate(model.parts))
+            room = max(_BLOCK[0] / 2 - np.abs(corners[:, 0]).max(), 0.0)
+            edge = y + _BLOCK[1] / 2
+            position = np.array([
+                x + rng.uniform(-room, room),
+                min(edge + rng.uniform(*_OVERHANG) - corners[:, 1].max(), edge - 0.01),
+                _BLOCK[2] + 0.001 - corners[:, 2].min(),
+            ])  # fmt: skip
+            body = table.put(model, position, rotation.as_quat())
+            if not table.is_near(body, bodies, _PACKED_GAP):
+                break
+            table.remove(body)
+        else:
+            return None
+        if not _stands(table, body, rotation, bodies):
+            return None
+        bodies.append(body)
+    return bodies
+
+
+def _viewpoint(layout: str, config: Config) -> Viewpoint | None:
+    """Of the layout wall from over the objects, of flat from the side of the block's edge; the
+    configured camera serves the others."""
+    x, y = config.workspace.center
+    if layout == "wall":
+        y += config.workspace.size / 2 - 0.07
+        return Viewpoint((x, y, 0.8), (x, y, 0.0), (1.0, 0.0, 0.0))
+    if layout == "flat":
+        return Viewpoint((x, y + 0.61, 0.66), (x, y + 0.04, 0.12), (0.0, 0.0, 1.0))
+    return None
+
+
 def _stands(table: LayoutTable, body: int, rotation: Rotation, others: list[int]) -> bool:
     """Whether a body just put down stays within 20 degrees of how it was put."""
     table.settle([body, *others])
@@ -211,5 +375,24 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
-    "bin": _pile_up, "household": _pile_up, "retrieve": _pile_up,
+    "bin": _pile_up, "household": _pile_up, "tall": _stand_close, "wall": _lean, "flat": _overhang,
+    "retrieve": _pile_up,
 }  # fmt: skip
+_COUNTS = {
+    "isolated": 1, "dense": DENSE_COUNT, "wall": WALL_COUNT, "flat": FLAT_COUNT,
+    "retrieve": RETRIEVE_COUNT,
+}  # fmt: skip
+_WALLS = {"bin": _walls_around, "wall": _wall_beside, "flat": _block}
+_FIXED = ("wall", "flat")  # whose walls are fixtures of the cell
+# By an object's sides, the shortest first; and in words.
+_SUITED = {
+    "tall": (lambda sides: sides[2] >= _TALL, f"{_TALL} m long"),
+    "wall": (
+        lambda sides: sides[2] >= _LEANER[0] and sides[1] <= _LEANER[1],
+        f"{_LEANER[0]} m long and at most {_LEANER[1]} m wide",
+    ),
+    "flat": (
+        lambda sides: sides[0] <= _FLAT and sides[1] >= _SPAN,
+        f"at most {_FLAT} m thick and {_SPAN} m wide",
+    ),
+}

@@ -9,7 +9,7 @@ grasps are planned.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -18,12 +18,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.cell import Cell, require_arm
-from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
+from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT, bin_walls, distance_to_box, table_box
 from envs.panda_model import FINGER_FORCE
 from envs.robot import Robot
 from envs.robot_kinematics import (
     HALF_TURN,
+    JOINT_LOWER,
+    JOINT_UPPER,
     UnreachableError,
+    all_postures,
+    arm_points,
     choose_posture,
     forward_kinematics,
     tip_position,
@@ -41,6 +45,9 @@ _LEAST_FRICTION = 0.4  # that a grip counts on
 _HOLD_MARGIN = 1.5  # times the force that this friction needs
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
+_ARM_RADIUS = 0.065  # m of the links between elbow and flange
+_LOOK_EVERY = 12  # references between two at which the arm's links are looked at
+_LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
 
@@ -155,24 +162,59 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
 
 
 def reaches(cell: Cell, grasp: Grasp) -> bool:
-    """Whether the arm can go to a grasp as `open_loop` does, and lift what it grips; nothing
-    moves."""
+    """Whether the arm can go to a grasp as `open_loop` does, and lift what it grips, without
+    touching what stands in the cell for good; nothing moves."""
     try:
-        _, down, target = _planned(cell, grasp)
-        _line(cell, down.positions[-1], _raised(cell, target, grasp.position[2]))
+        return any(_is_clear(cell, plan, grasp) for plan in _plans(cell, grasp))
     except UnreachableError:
         return False
-    return True
 
 
-def _planned(cell: Cell, grasp: Grasp) -> tuple[Trajectory, Trajectory, np.ndarray]:
-    """The way to the pregrasp, from there straight to the grasp, and the grasp's pose (4, 4), which
-    may be flipped. Raises UnreachableError."""
+Plan = tuple[Trajectory, Trajectory, np.ndarray]
+
+
+def _planned(cell: Cell, grasp: Grasp) -> Plan:
+    """The first of the `_plans` on which the arm is clear of the cell; if none is, the first.
+    Raises UnreachableError."""
+    plans = list(_plans(cell, grasp))
+    if len(plans) == 1:
+        return plans[0]
+    return next((plan for plan in plans if _is_clear(cell, plan, grasp)), plans[0])
+
+
+def _plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
+    """For each posture at the pregrasp: the way there, from there straight to the grasp, and the
+    grasp's pose (4, 4), which may be flipped. Raises UnreachableError where there is none."""
     pregrasp = _backed(grasp.pose, cell.config.execution.pregrasp_height)
-    q_pregrasp = choose_posture(pregrasp, cell.home)
-    target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
-    reach = cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell))
-    return reach, _descent(cell, q_pregrasp, target), target
+    failures, found = [], False
+    for q_pregrasp in all_postures(pregrasp, cell.home):
+        target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
+        try:
+            down = _descent(cell, q_pregrasp, target)
+        except UnreachableError as error:
+            failures.append(error)
+            continue
+        found = True
+        yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)), down, target
+    if not found:
+        raise failures[0]
+
+
+def _is_clear(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
+    """Whether the arm, but for its hand, stays clear of table, bin, walls and its joints' limits on
+    a plan and while it lifts. The hand is the planners' matter."""
+    reach, down, target = plan
+    try:
+        lift = _line(cell, down.positions[-1], _raised(cell, target, grasp.position[2]))
+    except UnreachableError:
+        return False
+    way = np.concatenate([part.positions[::_LOOK_EVERY] for part in (reach, down, lift)])
+    margin = cell.config.safety.joint_margin
+    if (way < JOINT_LOWER + margin).any() or (way > JOINT_UPPER - margin).any():
+        return False  # where a curve between waypoints may leave the limits
+    points = arm_points(way)
+    boxes = [table_box(), *bin_walls(), *(cell.scene.walls if cell.scene else ())]
+    return all(distance_to_box(points, box).min() > _ARM_RADIUS for box in boxes)
 
 
 def _backed(T_WE: np.ndarray, distance: float) -> np.ndarray:
@@ -281,7 +323,7 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
 def _raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
     """The pose (4, 4) at which an object is lifted high enough that the hand gripped at T_WE."""
     lifted = T_WE.copy()
-    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + 0.05
+    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + _LIFT_MARGIN
     return lifted
 
 
@@ -299,7 +341,9 @@ def _carry_to_bin(
     believes that it holds one."""
     settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
     lift = _line(cell, start, lifted)
-    posture = choose_posture(top_down_pose(OVER_BIN, -np.pi / 2), cell.home)
+    over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
+    over_bin[2] = max(over_bin[2], lifted[2, 3] - _LIFT_MARGIN)
+    posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
     carry = robot.joint_move(lift.positions[-1], posture, **_scales(cell))
     corner = _higher_than(lifted[2, 3] - _CORNER, lift)
     way = robot.blended_moves(start, lift, carry, corner, **_scales(cell))

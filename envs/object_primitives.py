@@ -1,8 +1,10 @@
-"""Procedural solids: eleven families, four that no training sees, and four of thin and dark things,
-each object determined by its index alone.
+"""Procedural solids: eleven families, four that no training sees, four of thin and dark things,
+three of tall and three of flat ones, each object determined by its index alone.
 
-A hand that opens 0.08 m can grasp every one of them in every resting pose: across the whole, across
-a bar, or across a wall with one finger inside. This module knows no simulator.
+A hand that opens 0.08 m can grasp every one of them, but for the flat ones, in every resting pose:
+across the whole, across a bar, or across a wall with one finger inside. Flat ones are wider than
+the hand and too thin to be gripped from above where they lie on a table. This module knows no
+simulator.
 """
 
 from __future__ import annotations
@@ -19,7 +21,12 @@ FAMILIES = (
 UNSEEN_FAMILIES = ("frustum", "wedge", "Z", "dumbbell")
 # What a depth camera sees worst, and photographs of household things are full of.
 THIN_FAMILIES = ("strap", "cable", "loop", "goggles")
-_STREAMS = {FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,)}  # of random numbers
+TALL_FAMILIES = ("bottle", "can", "carton")  # 12 to 25 cm high where they stand
+FLAT_FAMILIES = ("plate", "book", "lid")  # 5 to 15 mm high where they lie, wider than the hand
+_STREAMS = {
+    FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,), TALL_FAMILIES: (3,),
+    FLAT_FAMILIES: (4,),
+}  # fmt: skip
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _MASS_RANGE = (0.03, 0.3)
@@ -71,7 +78,7 @@ def make_primitive(
     index: int, scale: float = 1.0, families: tuple[str, ...] = FAMILIES
 ) -> Primitive:
     """The object of this index; families take turns, so any run of indices is balanced. families:
-    FAMILIES, UNSEEN_FAMILIES or THIN_FAMILIES, which count each by themselves."""
+    one of the module's groups, which count each by themselves."""
     rng = np.random.default_rng([_SEED, index, *_STREAMS[families]])
     family = families[index % len(families)]
     shape = _SHAPES[family](rng)
@@ -317,6 +324,29 @@ def _goggles(rng) -> list[np.ndarray]:
     ]
 
 
+def _bottle(rng) -> list[np.ndarray]:
+    """Body, shoulder and neck, standing."""
+    radius, neck, body, shoulder, top = rng.uniform(
+        (0.024, 0.011, 0.08, 0.02, 0.025), (0.033, 0.016, 0.16, 0.04, 0.05)
+    )
+    return [
+        _disc(radius, radius, 0, body),
+        _disc(radius, neck, body, body + shoulder),
+        _disc(neck, neck, body + shoulder, body + shoulder + top),
+    ]
+
+
+def _plate(rng) -> list[np.ndarray]:
+    """A wide rim on a foot, each as thick."""
+    radius, thick = rng.uniform((0.065, 0.004), (0.10, 0.007))
+    foot = rng.uniform(0.55, 0.7) * radius
+    inner = foot - 0.01
+    return [
+        _disc(foot, foot, 0, thick),
+        *_wall((inner, inner), (radius, radius), (thick, 2 * thick)),
+    ]
+
+
 # Bounds in metres. Of a convex solid the two smaller sides stay below 0.06: one of them is
 # always across when it lies on a face.
 _SHAPES = {
@@ -345,4 +375,14 @@ _SHAPES = {
     "cable": _cable,
     "loop": _loop,
     "goggles": _goggles,
+    "bottle": _bottle,
+    "can": lambda rng: NativeShape("cylinder", tuple(rng.uniform((0.024, 0.12), (0.033, 0.18)))),
+    "carton": lambda rng: NativeShape(
+        "box", tuple(rng.uniform((0.035, 0.045, 0.12), (0.06, 0.08, 0.24)))
+    ),
+    "plate": _plate,
+    "book": lambda rng: NativeShape(
+        "box", tuple(rng.uniform((0.09, 0.12, 0.006), (0.13, 0.19, 0.015)))
+    ),
+    "lid": lambda rng: NativeShape("cylinder", tuple(rng.uniform((0.05, 0.005), (0.085, 0.01)))),
 }

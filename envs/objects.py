@@ -24,6 +24,8 @@ from envs.object_files import DEFAULT_DENSITY, object_files
 from envs.object_meshes import ObjectError
 from envs.object_primitives import (
     FAMILIES,
+    FLAT_FAMILIES,
+    TALL_FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
     NativeShape,
@@ -36,9 +38,10 @@ from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
-# Numbers of the first object of each kind of `primitives` and of `thin`, and the end.
+# Numbers of the first object of each kind of `primitives` and of special families, and the end.
 PRIMITIVES = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
-THIN = {"train": 0, "test": 200, "sealed": 250, "end": 300}
+SPECIAL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
+SPECIAL_FAMILIES = {"thin": THIN_FAMILIES, "tall": TALL_FAMILIES, "flat": FLAT_FAMILIES}
 PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
@@ -282,26 +285,25 @@ class BoxSet(ObjectSet):
 class PrimitiveSet(ObjectSet):
     """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
     for tests, 100 for the published tables alone, and 100 of the families that no training sees.
-    thin: of the families of thin and dark things instead, 200, 50 and 50."""
+    name: of an entry of SPECIAL_FAMILIES instead, 200, 50 and 50."""
 
-    def __init__(self, settings: SetSettings, thin: bool = False) -> None:
-        name = "thin" if thin else "primitives"
+    def __init__(self, settings: SetSettings, name: str = "primitives") -> None:
         _refuse_fit(name, settings)
         super().__init__(name)
-        unseen = settings.split == "unseen_families"
-        if thin and unseen:
+        unseen, special = settings.split == "unseen_families", SPECIAL_FAMILIES.get(name)
+        if special and unseen:
             raise ObjectError(
-                "objects.split=unseen_families: training may see all families of thin; use "
+                f"objects.split=unseen_families: training may see all families of {name}; use "
                 "primitives, or objects.split=test"
             )
-        first = THIN if thin else PRIMITIVES
+        first = SPECIAL if special else PRIMITIVES
         self.indices = {
             "train": range(first["train"], first["test"]),
             "test": range(first["test"], first["sealed"]),
             "sealed": range(first["sealed"], first["end"]),
             "unseen_families": range(PRIMITIVES_UNSEEN),
         }[settings.split]
-        self.families = THIN_FAMILIES if thin else UNSEEN_FAMILIES if unseen else FAMILIES
+        self.families = special or (UNSEEN_FAMILIES if unseen else FAMILIES)
         self.scale, self.cache_dir = settings.scale or 1.0, settings.cache_dir
 
     def __len__(self) -> int:
@@ -403,5 +405,5 @@ OBJECT_SETS: dict[str, Callable[[SetSettings], ObjectSet]] = {
     "box": BoxSet,
     "primitives": PrimitiveSet,
     "random_urdfs": _random_urdfs,
-    "thin": partial(PrimitiveSet, thin=True),
+    **{name: partial(PrimitiveSet, name=name) for name in SPECIAL_FAMILIES},
 }

@@ -8,6 +8,7 @@ an object that turns. Pure numpy: planning touches no simulator and knows no cel
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -45,6 +46,8 @@ _LINKS = [
     for a, alpha, d in zip((*_A, 0.0), (*_ALPHA, 0.0), (*_D, TOOL_LENGTH))
 ]
 _ARM_FROM_ITS_END = _LINKS[-2::-1]
+
+_ELBOW = 5  # of the ends of the links' parts, two for each joint, that of the elbow
 
 _IDENTITY = np.eye(6)
 
@@ -130,6 +133,26 @@ def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     turns = velocities.T[:, :, None] * np.array(axes)
     arms = p + TOOL_LENGTH * z - np.array(origins)
     return np.hstack([np.cross(turns, arms).sum(axis=0), turns.sum(axis=0)])
+
+
+def arm_points(q: np.ndarray, spacing: float = 0.05) -> np.ndarray:
+    """(N, P, 3) points in W on the arm's links, at most `spacing` m apart, from the elbow to the
+    flange, for joint positions q (N, 7)."""
+    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
+    p, corners = np.zeros((len(q), 3)), []
+    for (a, turn, d), angle in zip(_LINKS[:-1], q.T[:, :, None]):
+        p = p + a * x
+        if turn:  # by a right angle about x
+            y, z = turn * z, -turn * y
+        corners += [p, p + d * z]
+        p = corners[-1]
+        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+    corners = [*corners[_ELBOW:], p + FLANGE_LENGTH * z]
+    points = [corners[0]]
+    for start, end in zip(corners, corners[1:]):
+        count = int(np.ceil(np.linalg.norm(end[0] - start[0]) / spacing))
+        points += [start + share * (end - start) for share in (np.arange(count) + 1) / count]
+    return np.stack(points, axis=1)
 
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
@@ -245,6 +268,14 @@ class ServoStep:
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the wrist flip
 
+# Three postures from which searches reach most of the poses, 60 to 85 degrees from straight above,
+# that the one from home does not: measured on 288 of them, 81 % from home and 88 % with these.
+STARTS = np.array([
+    [0.0, -0.3, -1.5, -2.2, 1.5, 1.8, 2.3],
+    [0.8, 0.2, 0.0, -2.2, -1.6, 3.0, 0.785],
+    [0.0, -0.3, -1.5, -2.2, -1.5, 1.8, -0.8],
+])  # fmt: skip
+
 _ROOM = 0.6  # rad between the wrist and its limits that a posture should leave
 _LITTLE_ROOM = 0.3  # rad of it below which a flip is considered
 _LONGEST_TURN = 2.8  # rad of the wrist, less than half a turn
@@ -262,6 +293,22 @@ def postures(T_WE: np.ndarray, home: np.ndarray) -> dict[bool, np.ndarray]:
     if not found:
         raise error
     return found
+
+
+def all_postures(T_WE: np.ndarray, home: np.ndarray) -> list[np.ndarray]:
+    """Joint positions (7,) that reach a gripper pose (4, 4) or its flip, the nearest to `home`
+    first; where none lies near it, those found from `STARTS`. Raises UnreachableError."""
+    try:
+        found = list(postures(T_WE, home).values())
+    except UnreachableError as error:
+        found = []
+        for start in STARTS:
+            for pose in (T_WE, T_WE @ HALF_TURN):
+                with contextlib.suppress(UnreachableError):
+                    found.append(inverse_kinematics(pose, start))
+        if not found:
+            raise error
+    return sorted(found, key=lambda q: float(abs(q - home).max()))
 
 
 def choose_posture(T_WE: np.ndarray, home: np.ndarray) -> np.ndarray:

@@ -321,6 +321,11 @@ def measure(
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over &= np.minimum(*ends) > WALL_LABEL
+    if heights.fixed is not None:  # a fixture under an object that leans over it
+        between = (u > left[:, None]) & (u < right[:, None])
+        fixed = heights.fixed.take(where).max(axis=1)
+        under = (tip - settings.clearance)[:, None]
+        left_over &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
     left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
     other = heights.label == OTHER_LABEL
     if other.any():

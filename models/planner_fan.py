@@ -9,7 +9,7 @@ decides later what it can reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,11 +41,11 @@ class FanSettings:
     rings: tilt from the vertical and number of directions around it, for each ring of the fan.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
     room. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
-    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside a tilted hand:
-    m across, and m above the fingertips.
+    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
+    m above the fingertips.
     """
 
-    rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8))
+    rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8), (85.0, 4))
     tilt_scale: float = 1.2
     returned: int = 40
     distinct_distance: float = 0.01
@@ -62,6 +62,9 @@ class FanSettings:
         return fan
 
 
+_TILTED = np.deg2rad(60)  # beyond which a tilt costs no more
+_LEVEL = np.cos(np.deg2rad(75))  # of a view that counts as level
+_LEVEL_FROM = 0.09  # m over the table of the highest matter, from which level views are searched
 # Fewer angles and candidates in each view than in one view alone: there are many views.
 SEARCH = SearchSettings(angles=9, shortlist=80, finalists=60, covered_weight=2.0)
 
@@ -84,7 +87,7 @@ class FanPlanner(SearchPlanner):
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.fan = fan
-        self._tilted_gripper = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
+        self._with_wrist = replace(gripper, palm_outline=(*gripper.palm_outline, fan.wrist))
 
     def return_at_least(self, count: int) -> None:
         super().return_at_least(count)
@@ -98,7 +101,7 @@ class FanPlanner(SearchPlanner):
         maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
         margins, relaxed ones serve.
         """
-        views = [maps(tilted_view(approach, self.workspace)) for approach in self.fan.directions()]
+        views = list(self._views(maps))
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
@@ -108,19 +111,31 @@ class FanPlanner(SearchPlanner):
                 return with_chances(best, self.calibration)
         return []
 
+    def _views(self, maps: Callable[[np.ndarray], HeightMap]) -> Iterator[HeightMap]:
+        """The maps of the fan, the one from above first. Those of a hand that comes nearly level
+        are left out where nothing is high enough for it."""
+        over_table = -np.inf
+        for approach in self.fan.directions():
+            if over_table < _LEVEL_FROM and approach[2] > -_LEVEL:
+                continue
+            heights = maps(tilted_view(approach, self.workspace))
+            if approach[2] == -1.0:
+                rises = heights.height[heights.label >= 0] - heights.table_height
+                over_table = rises.max(initial=-np.inf)
+            yield heights
+
     def _search_view(
         self, heights: HeightMap, settings: SearchSettings, value: Value | None
     ) -> list[Grasp]:
         tilt = np.arccos(np.clip(heights.T_WV[2, 2], -1.0, 1.0))
-        hand = self._tilted_gripper if tilt > 0 else self.gripper
         on_map = None if value is None else lambda candidates: value(heights, candidates)
         found = search_once(
-            heights, hand, self.workspace, settings, on_map, stride=2 if tilt > 0 else 1
+            heights, self._with_wrist, self.workspace, settings, on_map, 2 if tilt > 0 else 1
         )
         found = self.judged(heights, found).distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
-        factor = np.exp(-((tilt / self.fan.tilt_scale) ** 2))
+        factor = np.exp(-((min(tilt, _TILTED) / self.fan.tilt_scale) ** 2))
         return [
             Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
             for grasp in found.grasps(self.gripper)

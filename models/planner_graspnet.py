@@ -43,6 +43,7 @@ from utils.grasp_quality import grasp_depth
 from utils.height_map import (
     OTHER_LABEL,
     HeightMap,
+    base_heights,
     height_map_from_frame,
     local_maxima,
     tilted_height_map,
@@ -98,9 +99,13 @@ def labelled_by_centres(
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
 
-    rise = height - heights.table_height
+    rise, base = height - heights.table_height, np.zeros(count)
+    if heights.fixed is not None:
+        base = base_heights(label, heights.fixed, heights.table_height)[:count]
+        base = base - heights.table_height
+        rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
     total = np.bincount(owner, rise, count)[:count]
-    mean = np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
+    mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
     ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
     eye = frame.T_WC[:3, 3]
     share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])

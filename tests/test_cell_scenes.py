@@ -26,6 +26,13 @@ def primitives(config):
     return load_object_set("primitives", cache_dir=config.cache_folder)
 
 
+@pytest.fixture(scope="module")
+def sets(config, primitives):
+    """The set of objects of each layout."""
+    tall, flat = (load_object_set(name, cache_dir=config.cache_folder) for name in ("tall", "flat"))
+    return {layout: primitives for layout in LAYOUTS} | {"tall": tall, "wall": tall, "flat": flat}
+
+
 @pytest.mark.parametrize(
     "layout",
     [
@@ -34,12 +41,13 @@ def primitives(config):
         if name != "dense"  # piled up by the same function; 15 objects take many seconds
     ],
 )
-def test_scene_is_a_pure_function_of_its_seed(layout, primitives, laid_out):
-    first = make_scene(layout, primitives, 7, laid_out)
-    other = make_scene(layout, primitives, 9, laid_out)  # other work in between
-    again = make_scene(layout, primitives, 7, laid_out)
-    count = {"isolated": 1, "retrieve": 8}.get(layout, laid_out.scene.count)
-    assert len(first.placements) == count and first.target == again.target
+def test_scene_is_a_pure_function_of_its_seed(layout, sets, laid_out):
+    first = make_scene(layout, sets[layout], 7, laid_out)
+    other = make_scene(layout, sets[layout], 9, laid_out)  # other work in between
+    again = make_scene(layout, sets[layout], 7, laid_out)
+    counts = {"isolated": 1, "wall": 3, "flat": 2, "retrieve": 8}
+    assert len(first.placements) == counts.get(layout, laid_out.scene.count)
+    assert first.target == again.target
     for a, b in zip(first.placements, again.placements):
         assert a.model.name == b.model.name
         np.testing.assert_array_equal(a.position, b.position)
@@ -127,6 +135,72 @@ def test_the_walls_of_a_bin_hold_what_is_in_it(primitives, laid_out):
             turn = Rotation.from_quat(placed.quaternion)
             corners = placed.position + turn.apply(np.concatenate(placed.model.parts))
             assert np.abs(corners[:, :2] - workspace.center).max() < workspace.size / 2 + 0.021
+
+
+def corners_of(placed) -> np.ndarray:
+    """(N, 3) corners in W of the convex parts of an object."""
+    turn = Rotation.from_quat(placed.quaternion)
+    return placed.position + turn.apply(np.concatenate(placed.model.parts))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_tall_things_stand_close_together(sets, laid_out, seed):
+    """Higher than the hand is long from its fingertips to its wrist, and each so near another one
+    that no finger, 14 mm thick and with 4 mm of room, passes between the two."""
+    placements = make_scene("tall", sets["tall"], seed, laid_out).placements
+    for placed in placements:
+        heights = corners_of(placed)[:, 2]
+        assert heights.min() == pytest.approx(0.0, abs=2e-3) and 0.118 < heights.max() < 0.26
+    with make_layout_table(laid_out, [placed.model for placed in placements]) as table:
+        bodies = [table.put(*vars(placed).values()) for placed in placements]
+        for body in bodies:
+            others = [one for one in bodies if one != body]
+            assert table.is_near(body, others, 0.018) and not table.is_near(body, others, 5e-4)
+
+
+@pytest.mark.parametrize("name", ["tall", "flat"])
+def test_things_lean_on_the_wall(sets, laid_out, name):
+    scene = make_scene("wall", sets[name], 3, laid_out)
+    (wall,) = scene.walls
+    face = laid_out.workspace.center[1] + laid_out.workspace.size / 2
+    assert wall.position[1] - wall.half_size[1] == pytest.approx(face)
+    for placed in scene.placements:
+        turn = Rotation.from_quat(placed.quaternion).as_matrix()
+        lean = np.degrees(np.arccos(abs(turn[2, np.argmax(placed.model.extents)])))
+        corners = corners_of(placed)
+        assert 8 < lean < 35
+        assert corners[:, 2].min() == pytest.approx(0.0, abs=2e-3)  # stands on the table
+        assert corners[np.argmax(corners[:, 2]), 1] > face - 0.03  # and its top is at the wall
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_flat_things_lie_on_the_block_and_overhang_its_edge(sets, laid_out, seed):
+    scene = make_scene("flat", sets["flat"], seed, laid_out)
+    (block,) = scene.walls
+    edge, top = (block.position + block.half_size)[1:]
+    for placed in scene.placements:
+        corners = corners_of(placed)
+        assert np.sort(np.ptp(corners, axis=0))[1] > 0.08  # wider than the hand
+        assert corners[:, 2].min() == pytest.approx(top, abs=2e-3)
+        assert np.ptp(corners[:, 2]) < 0.017
+        assert 0.015 < corners[:, 1].max() - edge < 0.065
+        assert placed.position[1] < edge
+
+
+def test_planners_know_walls_that_stand_there_for_good_and_no_bin(sets, config):
+    for layout in ("wall", "flat"):
+        scene = make_scene(layout, sets[layout], 3, config)
+        (fixture,), (wall,) = scene.fixtures, scene.walls
+        corners = wall.position + np.array([wall.half_size, -wall.half_size])
+        np.testing.assert_allclose(fixture.vertices.max(axis=0), corners[0])
+        np.testing.assert_allclose(fixture.vertices.min(axis=0), corners[1])
+    assert make_scene("bin", sets["bin"], 3, config).fixtures == ()
+
+
+@pytest.mark.parametrize(("layout", "what"), [("tall", "0.12 m long"), ("flat", "0.085 m wide")])
+def test_a_layout_refuses_a_set_without_objects_of_its_shape(box_set, config, layout, what):
+    with pytest.raises(SceneError, match=f"no object of 'box' is .*{what}.* use the set {layout}"):
+        make_scene(layout, box_set, 0, config)
 
 
 def test_a_cube_on_a_table(box_set, laid_out):

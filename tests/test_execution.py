@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE
+from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
 from envs.execution import execute_grasp, reaches
+from envs.object_bodies import native_object
+from envs.object_primitives import NativeShape
 from envs.robot_kinematics import forward_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import needs_pybullet, pybullet
@@ -99,6 +101,31 @@ def test_failures_are_named(cell, box_set, grasp, reason):
     assert outcome.reason == reason and not outcome.success
     assert cell.remaining == {0}
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
+
+
+def test_the_arm_keeps_its_wrist_off_the_bin(cell, box_set):
+    """A hand that leans by 75 degrees, low over the table: on the left side of the workspace its
+    wrist is over the table, on the right side, as far from the middle, it would be in the bin's
+    wall."""
+    cell.load(cube_scene(box_set))
+    tilt, reached = np.deg2rad(75), []
+    for side in (1, -1):
+        approach = np.array([0.0, -side * np.sin(tilt), -np.cos(tilt)])
+        position = np.array([0.5, side * 0.05, 0.06])
+        reached.append(reaches(cell, Grasp(position, 0.0, 0.08, 1.0, approach)))
+    assert reached == [True, False]
+
+
+def test_a_bottle_is_carried_over_the_bin_and_not_into_its_wall(cell, config):
+    """Gripped at its neck, 18 cm over the table, it hangs lower than the bin's wall at the height
+    from which other things are released."""
+    shape = NativeShape("cylinder", (0.02, 0.2))
+    bottle = native_object("bottle", shape, 500.0, 0.8, (1.0, 0.0, 0.0, 1.0))
+    standing = Placement(bottle, np.array([0.5, 0.0, 0.1]), np.array([0.0, 0.0, 0.0, 1.0]))
+    cell.load(Scene("isolated", 0, (standing,)))
+    outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.18]), 0.0, 0.06, 1.0))
+    assert outcome.reason == "success", outcome.detail
+    assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
 
 
 @needs_pybullet

@@ -20,8 +20,11 @@ from utils.height_map import (
     height_map_from_frame,
     height_map_from_scene,
     local_maxima,
+    tilted_height_map,
+    tilted_view,
+    without_holes,
 )
-from utils.transforms import project
+from utils.transforms import inverse_pose, project, transform_points
 
 IMAGES = arrays.arrays(
     np.float32,
@@ -94,6 +97,32 @@ def test_walls_around_the_workspace_are_obstacles_and_no_objects() -> None:
         assert heights.label[heights.index(np.array([0.47, 0.03]))] == 0
         assert len(heights.centres) == 1
         np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+def test_what_lies_on_a_known_block_is_an_object_and_the_block_is_none() -> None:
+    """A plate, 1 cm thick, on a block of 10 cm, whose edge it overhangs by 3 of its 12 cm. From
+    above it looks like a tower that goes down to the table."""
+    block, plate = ((0.2, 0.16, 0.10), 0.0, (0.5, 0.0)), ((0.09, 0.12, 0.11), 0.0, (0.5, 0.05))
+    frame = boxes_frame([plate, block], walls=1)
+    blind, knowing = (
+        height_map_from_frame(replace(frame, fixtures=fixtures), Workspace())
+        for fixtures in ((), frame.truth.walls)
+    )
+    assert len(blind.centres) == 2 and blind.centres[:, 2].max() < 0.06
+    np.testing.assert_allclose(knowing.centres, [[0.5, 0.05, 0.105]], atol=0.003)
+    on_plate, on_block, beside = (
+        knowing.index(np.array(place)) for place in ((0.5, 0.10), (0.42, -0.04), (0.5, -0.12))
+    )
+    assert [knowing.label[at] for at in (on_plate, on_block, beside)] == [0, WALL_LABEL, -1]
+    assert knowing.fixed[on_block] == pytest.approx(0.1) and knowing.fixed[beside] == -np.inf
+    assert knowing.every(2).fixed.shape == knowing.every(2).height.shape
+    # So it is for a hand that comes level: plate before block, none of the block's face its matter.
+    T_WV = tilted_view(np.array([0.0, -0.98, -0.2]) / np.hypot(0.98, 0.2), Workspace())
+    knows = replace(frame, fixtures=frame.truth.walls)
+    seen = tilted_height_map(knowing, *without_holes(knows, Workspace()), T_WV)
+    for place, label in (((0.5, 0.11, 0.11), 0), ((0.5, 0.08, 0.05), WALL_LABEL)):
+        at = seen.index(transform_points(inverse_pose(T_WV), np.array(place))[:2])
+        assert seen.label[at] == label
 
 
 def test_what_lies_beyond_the_workspace_without_surrounding_it_is_an_object() -> None:

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from envs.object_primitives import FAMILIES, THIN_FAMILIES, UNSEEN_FAMILIES, make_primitive
-from envs.objects import load_object_set
+from envs.object_primitives import (
+    FAMILIES,
+    FLAT_FAMILIES,
+    TALL_FAMILIES,
+    THIN_FAMILIES,
+    UNSEEN_FAMILIES,
+    make_primitive,
+)
+from envs.objects import fits, load_object_set
 from tests.helpers.simulators import pybullet
+from utils.geometry import GripperGeometry
 
 if pybullet is not None:
     from envs.pybullet_bodies import spawn
@@ -173,6 +181,30 @@ def test_thin_things_are_one_body_that_the_hand_can_span(tmp_path, index):
     model = load_object_set("thin", split="train", cache_dir=tmp_path)[index]
     assert model.mass == pytest.approx(shape.density * volume)
     assert 0.03 - 1e-6 <= model.mass <= 0.3 + 1e-6
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_tall_things_are_higher_than_the_hand_is_long_and_narrow(index):
+    for number in (index, index + 30):
+        shape = make_primitive(number, families=TALL_FAMILIES)
+        sides = np.ptp(np.concatenate(shape.parts), axis=0)
+        assert 0.12 <= sides[2] <= 0.25 and sides[:2].min() <= 0.067
+        heights = sorted((part[:, 2].min(), part[:, 2].max()) for part in shape.parts)
+        assert all(
+            below[1] == pytest.approx(above[0]) for below, above in zip(heights, heights[1:])
+        )
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_flat_things_are_too_wide_for_the_hand_and_too_low_for_it_on_a_table(tmp_path, index):
+    """The tips keep 4 mm over the table, and 6 mm of an object have to rise between them."""
+    shape = make_primitive(index, families=FLAT_FAMILIES)
+    sides = np.ptp(np.concatenate(shape.parts), axis=0)
+    assert sides[:2].min() > 0.085 and 0.005 <= sides[2] <= 0.015
+    model = load_object_set("flat", split="train", cache_dir=tmp_path)[index]
+    assert 0.03 - 1e-6 <= model.mass <= 0.3 + 1e-6
+    # From the side the hand spans it.
+    assert fits(model, GripperGeometry())
 
 
 def test_a_band_has_the_volume_of_its_line():

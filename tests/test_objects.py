@@ -87,6 +87,14 @@ def test_thin_things_for_tests_are_others_than_those_for_training(tmp_path):
         load_object_set("thin", split="unseen_families", cache_dir=tmp_path)
 
 
+@pytest.mark.parametrize("name", ["tall", "flat"])
+def test_other_special_sets_are_split_alike(tmp_path, name):
+    parts = [load_object_set(name, split=split, cache_dir=tmp_path).indices
+             for split in ("train", "test", "sealed")]  # fmt: skip
+    assert [len(part) for part in parts] == [200, 50, 50]
+    assert len(set().union(*parts)) == 300
+
+
 def test_primitives_weigh_and_slide_as_promised(tmp_path):
     objects = load_object_set("primitives", cache_dir=tmp_path)
     for model in (objects[index] for index in range(len(FAMILIES))):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from envs.evaluation_worker import check_everything
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import load_object_set
 from envs.rounds import checked_grasps
-from models.planner_antipodal import measure
+from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
 from models.planners import make_planner
@@ -24,6 +25,7 @@ from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
 from utils.height_map import (
     WALL_LABEL,
+    HeightMap,
     height_map_from_frame,
     height_map_from_scene,
     table_slope,
@@ -297,3 +299,28 @@ def test_what_a_camera_sees_far_from_the_workspace_costs_nothing_and_changes_not
     narrow = height_map_from_frame(frame, workspace)
     inside = np.s_[60:-60, 60:-60]
     np.testing.assert_allclose(seen.height[inside], narrow.height[inside], atol=1e-6)
+
+
+def test_no_grasp_takes_a_known_wall_with_what_leans_over_it():
+    """A thing 3 cm wide hides the edge of a wall, 10 cm high, and rises 2 cm over it. Fingers on
+    both sides that reach lower would close on the wall."""
+    thing, wall = ((0.06, 0.03, 0.12), 0.0, (0.5, 0.0)), ((0.3, 0.01, 0.10), 0.0, (0.5, 0.0))
+    frame = boxes_frame([thing, wall], walls=1)
+    lowest = []
+    for fixtures in ((), frame.truth.walls):
+        heights = height_map_from_frame(replace(frame, fixtures=fixtures), Workspace())
+        found = search(heights, GripperGeometry(), Workspace(), SearchSettings())
+        lowest.append(found.tip[found.label == 0].min())
+    assert lowest[0] < 0.09 and lowest[1] > 0.1
+
+
+def _exact_map(truth: SceneGeometry, T_WV: np.ndarray) -> HeightMap:
+    return height_map_from_scene(truth, Workspace(), T_WV=T_WV)
+
+
+def test_level_views_are_searched_where_something_is_high():
+    for height, tilts in ((0.08, {0, 30, 60}), (0.12, {0, 30, 60, 85})):
+        plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
+        truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
+        views = plan._views(partial(_exact_map, truth))
+        assert {round(np.degrees(np.arccos(view.T_WV[2, 2]))) for view in views} == tilts

@@ -16,7 +16,7 @@ def test_the_shipped_configs_name_entries_of_the_registries():
 
 @pytest.mark.parametrize("key", [*REGISTRIES, *OBJECT_SET_KEYS])
 def test_any_entry_can_be_named(key):
-    known = REGISTRIES.get(key, ("box", "primitives", "random_urdfs", "thin"))
+    known = REGISTRIES.get(key, ("box", "primitives", "random_urdfs", "thin", "tall", "flat"))
     for name in known:
         check_names(load_config(None, [f"{key}={name}", "env.goal=object"]))
 
@@ -40,7 +40,7 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("evaluate.controllers=ibsv", "evaluate.controllers: got 'ibsv', .* did you mean ibvs?"),
         (
             "env.scenario=moved",
-            "env.scenario: got 'moved', expected one of bin, dense, household, isolated, packed",
+            "env.scenario: got 'moved', expected one of bin, dense, flat, household, isolated",
         ),
         ("simulator=pybulet", "simulator: got 'pybulet', .* did you mean pybullet?"),
         ("data.kind=cornel", "data.kind: got 'cornel', .* did you mean cornell?"),

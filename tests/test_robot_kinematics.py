@@ -7,14 +7,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from envs.robot_kinematics import (
+    GRASP_DEPTH,
     JOINT_LOWER,
     JOINT_UPPER,
     ServoStep,
     UnreachableError,
+    all_postures,
+    arm_points,
     forward_kinematics,
     geometric_jacobian,
     inverse_kinematics,
     pose_error,
+    postures,
     rotation_vector,
     tip_twists,
 )
@@ -82,3 +86,39 @@ def test_twists_are_the_jacobian_times_velocities(q, velocity):
     q, velocity = np.array(q), np.array(velocity)
     expected = geometric_jacobian(q) @ velocity
     np.testing.assert_allclose(tip_twists(q[None], velocity[None])[0], expected, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(joint_positions)
+def test_points_on_the_arm_lie_on_its_links(q):
+    """From the upper arm's end, 0.316 m from the shoulder at 0.333 m, to the flange, 0.105 m behind
+    E, on a way that is as long as the links; no two neighbours farther apart than asked."""
+    q = np.array(q)
+    points = arm_points(q[None], spacing=0.04)[0]
+    assert np.linalg.norm(points[0] - (0, 0, 0.333)) == pytest.approx(0.316)
+    T = forward_kinematics(q)
+    np.testing.assert_allclose(points[-1], T[:3, 3] - GRASP_DEPTH * T[:3, 2], atol=1e-12)
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 0.04 + 1e-9
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    assert length == pytest.approx(0.0825 + 0.0825 + 0.384 + 0.088 + 0.107)
+
+
+def test_more_starts_reach_level_poses_that_home_does_not():
+    """A hand that comes level from the robot's side, its closing line vertical."""
+    reached = 0
+    for x, y in ((0.45, 0.0), (0.5, -0.1), (0.55, 0.05), (0.6, 0.1)):
+        pose = np.eye(4)
+        pose[:3, :3] = np.column_stack([(0, 1, 0), (0, 0, 1), (1, 0, 0)])
+        pose[:3, 3] = x, y, 0.15
+        try:
+            found = all_postures(pose, HOME)
+        except UnreachableError:
+            continue
+        reached += 1
+        with pytest.raises(UnreachableError):
+            postures(pose, HOME)
+        for q in found:
+            T = forward_kinematics(q)
+            np.testing.assert_allclose(T[:3, 3], pose[:3, 3], atol=2e-4)
+            assert T[:3, 2] @ pose[:3, 2] > 1 - 1e-5 and abs(T[:3, 1] @ pose[:3, 1]) > 1 - 1e-5
+    assert reached >= 2

@@ -24,7 +24,7 @@ from utils.depth import (
     nearest_values,
     reach_in_pixels,
 )
-from utils.geometry import SceneGeometry, Workspace, intersect_lines
+from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_lines
 from utils.transforms import (
     RGBDFrame,
     deproject,
@@ -42,6 +42,9 @@ WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+# Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
+_RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
+_LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
@@ -61,6 +64,8 @@ class HeightMap:
     centres: (M, 3) each label's centre of mass in V, or an estimate of it.
     table_height: metres in W.
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.
+    fixed: (R, C) metres in V, the tops of fixtures (`RGBDFrame.fixtures`) or true walls, -inf
+        beside them; None where nothing is known of any.
     """
 
     height: np.ndarray
@@ -71,6 +76,7 @@ class HeightMap:
     cell: float
     table_height: float
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
+    fixed: np.ndarray | None = None
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +104,9 @@ class HeightMap:
             np.ascontiguousarray(part[::stride, ::stride])
             for part in (self.height, self.ceiling, self.label)
         )
-        return replace(self, height=height, ceiling=ceiling, label=label, cell=stride * self.cell)
+        fixed = None if self.fixed is None else self.fixed[::stride, ::stride]
+        cell = stride * self.cell
+        return replace(self, height=height, ceiling=ceiling, label=label, cell=cell, fixed=fixed)
 
     def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
         """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
@@ -154,9 +162,51 @@ def height_map_from_frame(
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
     seen = _seen(*without_holes(frame, workspace), np.eye(4), grid.shape[:2], origin, cell, table)
-    label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
-    centres = _column_centroids(seen.height - table, label, grid, table)
-    return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+    if not frame.fixtures:
+        label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
+        centres = _column_centroids(seen.height - table, label, grid, table)
+        return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+    fixed = _tops(frame.fixtures, grid, origin, cell)
+    bare = _bare(seen.height, fixed)
+    label = label_pieces(np.where(bare, table, seen.height), table, cell)
+    label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
+    base = base_heights(label, fixed, table)
+    on = np.append(base, (table, table))[label]  # the last two are of walls and of the table
+    centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
+    centres[:, 2] += base
+    height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
+
+
+def base_heights(label: np.ndarray, fixed: np.ndarray, table: float) -> np.ndarray:
+    """(M,) metres in W of what each label (R, C) rests on: a fixture where most of it lies over
+    one, the table otherwise. fixed: (R, C) of a map from above, see `HeightMap`."""
+    on = np.flatnonzero(label >= 0)
+    ground, owner = np.maximum(fixed.take(on), table), label.take(on)
+    return np.array([np.median(ground[owner == number]) for number in range(label.max() + 1)])
+
+
+def without_rims(
+    label: np.ndarray, height: np.ndarray, fixed: np.ndarray, cell: float
+) -> np.ndarray:
+    """The labels (R, C) with WALL_LABEL on pieces that lie along a fixture's edge and hardly rise
+    over it: depth cameras round edges off. fixed: (R, C) the fixtures' tops, -inf beside them."""
+    reach = 2 * int(_RIM_REACH / cell) + 1
+    window = np.ones((reach, reach))
+    fixed = np.maximum(fixed, -FARTHEST)  # so that heights can be subtracted
+    near = cv2.dilate(fixed, window)
+    edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
+    edge &= height < near + _RIM_RISE
+    count = np.bincount(label[label >= 0], minlength=label.max() + 1)
+    on_edge = np.bincount(label[(label >= 0) & edge], minlength=label.max() + 1)
+    kept = on_edge < _RIM_SHARE * count
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, WALL_LABEL), (WALL_LABEL, -1))
+    return number[label]
+
+
+def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """(R, C) bool: the surface there is that of a fixture. fixed: (R, C) the fixtures' tops."""
+    return height < cv2.dilate(fixed, np.ones((5, 5))) + _LABEL_FLOOR
 
 
 def tilted_height_map(
@@ -183,7 +233,17 @@ def tilted_height_map(
     if rim.any():
         label = np.where(rim, nearest_values(label, known), label)
     centres = transform_points(inverse_pose(T_WV), overhead.centres)
-    return HeightMap(*seen.walled(), label, centres, origin, cell, overhead.table_height, T_WV)
+    height, ceiling = seen.walled()
+    if filled.fixtures:
+        grid = np.stack(surface[:2], axis=-1)
+        turned = [solid.transformed(inverse_pose(T_WV)) for solid in filled.fixtures]
+        fixed = _tops(turned, grid, origin, cell)
+        label = np.where(_bare(height, fixed), WALL_LABEL, label)
+        height, ceiling = np.maximum(height, fixed), np.maximum(ceiling, fixed)
+    else:
+        fixed = None
+    table = overhead.table_height
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed)
 
 
 class _Seen(NamedTuple):
@@ -287,23 +347,42 @@ def height_map_from_scene(
     scene = scene.transformed(inverse_pose(T_WV))
     bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
     for number, solids in [*bodies, (WALL_LABEL, scene.walls)]:
-        for solid in solids:
-            low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
-            high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
-            low, high = np.maximum(low, 0), np.maximum(high, 0)
-            window = np.s_[low[1] : high[1], low[0] : high[0]]
-            base = grid[window]
-            if base.size == 0:
-                continue
-            origins = np.concatenate(
-                [base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1
-            )
-            top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
+        for window, top in _columns(solids, grid, origin, cell):
             label[window] = np.where(top > height[window], number, label[window])
             height[window] = np.maximum(top, height[window])
     height = height.astype(np.float32)
+    fixed = _tops(scene.walls, grid, origin, cell) if scene.walls else None
     centres = np.array([item.centre_of_mass for item in scene.objects]).reshape(-1, 3)
-    return HeightMap(height, height, label, centres, origin, cell, table, T_WV)
+    return HeightMap(height, height, label, centres, origin, cell, table, T_WV, fixed)
+
+
+def _columns(
+    solids: Iterable[ConvexSolid], grid: np.ndarray, origin: np.ndarray, cell: float
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """For each solid the window of a grid (R, C, 2) over which it lies, and its highest point there
+    on the line through each cell's centre; -inf where the line misses it."""
+    for solid in solids:
+        low = np.ceil((solid.vertices[:, :2].min(axis=0) - origin) / cell).astype(int)
+        high = np.floor((solid.vertices[:, :2].max(axis=0) - origin) / cell).astype(int) + 1
+        low, high = np.maximum(low, 0), np.maximum(high, 0)
+        window = np.s_[low[1] : high[1], low[0] : high[0]]
+        base = grid[window]
+        if base.size == 0:
+            continue
+        origins = np.concatenate([base.reshape(-1, 2), np.zeros((base[..., 0].size, 1))], axis=1)
+        top = intersect_lines(solid, origins, (0.0, 0.0, 1.0)).leave.reshape(base.shape[:2])
+        yield window, top
+
+
+def _tops(
+    solids: Iterable[ConvexSolid], grid: np.ndarray, origin: np.ndarray, cell: float
+) -> np.ndarray:
+    """(R, C) float32 highest point of solids on the line through each cell of a grid (R, C, 2);
+    -inf where it misses them all."""
+    tops = np.full(grid.shape[:2], -np.inf, np.float32)
+    for window, top in _columns(solids, grid, origin, cell):
+        tops[window] = np.maximum(tops[window], top)
+    return tops
 
 
 def label_pieces(

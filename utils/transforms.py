@@ -144,6 +144,8 @@ class RGBDFrame:
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
         see only the depth image must not.
     truth: the scene's true geometry for planners that need it; otherwise None.
+    fixtures: solids in W that stand in the cell for good and whose place every planner may know,
+        such as shelves.
     target: (H, W) bool, the visible pixels of the one object that is wanted, as a click or a
         segmenter gives them; None: any object.
     """
@@ -154,6 +156,7 @@ class RGBDFrame:
     T_WC: np.ndarray
     segmentation: np.ndarray | None = None
     truth: SceneGeometry | None = None  # type: ignore[name-defined]  # noqa: F821 - utils.geometry
+    fixtures: tuple[ConvexSolid, ...] = ()  # type: ignore[name-defined]  # noqa: F821 - as above
     target: np.ndarray | None = None
 
     def points(self) -> np.ndarray:
