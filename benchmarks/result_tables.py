@@ -21,7 +21,7 @@ from utils.statistics import wilson_interval
 
 PAGES = (
     "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/graspnet.md",
-    "docs/six_dof.md",
+    "docs/six_dof.md", "docs/vgn.md",
     "docs/scaling.md", "docs/reliability.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
@@ -281,6 +281,17 @@ def variants(say: Say, part: Figures) -> str:
     return "\n\n".join([scoreboard(say, part), beside])
 
 
+def retrieve(say: Say, part: Figures) -> str:
+    rows = rows_of(part)
+    lines = [
+        [f"`{row['objects']}`", f"`{row['policy']}`",
+         rate(row["targets_in_hand"], row["targets"]), _decimal(row["picks_to_target"])]
+        for row in rows
+    ]  # fmt: skip
+    header = ["objects", "planner", "target in hand", "picks to it"]
+    return "\n\n".join([with_depths(header, lines, _noises(rows), 1), origin(say, part)])
+
+
 def calibration(say: Say, part: Figures) -> str:
     """What each planner stated, what came of it, and how far both are apart in ten bins."""
     lines = [
@@ -432,6 +443,9 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "differences": (("scoreboard",), differences),
     "six_dof": (("six_dof",), variants),
     "direct": (("direct",), variants),
+    "scenes": (("scenes",), variants),
+    "retrieve": (("retrieve",), retrieve),
+    "vgn": (("vgn",), variants),
     "calibration": (("calibration",), calibration),
     "clutter15": (("clutter15",), clutter15),
     "differences15": (("clutter15",), differences),
@@ -446,6 +460,10 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "scaling_model": (("scaling",), scaling_model),
     "reliability": (("reliability",), reliability),
 }
+
+
+def _decimal(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
 
 
 def _planner_cells(row: Figures) -> list[str]:
