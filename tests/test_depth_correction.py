@@ -78,6 +78,13 @@ def test_without_a_table_nothing_is_scaled() -> None:
     assert table_roughness(replace(frame, depth=np.zeros_like(frame.depth)), 0.0) == 0.0
 
 
+def test_a_surface_that_is_no_table_scales_nothing() -> None:
+    """A wall, 45 degrees to the table: each of its lines asks for another factor."""
+    frame = scene(np.deg2rad(45))
+    flat = replace(frame, depth=np.full_like(frame.depth, EYE))
+    assert scale_to_table(flat, 0.0) == 1.0
+
+
 def test_roughness_is_the_standard_deviation() -> None:
     frame, rng = scene(), np.random.default_rng(0)
     depth = frame.depth + rng.normal(0, 0.004, frame.depth.shape).astype(np.float32)

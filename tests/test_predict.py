@@ -253,10 +253,15 @@ def test_widths_are_limited_to_the_hand_of_the_checkpoint(opening, files, tmp_pa
 
 def test_count_and_table_height(files, capsys):
     assert len(files.run(capsys, count=1)["grasps"]) == 1
-    given = files.run(capsys, table_height=0.045)  # fingertips stay 4 mm above it
-    assert not given["table"]["estimated"]
-    for grasp in given["grasps"]:
-        assert grasp["world"]["position"][2] == pytest.approx(0.049 + 0.0072, abs=1e-6)
+    assert files.run(capsys)["remarks"] == []
+    given = files.run(capsys, table_height=0.045)
+    assert not given["table"]["estimated"] and given["grasps"]
+    # The table that is seen is moved to the height that is given, and the user is told.
+    (remark,) = given["remarks"]
+    eye = given["T_WC"][2][3]
+    assert f"multiplied by {(eye - 0.045) / eye:.3f}" in remark
+    for grasp in given["grasps"]:  # fingertips stay 4 mm above it
+        assert grasp["world"]["position"][2] >= 0.049 + 0.0072 - 1e-6
 
 
 def test_an_empty_table_gives_an_empty_list(files, capsys):

@@ -37,14 +37,15 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
 
 def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
     """The factor by which depths have to be multiplied for the table to lie at its height; 1 where
-    no table is seen.
+    too little of a table is seen.
 
     Each pixel asks for a factor; those of the table ask for the same one. It is the densest of all,
     weighted by how likely a camera is to be that wrong, because the top of a box asks alike, too.
     """
     asked = _ratio_to_table(frame, table_height)
+    least = _LEAST_SHARE * len(asked)
     asked = asked[np.abs(asked - 1) < SCALE_REACH]
-    if len(asked) < _LEAST_SHARE * frame.depth.size:
+    if len(asked) <= least:
         return 1.0
     edges = np.arange(1 - SCALE_REACH, 1 + SCALE_REACH, _BIN)
     count = np.histogram(asked, edges)[0].astype(float)
@@ -52,14 +53,17 @@ def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
     density = cv2.GaussianBlur(count[None], (0, 0), _BLUR / _BIN)[0]
     best = float(middle[(density * np.exp(-(((middle - 1) / SCALE_SPREAD) ** 2) / 2)).argmax()])
     for _ in range(_REFITS):
-        best = float(asked[np.abs(asked - best) < 2 * _BLUR].mean())
+        alike = asked[np.abs(asked - best) < 2 * _BLUR]
+        if len(alike) <= least:
+            return 1.0
+        best = float(alike.mean())
     return best
 
 
 _BIN = 0.001  # of the histogram of factors
 _BLUR = 0.005  # standard deviation that is expected among the table's factors
 _REFITS = 3
-_LEAST_SHARE = 0.05  # of the pixels that have to be near the table
+_LEAST_SHARE = 0.15  # of the known pixels that have to agree on the table
 
 
 def table_roughness(frame: RGBDFrame, table_height: float) -> float:
@@ -67,7 +71,7 @@ def table_roughness(frame: RGBDFrame, table_height: float) -> float:
     pixels near it; 0 where none is."""
     error = _ratio_to_table(frame, table_height) - 1
     near = error[np.abs(error) < 4 * _BLUR]
-    if len(near) < _LEAST_SHARE * frame.depth.size:
+    if len(near) <= _LEAST_SHARE * len(error):
         return 0.0
     spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
     return spread * float(np.median(frame.depth[known_depth(frame.depth)]))

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from utils.depth import depth_of_plane
+from utils.depth_correction import TRUSTED_SCALE, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth
@@ -98,6 +99,12 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
         )
     if unseen > MANY_UNSEEN:
         remarks.append(f"{unseen:.0%} of the place that was searched has no depth")
+    scale = scale_to_table(frame, workspace.table_height)
+    if abs(scale - 1) > TRUSTED_SCALE:
+        remarks.append(
+            f"depths were multiplied by {scale:.3f}, so that the table that the image shows lies at "
+            "the height that is given; if it does not, check --table-height and --camera-pose"
+        )
     return remarks
 
 
