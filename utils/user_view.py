@@ -102,8 +102,8 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
     scale = scale_to_table(frame, workspace.table_height)
     if abs(scale - 1) > TRUSTED_SCALE:
         remarks.append(
-            f"depths were multiplied by {scale:.3f}, so that the table in the image lies at the height "
-            "that is given; if it does not, check --table-height and --camera-pose"
+            f"depths were multiplied by {scale:.3f}, so that the table in the image lies at the "
+            "height that is given; if it does not, check --table-height and --camera-pose"
         )
     return remarks
 
