@@ -183,7 +183,8 @@ def base_heights(label: np.ndarray, fixed: np.ndarray, table: float) -> np.ndarr
     one, the table otherwise. fixed: (R, C) of a map from above, see `HeightMap`."""
     on = np.flatnonzero(label >= 0)
     ground, owner = np.maximum(fixed.take(on), table), label.take(on)
-    return np.array([np.median(ground[owner == number]) for number in range(label.max() + 1)])
+    parts = (ground[owner == number] for number in range(_count(label)))
+    return np.array([np.median(part) if len(part) else table for part in parts])
 
 
 def without_rims(
@@ -197,11 +198,16 @@ def without_rims(
     near = cv2.dilate(fixed, window)
     edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
     edge &= height < near + _RIM_RISE
-    count = np.bincount(label[label >= 0], minlength=label.max() + 1)
-    on_edge = np.bincount(label[(label >= 0) & edge], minlength=label.max() + 1)
+    count = np.bincount(label[label >= 0], minlength=_count(label))
+    on_edge = np.bincount(label[(label >= 0) & edge], minlength=_count(label))
     kept = on_edge < _RIM_SHARE * count
     number = np.append(np.where(kept, np.cumsum(kept) - 1, WALL_LABEL), (WALL_LABEL, -1))
     return number[label]
+
+
+def _count(label: np.ndarray) -> int:
+    """Number of objects in labels (R, C), of which some or all may be negative."""
+    return max(int(label.max()) + 1, 0)
 
 
 def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
@@ -451,7 +457,7 @@ def _column_centroids(
     rise: np.ndarray, label: np.ndarray, grid: np.ndarray, table: float
 ) -> np.ndarray:
     """(M, 3) centroids of the columns under each labelled piece."""
-    count = label.max() + 1
+    count = _count(label)
     on = np.flatnonzero(label >= 0)
     label, rise, place = label.take(on), rise.take(on), grid.reshape(-1, 2)[on].T
     weight = np.bincount(label, rise, count)
