@@ -41,6 +41,9 @@ WALL = 0.05  # m over all that is known: height assumed in holes that are too wi
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
+# What stands as near as this around the workspace is in the way of a hand that comes from a side:
+# the hand is 0.2 m long and starts 0.1 m before the grasp.
+_HAND_REACH, _STANDS = 0.30, 0.02  # m, and m over the table
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
@@ -269,7 +272,7 @@ class _Seen(NamedTuple):
 def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
     """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
     which of them (H, W) may hide matter: those that are not `at_edges`. Both without the rows and
-    columns in which nothing lies over or around the workspace."""
+    columns in which nothing lies over the workspace or stands around it."""
     measured = known_depth(frame.depth)
     hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
@@ -280,8 +283,8 @@ def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np
 
 
 def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
-    """The rows and the columns whose points lie over the grid; what has no depth counts as
-    table."""
+    """The rows and the columns whose points lie over the grid, or stand where they are in the way
+    of a hand that comes from a side; what has no depth counts as table."""
     known = known_depth(frame.depth)
     depth = np.where(known, frame.depth, depth_of_plane(frame, workspace.table_height))
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
@@ -289,6 +292,8 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     places = deproject(np.stack([u, v], axis=-1), np.where(ahead, depth, 0), frame.K, frame.T_WC)
     apart = np.abs(places[..., :2] - workspace.centre).max(axis=-1)
     near = ahead & (apart <= workspace.size / 2 + MARGIN)
+    stands = places[..., 2] > workspace.table_height + _STANDS
+    near |= ahead & stands & (apart <= workspace.size / 2 + _HAND_REACH)
     if not near.any():
         return slice(0, depth.shape[0]), slice(0, depth.shape[1])
     # Two pixels more: the rays that graze an edge pass between a pixel and the next.
