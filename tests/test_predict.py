@@ -253,10 +253,27 @@ def test_widths_are_limited_to_the_hand_of_the_checkpoint(opening, files, tmp_pa
 
 def test_count_and_table_height(files, capsys):
     assert len(files.run(capsys, count=1)["grasps"]) == 1
-    given = files.run(capsys, table_height=0.045)  # fingertips stay 4 mm above it
+    given = files.run(capsys, table_height=0.045)
     assert not given["table"]["estimated"]
-    for grasp in given["grasps"]:
-        assert grasp["world"]["position"][2] == pytest.approx(0.049 + 0.0072, abs=1e-6)
+    # The image shows the table at 0, 0.8 m away. So all depths shrink, cubes of 6 cm by as much.
+    (remark,) = given["remarks"]
+    assert f"multiplied by {1 - 0.045 / 0.8:.3f}" in remark and "height of 0.045 m" in remark
+    lowest, top = 0.045 + 0.004 + 0.0072, 0.045 + 0.06 * (1 - 0.045 / 0.8)
+    for grasp in best_of_each(given["grasps"]):
+        assert lowest - 1e-6 < grasp["world"]["position"][2] < top
+
+
+def test_a_camera_that_measures_too_near_is_corrected_before_the_workspace_is_chosen(files, capsys):
+    """By 3.5 %: the whole table, 0.8 m away, seems to stand 2.8 cm high."""
+    good = files.run(capsys, table_height=0.0)
+    depth = np.rint(965 * files.frame.depth).astype(np.uint16)
+    Image.fromarray(depth).save(files.folder / "depth.png")
+    found = files.run(capsys, table_height=0.0)
+    assert found["workspace"]["size"] == pytest.approx(good["workspace"]["size"], abs=0.011)
+    assert good["remarks"] == [] and "multiplied by 1.036" in found["remarks"][0]
+    assert len(best_of_each(found["grasps"])) == len(CUBES)
+    with pytest.raises(UserError, match="shows only the table"):
+        files.run(capsys, table_height=0.0, **mask_of_the_table(files))
 
 
 def test_an_empty_table_gives_an_empty_list(files, capsys):
@@ -504,6 +521,8 @@ def only_a_count_beside_export(files):
         (options(planner="heuristic"), "heuristic has no network"),
         (options(point=[3, 3]), "--point 3 3: on the table"),
         (options(point=[320, 3]), "outside the image"),
+        (options(point=["nan", 3]), "--point nan 3.0: expected pixels"),
+        (options(box=[0, 0, "inf", 20]), "--box 0.0 0.0 inf 20.0: expected pixels"),
         (options(box=[0, 0, 20, 20]), "no object in it"),
         (options(mask="nowhere.png"), "no such file"),
         (small_mask, "a mask of 100x100 pixels, the image has 320x240"),
