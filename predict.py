@@ -70,7 +70,7 @@ from utils.runs import run_script, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
-from utils.user_view import check_view, given_workspace, workspace_of
+from utils.user_view import check_view, corrected_view, given_workspace, workspace_of
 
 NETWORK_PLANNERS = {"graspnet": GraspNetPlanner, "graspnet6d": GraspNetFanPlanner}
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
@@ -93,9 +93,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
-    frame = replace(image, T_WC=table.T_WC)
-    workspace, remarks = locate_workspace(frame, table, options)
-    remarks += check_view(frame, workspace)
+    frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
+    workspace, cut = locate_workspace(frame, table, options)
+    remarks = [*scaled, *cut, *check_view(frame, workspace)]
     planner = new_planner(options, saved, workspace)
     frame = replace(frame, target=find_target(planner, frame, options))
 
@@ -179,6 +179,10 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
             raise UserError("--table-height is a height in the world: it needs --camera-pose")
         if not np.isfinite(options.table_height):
             raise UserError(f"--table-height: got {options.table_height}, expected metres")
+    for name in ("point", "box"):
+        marked = getattr(options, name)
+        if marked is not None and not np.isfinite(marked).all():
+            raise UserError(f"--{name} {' '.join(map(str, marked))}: expected pixels")
     if options.workspace is not None and options.camera_pose is None:
         raise UserError("--workspace is a square in the world: it needs --camera-pose")
     return options

@@ -50,6 +50,10 @@ _FIRST_SEED = {
 }  # no evaluation uses these seeds
 
 
+# `generate` refuses other views than the fixed one, and a hand without an arm.
+_SIDE_VIEW = ("view", "side_tilt_deg", "side_distance", "side_azimuth_deg")
+
+
 def data_folder(config: Config, root: Path = Path("data")) -> Path:
     """Return the folder of a config's simulated data, whose name is a hash of all that the data
     depend on."""
@@ -63,7 +67,7 @@ def _content(config: Config) -> str:
     everything = config.model_dump(mode="json")
     keys = ("seed", "simulator", "sim", "camera", "workspace", "scene")
     chosen = {key: everything[key] for key in keys}
-    for key in ("depth_noise", "depth_noise_args"):  # images are stored clean
+    for key in ("depth_noise", "depth_noise_args", *_SIDE_VIEW):  # images are stored clean
         chosen["camera"].pop(key)
     chosen["objects"] = everything["objects"] | {"split": "train"}
     if not config.objects.skip_broken:  # so that data made before there was this key stays valid
@@ -74,6 +78,8 @@ def _content(config: Config) -> str:
     }
     if config.data.executed_share > 0:
         chosen |= {key: everything[key] for key in ("robot", "execution", "safety")}
+        chosen["robot"].pop("arm")
+        chosen["execution"].pop("on_contact")
     if config.data.randomise_physics:
         physics = everything["randomization"]["physics"]
         chosen["physics"] = {key: physics[key] for key in _PHYSICS}
@@ -87,6 +93,8 @@ def _content(config: Config) -> str:
     }
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
     chosen["gripper"] = json.loads(json.dumps(asdict(config.gripper.geometry)))
+    if not config.gripper.opens_fully:  # valid as above
+        chosen["gripper"].pop("opens_fully")
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
 
 

@@ -98,7 +98,7 @@ def make_layout_table(
 
 def check_simulator(config: Config) -> None:
     """Raise UserError for a simulator that does not exist, is not installed, or cannot be
-    randomised."""
+    randomised, and for settings that the robot's form rules out."""
     cell = cell_class(config.simulator)
     if config.evaluate.randomise and not cell.can_be_randomized():
         raise not_randomizable(config)
@@ -106,6 +106,11 @@ def check_simulator(config: Config) -> None:
         require_arm(config, "evaluate.randomise=true")
     if config.camera.mount == "wrist":
         require_arm(config, "camera.mount=wrist")
+    if config.execution.on_contact == "grip" and config.robot.arm != "none":
+        raise UserError(
+            "execution.on_contact=grip: an arm that meets something stops and fails; set "
+            "robot.arm=none, or execution.on_contact=fail"
+        )
 
 
 def _simulator(name: str, key: str) -> Simulator:

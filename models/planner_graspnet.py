@@ -51,7 +51,14 @@ from utils.height_map import (
 )
 from utils.images import PixelScaling
 from utils.target import only_target
-from utils.transforms import Grasp, RGBDFrame, deproject, project, transform_points
+from utils.transforms import (
+    Grasp,
+    RGBDFrame,
+    deproject,
+    known_depth,
+    project,
+    transform_points,
+)
 
 
 @dataclass(frozen=True)
@@ -304,7 +311,8 @@ class NetworkView:
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     """The part of a frame in which something stands on the table, or may stand unseen: all that is
     left out is table. The whole frame where nothing does."""
-    high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)  # unknown is 0
+    high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)
+    high |= ~known_depth(frame.depth)
     # Single pixels are noise.
     pieces = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     left, top, width, height = cv2.boundingRect(pieces)

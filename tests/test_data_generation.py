@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from envs import data_generation
 from envs.cell import Intrinsics, PhysicsError, camera_intrinsics
@@ -78,6 +79,18 @@ def test_what_does_not_matter_keeps_the_folder(override):
 def test_the_folder_of_a_config_that_skips_nothing_is_that_of_before_there_was_the_key():
     assert "skip_broken" not in data_generation._content(load_config())
     assert folder_of("objects.skip_broken=true") != folder_of()
+
+
+def test_data_made_before_there_were_side_views_and_floating_hands_stay_valid():
+    content = yaml.safe_load(
+        data_generation._content(load_config(None, ["data.executed_share=0.5"]))
+    )
+    assert {"view", "side_tilt_deg", "side_distance", "side_azimuth_deg"}.isdisjoint(
+        content["camera"]
+    )
+    assert "arm" not in content["robot"] and "on_contact" not in content["execution"]
+    assert "opens_fully" not in content["gripper"]
+    assert folder_of("gripper.opens_fully=true") != folder_of()
 
 
 def test_a_named_root_is_taken_as_it_is(tmp_path):

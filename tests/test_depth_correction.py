@@ -9,16 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.box_frames import CORNERS, boxes_frame
 from utils.depth import GammaNoise
 from utils.depth_correction import (
     COLOUR_NOISE,
     SMOOTHING_RADIUS,
+    _fixture_pixels,
     corrected,
     scale_to_table,
     smoothed_by_colour,
     table_roughness,
 )
-from utils.transforms import RGBDFrame, look_at
+from utils.geometry import ConvexSolid, intersect_lines
+from utils.transforms import RGBDFrame, deproject, look_at
 
 SIZE, FOCAL, EYE = 120, 240.0, 0.8
 GREY, RED = (140, 140, 140), (200, 40, 30)
@@ -69,6 +72,36 @@ def test_a_large_box_is_not_taken_for_the_table() -> None:
     depth = np.full_like(frame.depth, EYE - BOX_HEIGHT)
     depth[:, : SIZE // 3] = EYE
     assert scale_to_table(replace(frame, depth=depth), 0.0) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("height", [0.01, 0.02, 0.03])
+def test_a_known_board_is_not_taken_for_the_table(height: float) -> None:
+    """It covers two thirds of the table that is seen, or all of it; without its place its top is
+    the table."""
+    for side in (0.36, 1.0):
+        frame = boxes_frame([((side, side, height), 0.0, (0.5, 0.0))], walls=1)
+        knowing = replace(frame, fixtures=frame.truth.walls)
+        assert scale_to_table(knowing, 0.0) == pytest.approx(1.0, abs=1e-4)
+        assert scale_to_table(frame, 0.0) == pytest.approx(0.8 / (0.8 - height), abs=5e-3)
+    frame = boxes_frame([((0.36, 0.36, height), 0.0, (0.5, 0.0))], walls=1)
+    scaled = replace(frame, depth=frame.depth * np.float32(0.95), fixtures=frame.truth.walls)
+    assert scale_to_table(scaled, 0.0) == pytest.approx(1 / 0.95, abs=1e-4)
+
+
+@pytest.mark.parametrize("x", [0.2, 0.5, -0.5])
+def test_pixels_of_fixtures_are_those_whose_rays_meet_them(x: float) -> None:
+    """A wall before the camera, around it, and behind it; the reference is each ray's own
+    intersection. Rays that graze the outline may fall on either side of it."""
+    frame = scene(0.9)
+    eye = frame.T_WC[:3, 3]
+    wall = ConvexSolid.from_vertices(CORNERS * (0.3, 0.05, 0.3) + (eye[0] - x, 0.02, eye[2] - 0.3))
+    v, u = np.mgrid[:SIZE, :SIZE]
+    ends = deproject(np.stack([u, v], -1), np.ones(u.shape), frame.K, frame.T_WC).reshape(-1, 3)
+    hits = intersect_lines(wall, np.broadcast_to(eye, ends.shape), ends - eye)
+    expected = np.isfinite(hits.enter) & (hits.leave > 0)
+    found = _fixture_pixels(replace(frame, fixtures=(wall,))).ravel()
+    assert (found != expected).mean() < 0.02
+    assert expected.any() == (x > 0)
 
 
 def test_without_a_table_nothing_is_scaled() -> None:

@@ -199,6 +199,11 @@ def test_what_needs_the_arm_is_refused(cell, box_set):
     require_arm(load_config(None), "anything")
 
 
+def test_an_arm_does_not_play_vgns_rule_for_contacts():
+    with pytest.raises(UserError, match=r"on_contact=grip: .*set robot\.arm=none"):
+        make_cell(config_of(INSTALLED[0], "execution.on_contact=grip", "robot.arm=panda"))
+
+
 @pytest.mark.parametrize("make", [HeuristicPlanner, HeuristicFanPlanner])
 @pytest.mark.parametrize("gap", [0.012, 0.05])
 def test_planners_leave_room_for_a_hand_that_opens_fully(make, gap):

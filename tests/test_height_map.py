@@ -17,6 +17,7 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HOLE_RISE,
     WALL_LABEL,
+    base_heights,
     height_map_from_frame,
     height_map_from_scene,
     local_maxima,
@@ -123,6 +124,22 @@ def test_what_lies_on_a_known_block_is_an_object_and_the_block_is_none() -> None
     for place, label in (((0.5, 0.11, 0.11), 0), ((0.5, 0.08, 0.05), WALL_LABEL)):
         at = seen.index(transform_points(inverse_pose(T_WV), np.array(place))[:2])
         assert seen.label[at] == label
+
+
+@pytest.mark.parametrize("things", [[], [((0.04, 0.06, 0.08), 0.0, (0.5, 0.0))]])
+def test_a_known_board_that_covers_everything_is_no_object(things) -> None:
+    """A board of 3 cm, larger than the whole map: what stands on it is all that there is."""
+    frame = boxes_frame([*things, ((1.0, 1.0, 0.03), 0.0, (0.5, 0.0))], walls=1)
+    heights = height_map_from_frame(replace(frame, fixtures=frame.truth.walls), Workspace())
+    assert len(heights.centres) == len(things)
+    assert set(np.unique(heights.label)) == {WALL_LABEL, *range(len(things))}
+    for centre in heights.centres:
+        np.testing.assert_allclose(centre, (0.5, 0.0, 0.055), atol=0.002)
+
+
+def test_what_a_label_without_cells_rests_on_is_the_table() -> None:
+    label, fixed = np.full((4, 4), 1), np.full((4, 4), 0.1, np.float32)
+    np.testing.assert_allclose(base_heights(label, fixed, 0.02), [0.02, 0.1])
 
 
 def test_what_lies_beyond_the_workspace_without_surrounding_it_is_an_object() -> None:

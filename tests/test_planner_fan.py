@@ -301,6 +301,23 @@ def test_what_a_camera_sees_far_from_the_workspace_costs_nothing_and_changes_not
     np.testing.assert_allclose(seen.height[inside], narrow.height[inside], atol=1e-6)
 
 
+def test_no_hand_comes_through_a_wall_beyond_the_map() -> None:
+    """A wall, 25 cm high, stands 11 cm beside the workspace: the map from above ends before it, and
+    a hand that comes from its side would be in it."""
+    bottle, wall = ((0.05, 0.05, 0.14), 0.0, (0.5, 0.10)), ((0.3, 0.02, 0.25), 0.0, (0.5, 0.27))
+    plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
+    behind = np.linspace(0.05, 0.2, 40)[:, None, None]  # of the fingertips, along the hand
+    beside = np.linspace(-0.1, 0.1, 21)[:, None]  # and across, the palm is 0.2 m long
+    for boxes, crossing in (([bottle], True), ([bottle, wall], False)):
+        grasps = plan(boxes_frame(boxes, focal=200.0))
+        hands = np.array([
+            grasp.position - behind * grasp.approach + beside * grasp.closing_direction
+            for grasp in grasps
+        ])  # fmt: skip
+        inside = np.abs(hands - (0.5, 0.27, 0.125)) < (0.15, 0.01, 0.125)
+        assert inside.all(axis=-1).any() == crossing
+
+
 def test_no_grasp_takes_a_known_wall_with_what_leans_over_it():
     """A thing 3 cm wide hides the edge of a wall, 10 cm high, and rises 2 cm over it. Fingers on
     both sides that reach lower would close on the wall."""

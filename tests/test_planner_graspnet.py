@@ -167,13 +167,13 @@ def test_an_empty_table_stays_whole() -> None:
     assert around_matter(frame, 0.0) is frame
 
 
-def test_what_was_not_measured_is_not_cut_off() -> None:
+@pytest.mark.parametrize("unknown", [0.0, np.nan])
+def test_what_was_not_measured_is_not_cut_off(unknown: float) -> None:
     """A black box has no depth: it may stand there."""
     frame = boxes_frame(BOXES)
     depth = frame.depth.copy()
-    middle, _ = project(np.array([0.45, 0.1, 0.05]), frame.K, frame.T_WC)
-    u, v = np.rint(middle).astype(int)
-    depth[v - 10 : v + 10, u - 10 : u + 10] = 0
+    black = (frame.points()[..., 1] > 0.0) & (frame.points()[..., 2] > 0.001)
+    depth[black] = unknown
     part = around_matter(replace(frame, depth=depth), 0.0)
     assert part.depth.shape == around_matter(frame, 0.0).depth.shape
 

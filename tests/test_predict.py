@@ -253,15 +253,27 @@ def test_widths_are_limited_to_the_hand_of_the_checkpoint(opening, files, tmp_pa
 
 def test_count_and_table_height(files, capsys):
     assert len(files.run(capsys, count=1)["grasps"]) == 1
-    assert files.run(capsys)["remarks"] == []
     given = files.run(capsys, table_height=0.045)
-    assert not given["table"]["estimated"] and given["grasps"]
-    # The table that is seen is moved to the height that is given, and the user is told.
+    assert not given["table"]["estimated"]
+    # The image shows the table at 0, 0.8 m away. So all depths shrink, cubes of 6 cm by as much.
     (remark,) = given["remarks"]
-    eye = given["T_WC"][2][3]
-    assert f"multiplied by {(eye - 0.045) / eye:.3f}" in remark
-    for grasp in given["grasps"]:  # fingertips stay 4 mm above it
-        assert grasp["world"]["position"][2] >= 0.049 + 0.0072 - 1e-6
+    assert f"multiplied by {1 - 0.045 / 0.8:.3f}" in remark and "height of 0.045 m" in remark
+    lowest, top = 0.045 + 0.004 + 0.0072, 0.045 + 0.06 * (1 - 0.045 / 0.8)
+    for grasp in best_of_each(given["grasps"]):
+        assert lowest - 1e-6 < grasp["world"]["position"][2] < top
+
+
+def test_a_camera_that_measures_too_near_is_corrected_before_the_workspace_is_chosen(files, capsys):
+    """By 3.5 %: the whole table, 0.8 m away, seems to stand 2.8 cm high."""
+    good = files.run(capsys, table_height=0.0)
+    depth = np.rint(965 * files.frame.depth).astype(np.uint16)
+    Image.fromarray(depth).save(files.folder / "depth.png")
+    found = files.run(capsys, table_height=0.0)
+    assert found["workspace"]["size"] == pytest.approx(good["workspace"]["size"], abs=0.011)
+    assert good["remarks"] == [] and "multiplied by 1.036" in found["remarks"][0]
+    assert len(best_of_each(found["grasps"])) == len(CUBES)
+    with pytest.raises(UserError, match="shows only the table"):
+        files.run(capsys, table_height=0.0, **mask_of_the_table(files))
 
 
 def test_an_empty_table_gives_an_empty_list(files, capsys):
@@ -509,6 +521,8 @@ def only_a_count_beside_export(files):
         (options(planner="heuristic"), "heuristic has no network"),
         (options(point=[3, 3]), "--point 3 3: on the table"),
         (options(point=[320, 3]), "outside the image"),
+        (options(point=["nan", 3]), "--point nan 3.0: expected pixels"),
+        (options(box=[0, 0, "inf", 20]), "--box 0.0 0.0 inf 20.0: expected pixels"),
         (options(box=[0, 0, 20, 20]), "no object in it"),
         (options(mask="nowhere.png"), "no such file"),
         (small_mask, "a mask of 100x100 pixels, the image has 320x240"),

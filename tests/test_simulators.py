@@ -151,6 +151,16 @@ def test_an_unknown_simulator_is_refused():
         make_cell(config)
 
 
+@pytest.mark.parametrize(
+    ("installed", "chosen"), [(True, ("random_urdfs", "primitives")), (False, ("primitives",))]
+)
+def test_auto_among_object_sets_is_what_is_offered_and_none_twice(monkeypatch, installed, chosen):
+    spec = object() if installed else None
+    monkeypatch.setattr("utils.config_types.importlib.util.find_spec", lambda _: spec)
+    config = load_config(None, ["evaluate.object_sets=auto,primitives"])
+    assert config.evaluate.object_sets == chosen
+
+
 def test_auto_is_the_simulator_that_is_installed():
     config = load_config(None, ["simulator=auto"])
     assert config.simulator == config.scene.simulator == INSTALLED[0]

@@ -64,13 +64,13 @@ def _installed_simulator(name: str) -> str:
 
 
 def _offered_sets(names: tuple[str, ...], sets: tuple[str, ...]) -> tuple[str, ...]:
-    """`auto` is `sets`; without random_urdfs, or else primitives, where pybullet_data, which brings
-    the former, is not installed."""
-    if names != (AUTO,):
-        return names
+    """`auto`, alone or among others, is `sets`; without random_urdfs, or else primitives, where
+    pybullet_data, which brings the former, is not installed."""
     if importlib.util.find_spec("pybullet_data") is None:
         sets = tuple(name for name in sets if name != "random_urdfs")
-    return sets or ("primitives",)
+    offered = sets or ("primitives",)
+    every = (one for name in names for one in (offered if name == AUTO else (name,)))
+    return tuple(dict.fromkeys(every))
 
 
 SimulatorName = Annotated[Name, AfterValidator(_installed_simulator)]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from utils.depth import depth_of_plane
-from utils.transforms import RGBDFrame, known_depth
+from utils.transforms import RGBDFrame, inverse_pose, known_depth, transform_points
 
 TRUSTED_SCALE = 0.002  # errors of the scale below this are left alone: 1.6 mm at 0.8 m
 SCALE_SPREAD = 0.04  # standard deviation of the errors of scale that are expected
@@ -64,6 +64,7 @@ _BIN = 0.001  # of the histogram of factors
 _BLUR = 0.005  # standard deviation that is expected among the table's factors
 _REFITS = 3
 _LEAST_SHARE = 0.15  # of the known pixels that have to agree on the table
+_NEAREST = 0.01  # m, in front of which a camera sees nothing
 
 
 def table_roughness(frame: RGBDFrame, table_height: float) -> float:
@@ -78,11 +79,29 @@ def table_roughness(frame: RGBDFrame, table_height: float) -> float:
 
 
 def _ratio_to_table(frame: RGBDFrame, table_height: float) -> np.ndarray:
-    """(N,) the table's depth over the measured one, for all known pixels whose ray meets the
-    table."""
+    """(N,) the table's depth over the measured one, for all known pixels whose ray meets the table
+    and no fixture: the top of a board is as flat as the table, and may cover more of it."""
     table = depth_of_plane(frame, table_height)
     on = known_depth(frame.depth) & np.isfinite(table) & (table > 0)
+    on &= ~_fixture_pixels(frame)
     return table[on] / frame.depth[on]
+
+
+def _fixture_pixels(frame: RGBDFrame) -> np.ndarray:
+    """(H, W) bool, pixels whose rays meet a fixture."""
+    found = np.zeros(frame.depth.shape, np.uint8)
+    for solid in frame.fixtures:
+        corners = transform_points(inverse_pose(frame.T_WC), solid.vertices)
+        front, back = corners[corners[:, 2] > _NEAREST], corners[corners[:, 2] <= _NEAREST]
+        # The part before the camera is the hull of the corners there and of where lines to the
+        # corners behind it cross the nearest plane.
+        share = (front[:, None, 2] - _NEAREST) / (front[:, None, 2] - back[:, 2])
+        crossings = front[:, None] + share[..., None] * (back - front[:, None])
+        seen = np.concatenate([front, crossings.reshape(-1, 3)]) @ frame.K.T
+        if len(seen):
+            outline = np.rint(np.clip(seen[:, :2] / seen[:, 2:], -1e6, 1e6)).astype(np.int32)
+            cv2.fillConvexPoly(found, cv2.convexHull(outline), 1)
+    return found > 0
 
 
 def smoothed_by_colour(frame: RGBDFrame) -> np.ndarray:

@@ -41,6 +41,9 @@ WALL = 0.05  # m over all that is known: height assumed in holes that are too wi
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
+# What stands as near as this around the workspace is in the way of a hand that comes from a side:
+# the hand is 0.2 m long and starts 0.1 m before the grasp.
+_HAND_REACH, _STANDS = 0.30, 0.02  # m, and m over the table
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
@@ -183,7 +186,8 @@ def base_heights(label: np.ndarray, fixed: np.ndarray, table: float) -> np.ndarr
     one, the table otherwise. fixed: (R, C) of a map from above, see `HeightMap`."""
     on = np.flatnonzero(label >= 0)
     ground, owner = np.maximum(fixed.take(on), table), label.take(on)
-    return np.array([np.median(ground[owner == number]) for number in range(label.max() + 1)])
+    parts = (ground[owner == number] for number in range(_count(label)))
+    return np.array([np.median(part) if len(part) else table for part in parts])
 
 
 def without_rims(
@@ -197,11 +201,16 @@ def without_rims(
     near = cv2.dilate(fixed, window)
     edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
     edge &= height < near + _RIM_RISE
-    count = np.bincount(label[label >= 0], minlength=label.max() + 1)
-    on_edge = np.bincount(label[(label >= 0) & edge], minlength=label.max() + 1)
+    count = np.bincount(label[label >= 0], minlength=_count(label))
+    on_edge = np.bincount(label[(label >= 0) & edge], minlength=_count(label))
     kept = on_edge < _RIM_SHARE * count
     number = np.append(np.where(kept, np.cumsum(kept) - 1, WALL_LABEL), (WALL_LABEL, -1))
     return number[label]
+
+
+def _count(label: np.ndarray) -> int:
+    """Number of objects in labels (R, C), of which some or all may be negative."""
+    return max(int(label.max()) + 1, 0)
 
 
 def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
@@ -263,7 +272,7 @@ class _Seen(NamedTuple):
 def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
     """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
     which of them (H, W) may hide matter: those that are not `at_edges`. Both without the rows and
-    columns in which nothing lies over or around the workspace."""
+    columns in which nothing lies over the workspace or stands around it."""
     measured = known_depth(frame.depth)
     hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
@@ -274,8 +283,8 @@ def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np
 
 
 def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
-    """The rows and the columns whose points lie over the grid; what has no depth counts as
-    table."""
+    """The rows and the columns whose points lie over the grid, or stand where they are in the way
+    of a hand that comes from a side; what has no depth counts as table."""
     known = known_depth(frame.depth)
     depth = np.where(known, frame.depth, depth_of_plane(frame, workspace.table_height))
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
@@ -283,6 +292,8 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     places = deproject(np.stack([u, v], axis=-1), np.where(ahead, depth, 0), frame.K, frame.T_WC)
     apart = np.abs(places[..., :2] - workspace.centre).max(axis=-1)
     near = ahead & (apart <= workspace.size / 2 + MARGIN)
+    stands = places[..., 2] > workspace.table_height + _STANDS
+    near |= ahead & stands & (apart <= workspace.size / 2 + _HAND_REACH)
     if not near.any():
         return slice(0, depth.shape[0]), slice(0, depth.shape[1])
     # Two pixels more: the rays that graze an edge pass between a pixel and the next.
@@ -451,7 +462,7 @@ def _column_centroids(
     rise: np.ndarray, label: np.ndarray, grid: np.ndarray, table: float
 ) -> np.ndarray:
     """(M, 3) centroids of the columns under each labelled piece."""
-    count = label.max() + 1
+    count = _count(label)
     on = np.flatnonzero(label >= 0)
     label, rise, place = label.take(on), rise.take(on), grid.reshape(-1, 2)[on].T
     weight = np.bincount(label, rise, count)

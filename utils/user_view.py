@@ -2,7 +2,8 @@
 
 A planner works on a square of the table. `workspace_of` finds the square that holds what stands on
 the table; `check_view` refuses an image that shows too little for grasps to be more than a guess.
-This module knows no planner and no file.
+`corrected_view` says where all of its depths had to be scaled. This module knows no planner and no
+file.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from utils.depth import depth_of_plane
-from utils.depth_correction import TRUSTED_SCALE, scale_to_table
+from utils.depth_correction import TRUSTED_SCALE, corrected, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth
@@ -64,6 +65,20 @@ def workspace_of(
     return Workspace(_pair(centre), LARGEST, table_height), [remark]
 
 
+def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, list[str]]:
+    """The frame as planners correct it by its table (`utils.depth_correction`), and a remark where
+    all depths were scaled: it may be the camera that is wrong, but also its pose or the height."""
+    scale = scale_to_table(frame, table_height)
+    if abs(scale - 1) <= TRUSTED_SCALE:
+        return corrected(frame, table_height), []
+    remark = (
+        f"all depths were multiplied by {scale:.3f}, so that the largest flat surface lies at the "
+        f"table's height of {table_height:g} m; check that height, the camera's pose and the unit "
+        "of the depth image"
+    )
+    return corrected(frame, table_height), [remark]
+
+
 def given_workspace(numbers: Sequence[float], table_height: float) -> Workspace:
     """The square of [x, y, size], metres in W. Raises UserError for one of another size than
     SMALLEST / 2 to LARGEST."""
@@ -99,12 +114,6 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
         )
     if unseen > MANY_UNSEEN:
         remarks.append(f"{unseen:.0%} of the place that was searched has no depth")
-    scale = scale_to_table(frame, workspace.table_height)
-    if abs(scale - 1) > TRUSTED_SCALE:
-        remarks.append(
-            f"depths were multiplied by {scale:.3f}, so that the table in the image lies at the "
-            "height that is given; if it does not, check --table-height and --camera-pose"
-        )
     return remarks
 
 

@@ -17,13 +17,15 @@ def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
 
 
 def boxes_frame(
-    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]], walls: int = 0
+    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]],
+    walls: int = 0,
+    focal: float = 390.6,
 ) -> RGBDFrame:
     """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula. The
-    last `walls` of them are walls."""
+    last `walls` of them are walls. focal: pixels."""
     v, u = np.mgrid[0:224, 0:224]
     rays = (
-        np.stack([(u - 111.5) / 390.6, (v - 111.5) / 390.6, np.ones_like(u)], axis=-1)
+        np.stack([(u - 111.5) / focal, (v - 111.5) / focal, np.ones_like(u)], axis=-1)
         @ T_WC[:3, :3].T
     )
     eye = T_WC[:3, 3]
@@ -44,7 +46,8 @@ def boxes_frame(
     truth = SceneGeometry(
         tuple(objects[:count]), walls=tuple(wall.solids[0] for wall in objects[count:])
     )
-    return RGBDFrame(rgb, depth.astype(np.float32), K, T_WC, truth=truth)
+    seen_by = np.array([[focal, 0, 111.5], [0, focal, 111.5], [0, 0, 1.0]])
+    return RGBDFrame(rgb, depth.astype(np.float32), seen_by, T_WC, truth=truth)
 
 
 def bin_walls(half: float = 0.15, height: float = 0.10, thick: float = 0.01) -> list:
