@@ -63,8 +63,11 @@ def tilts(planner: Planner | type) -> bool:
 
 
 def takes_targets(planner: Planner | type) -> bool:
-    """Whether the planner grasps one object among others where its frame names one."""
-    return callable(getattr(planner, "segments", None))
+    """Whether the planner grasps one object among others where its frame names one; a
+    `SearchPlanner` of a user's does so only with height maps of its own."""
+    segments, heights = (getattr(planner, name, None) for name in ("segments", "heights"))
+    bare = getattr(heights, "__func__", heights) is SearchPlanner.heights
+    return callable(segments) and not bare
 
 
 def calibration_of(planner: Planner) -> Calibration | None:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.planners import PLANNERS, make_planner, takes_targets
+from models.planner_antipodal import SearchPlanner
+from models.planners import PLANNERS, HeuristicPlanner, make_planner, takes_targets
 from tests.helpers.box_frames import boxes_frame
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
@@ -141,6 +142,17 @@ def test_nothing_else_is_between_the_fingers(name: str) -> None:
 
 def test_the_random_planner_takes_no_targets() -> None:
     assert not takes_targets(make_planner("random", GripperGeometry(), Workspace(), 0))
+
+
+def test_a_search_without_maps_of_its_own_takes_no_targets() -> None:
+    """As docs/planner.md has it: a SearchPlanner of a user's, which knows nothing of targets."""
+
+    class Own(SearchPlanner):
+        def __call__(self, frame: RGBDFrame) -> list:
+            return []
+
+    assert not takes_targets(Own) and not takes_targets(Own(GripperGeometry(), Workspace()))
+    assert takes_targets(HeuristicPlanner)
 
 
 # --- What a user marks ----------------------------------------------------------------------
