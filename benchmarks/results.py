@@ -133,25 +133,25 @@ PARTS = (
                     "evaluate.object_sets=benchmarks.bowls:bowls", noises=NOISY_FIRST, kept=3),
     )),
     Part("scenes", "scenes that ask for grasps from the side", 20, tuple(
-        _evaluation(name, 20, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={scenarios} "
+        _evaluation(name, 15, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={scenarios} "
                     f"evaluate.object_sets={name}", noises="realsense", kept=3)
         for name, scenarios in (("tall", "tall,wall"), ("flat", "wall,flat"))
     )),
     Part("retrieve", "one object under a pile", 20, (
-        _evaluation("retrieve", 25, "evaluate.policies=heuristic,graspnet,oracle "
+        _evaluation("retrieve", 25, "evaluate.policies=graspnet,oracle "
                     "evaluate.scenarios=retrieve evaluate.object_sets=random_urdfs,primitives",
                     noises="realsense", kept=3),
     )),
     Part("vgn", "the field's protocols with a floating hand and side views", 20, tuple(
-        _evaluation(name, 20, f"--config configs/{name}.yaml evaluate.policies=graspnet,graspnet6d "
+        _evaluation(name, 15, f"--config configs/{name}.yaml evaluate.policies=graspnet,graspnet6d "
                     "evaluate.object_sets=random_urdfs", noises=noise, kept=3)
         for name, noise in (("vgn", "gaussian"), ("giga", "gamma"))
     )),
     Part("direct", "the network's own peaks beside the search that it ranks", 20, (
-        _evaluation("direct", 30, "evaluate.policies=graspnet,graspnet_direct "
+        _evaluation("direct", 20, "evaluate.policies=graspnet,graspnet_direct "
                     "evaluate.scenarios=packed,pile,dense evaluate.object_sets=random_urdfs",
                     noises=NOISY_FIRST, kept=3),
-        _evaluation("primitives", 30, "evaluate.policies=graspnet,graspnet_direct "
+        _evaluation("primitives", 20, "evaluate.policies=graspnet,graspnet_direct "
                     "evaluate.scenarios=packed,pile evaluate.object_sets=primitives",
                     noises=NOISY_FIRST, kept=3),
     )),
