@@ -13,13 +13,13 @@ pixel centres, or a JSON file with these keys (and width and height, which are c
 .yaml: it takes a point in the camera's optical frame (x right, y down, z forward) to the world,
 whose z is up.
 
-The grasps are those of a planner (docs/planner.md): --planner graspnet, heuristic, or graspnet6d
-and heuristic6d, whose hand comes from any side. --checkpoint takes a network of your own. The
-planner works on the square of the table that holds all matter above it, or on --workspace X Y SIZE,
-its centre and side in the world. One object is named by a pixel on it (--point U V), by a box
-around it (--box U0 V0 U1 V1, the object that fills most of it), or by its pixels (--mask FILE, a
-PNG or NPY of the image's size, not 0 where the object is). Then all grasps are of that object, and
-`clearing` holds grasps that first move aside what is in its way, if anything is.
+The grasps are those of a planner (docs/planner.md): --planner graspnet, graspnet_direct, heuristic,
+or graspnet6d and heuristic6d, whose hand comes from any side. --checkpoint takes a network of your
+own. The planner works on the square of the table that holds all matter above it, or on --workspace
+X Y SIZE, its centre and side in the world. One object is named by a pixel on it (--point U V), by a
+box around it (--box U0 V0 U1 V1, the object that fills most of it), or by its pixels (--mask FILE,
+a PNG or NPY of the image's size, not 0 where the object is). Then all grasps are of that object,
+and `clearing` holds grasps that first move aside what is in its way, if anything is.
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
 the table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture
@@ -51,8 +51,8 @@ from models.graspnet import check_rgbd
 from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
 from models.planner_antipodal import SearchPlanner
-from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
 from models.planner_target import TargetPlanner, check_reached
+from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
@@ -72,7 +72,7 @@ from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
 from utils.user_view import check_view, corrected_view, given_workspace, workspace_of
 
-NETWORK_PLANNERS = {"graspnet": GraspNetPlanner, "graspnet6d": GraspNetFanPlanner}
+NETWORK_PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
 
 
@@ -224,7 +224,7 @@ def new_planner(
     if options.checkpoint is None:
         planner = make_planner(options.planner, GripperGeometry(), workspace, 0, "--planner")
     else:
-        make = NETWORK_PLANNERS[options.planner]
+        make = ALL_PLANNERS[options.planner]
         planner = make(saved.gripper, workspace, checkpoint=options.checkpoint)
     planner.return_at_least(options.count)
     return planner

@@ -65,6 +65,7 @@ _TALL_GAP = 0.015  # m, most between neighbours: a finger with its room needs 0.
 _LEANER = (0.10, 0.115)  # m, of the layout wall: least longest side, and greatest second one
 _LEAN = np.radians((12, 28))  # rad from the vertical, when put down
 _LEANS = np.radians((8, 35))  # rad, at rest
+_SLOT_PLAY = 0.02  # m to either side of the places at which things lean
 _FLAT, _SPAN = 0.016, 0.085  # m, of the layout flat: greatest thickness, least second longest side
 _BLOCK = np.array([0.34, 0.16, 0.15])  # m, on which flat things lie; half a hand high and more
 _OVERHANG = (0.02, 0.06)  # m
@@ -103,6 +104,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
+            if layout == "wall" and not all(map(_leans, placements)):
+                continue
             target = _covered(placements, config) if layout == TARGET_LAYOUT else None
             if layout != TARGET_LAYOUT or target is not None:
                 return Scene(layout, seed, placements, walls, fixed, viewpoint, target)
@@ -273,10 +276,13 @@ def _stand_close(
 
 def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int] | None:
     """Each object on its longest side's end, its thinnest side towards the wall, leaning over;
-    None if one finds no place or does not stay so."""
+    None if one finds no place or does not come to rest."""
     bodies: list[int] = []
     face = config.workspace.center[1] + config.workspace.size / 2  # y of the wall
-    for model in models:
+    reach = config.workspace.size / 2 - 0.03
+    # Wide things find room only beside each other, not at random places.
+    slots = rng.permutation(np.linspace(-reach, reach, len(models)))
+    for model, slot in zip(models, slots):
         thin, _, long = np.eye(3)[np.argsort(model.extents, kind="stable")]
         upright = Rotation.align_vectors([[0, 0, 1], [0, 1, 0]], [long, thin])[0]
         rotation = Rotation.from_euler("x", -rng.uniform(*_LEAN)) * upright
@@ -285,8 +291,7 @@ def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) ->
         low = corners[:, 2].min()
         farthest = _reach_below(corners, low + _WALL_HEIGHT)
         for _ in range(_TRIES):
-            reach = config.workspace.size / 2 - 0.03
-            x = config.workspace.center[0] + rng.uniform(-reach, reach)
+            x = config.workspace.center[0] + slot + rng.uniform(-_SLOT_PLAY, _SLOT_PLAY)
             position = np.array([x, face - 0.001 - farthest, 0.001 - low])
             body = table.put(model, position, rotation.as_quat())
             if not table.is_near(body, bodies, _PACKED_GAP):
@@ -297,12 +302,14 @@ def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) ->
         bodies.append(body)
         if not table.settle(bodies):
             return None
-    for model, body in zip(models, bodies):
-        turn = Rotation.from_quat(table.pose(body)[1]).as_matrix()
-        lean = np.arccos(abs(turn[2, np.argmax(model.extents)]))
-        if not _LEANS[0] <= lean <= _LEANS[1]:
-            return None
     return bodies
+
+
+def _leans(placed: Placement) -> bool:
+    """Whether an object leans, and neither stands upright nor lies."""
+    turn = Rotation.from_quat(placed.quaternion).as_matrix()
+    lean = np.arccos(min(abs(turn[2, np.argmax(placed.model.extents)]), 1.0))
+    return bool(_LEANS[0] <= lean <= _LEANS[1])
 
 
 def _reach_below(corners: np.ndarray, height: float) -> float:

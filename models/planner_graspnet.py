@@ -137,7 +137,8 @@ def vote_centres(
     peaks = local_maxima(density, settings.apart, least)
     found = np.column_stack(peaks[::-1]) - settings.margin
     near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
-    return np.array([votes[around].mean(axis=0) for around in near]).reshape(-1, 2)
+    # The blur may make a peak between votes that are all farther away.
+    return np.array([votes[some].mean(axis=0) for some in near if some.any()]).reshape(-1, 2)
 
 
 # Half the heuristic's angles: turning onto the faces and the network make up for it. The split

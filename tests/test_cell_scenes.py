@@ -170,7 +170,7 @@ def test_things_lean_on_the_wall(sets, laid_out, name):
         corners = corners_of(placed)
         assert 8 < lean < 35
         assert corners[:, 2].min() == pytest.approx(0.0, abs=2e-3)  # stands on the table
-        assert corners[np.argmax(corners[:, 2]), 1] > face - 0.03  # and its top is at the wall
+        assert corners[:, 1].max() > face - 0.002  # and touches the wall, or leans over it
 
 
 @pytest.mark.parametrize("seed", [3, 4])

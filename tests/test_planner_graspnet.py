@@ -12,6 +12,7 @@ from models.planner_graspnet import (
     CROP_MARGIN,
     GraspNetDirectPlanner,
     GraspNetPlanner,
+    VoteSettings,
     around_matter,
     labelled_by_centres,
     quality_between,
@@ -116,6 +117,15 @@ def test_two_objects_that_touch_are_not_grasped_as_one() -> None:
     assert abs(abs(found[0].position[1]) - 0.015) < 0.004
     for grasp in (g for g in found if g.quality > 0.3 * found[0].quality):
         assert np.rad2deg(angle_difference(grasp.angle, 0.0)) < 20, "along the line of contact"
+
+
+def test_a_peak_between_votes_that_are_far_from_it_is_no_centre() -> None:
+    """Two groups of votes, 12 pixels apart: with a wide blur they have one peak between them, from
+    which each is 6 pixels away."""
+    votes = np.repeat([[50.0, 50.0], [62.0, 50.0]], 200, axis=0)
+    found = vote_centres(votes, (100, 120), CELL, VoteSettings(blur=9.0, apart=5))
+    assert np.isfinite(found).all()
+    assert len(found) == 0
 
 
 # --- The network's own peaks ---------------------------------------------------------------

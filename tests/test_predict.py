@@ -438,6 +438,11 @@ def empty_mask(files):
     return {"mask": files.folder / "mask.npy"}
 
 
+def mask_of_everything(files):
+    Image.fromarray(files.frame.rgb).save(files.folder / "mask.png")  # the picture by mistake
+    return {"mask": files.folder / "mask.png"}
+
+
 def mask_of_the_table(files):
     mask = np.zeros((240, 320), bool)
     mask[:30, :30] = True
@@ -527,6 +532,7 @@ def only_a_count_beside_export(files):
         (options(mask="nowhere.png"), "no such file"),
         (small_mask, "a mask of 100x100 pixels, the image has 320x240"),
         (empty_mask, "the mask is empty"),
+        (mask_of_everything, "the mask marks every pixel"),
         (mask_of_the_table, "shows only the table"),
         (target_that_is_too_wide, "no grasp reaches the target"),
         (oblique_pose, "the view is too oblique: the camera looks 76 degrees off"),

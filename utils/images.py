@@ -177,7 +177,8 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     """(H, W) bool of a PNG or NPY of `shape`: True where it is not 0; of a colour image, where any
-    channel but alpha is not. Raises UserError for another size and for a mask without a pixel."""
+    channel but alpha is not. Raises UserError for another size and for a mask of no or of every
+    pixel."""
     if path.suffix.lower() == ".npy":
         values = _load_array(path)
     else:
@@ -198,6 +199,11 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
     mask = np.nan_to_num(values.astype(float)) != 0
     if not mask.any():
         raise UserError(f"{path}: the mask is empty: all pixels are 0; mark those of the object")
+    if mask.all():
+        raise UserError(
+            f"{path}: the mask marks every pixel, as a picture in place of a mask does; only those "
+            "of the object may be other than 0"
+        )
     return mask
 
 

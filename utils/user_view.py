@@ -107,6 +107,12 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
             f"to {OBLIQUE:g} degrees alone"
         )
     unseen = unseen_share(frame, workspace)
+    if unseen is None:
+        x, y = workspace.centre
+        raise UserError(
+            f"the image does not show the place to search, {workspace.size:g} m around "
+            f"({x:g}, {y:g}) m; check --workspace, --camera-pose and --table-height"
+        )
     if unseen > MOST_UNSEEN:
         raise UserError(
             f"too much is unseen: {unseen:.0%} of the place that was searched has no depth, at "
@@ -117,15 +123,15 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
     return remarks
 
 
-def unseen_share(frame: RGBDFrame, workspace: Workspace) -> float:
+def unseen_share(frame: RGBDFrame, workspace: Workspace) -> float | None:
     """Share of the pixels that look at the workspace, through it at the table's height, whose depth
-    is unknown; 1 where none does."""
+    is unknown; None where none does."""
     depth = depth_of_plane(frame, workspace.table_height)
     v, u = np.nonzero((depth > 0) & np.isfinite(depth))
     foot = deproject(np.column_stack([u, v]), depth[v, u], frame.K, frame.T_WC)
     inside = np.abs(foot[:, :2] - workspace.centre).max(axis=1) <= workspace.size / 2
     known = known_depth(frame.depth)[v, u][inside]
-    return float(1 - known.mean()) if len(known) else 1.0
+    return float(1 - known.mean()) if len(known) else None
 
 
 def _looked_at(frame: RGBDFrame, table_height: float) -> np.ndarray:
