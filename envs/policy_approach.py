@@ -29,6 +29,7 @@ from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
+_STILL = 0.001  # m between two observations: fingers that move press their motor without an object
 LEARNED_SCENARIOS = ("isolated", "static")  # one object, which stays where it is
 LEARNED = ("ppo", "sb3")  # the word before the colon, followed by a file
 SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"
@@ -62,13 +63,15 @@ class PolicyApproach:
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """Raises GraspFailure when nothing is gripped within the actions of a training episode."""
         self.closed_at, ended, gripped = None, False, 0
+        before = cell.robot.opening
         try:
             observation, info = self.env.take_over()
             while not ended and gripped < _SURE:
                 action = self.policy({**info, **observation})
                 observation, _, terminated, truncated, info = self.env.step(action)
                 ended = terminated or truncated
-                gripped = gripped + 1 if cell.robot.grips() else 0
+                moved, before = abs(cell.robot.opening - before), cell.robot.opening
+                gripped = gripped + 1 if cell.robot.grips() and moved < _STILL else 0
                 if gripped == 1:
                     self.closed_at = _grasp_of(cell)
         finally:
