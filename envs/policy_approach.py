@@ -29,7 +29,7 @@ from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
-_STILL = 0.001  # m between two observations: fingers that move press their motor without an object
+_STILL = 0.001  # m between two observations: fingers that move may push without holding
 LEARNED_SCENARIOS = ("isolated", "static")  # one object, which stays where it is
 LEARNED = ("ppo", "sb3")  # the word before the colon, followed by a file
 SHIPPED = Path(__file__).resolve().parents[1] / "checkpoints" / "ppo_box.pt"
@@ -42,8 +42,8 @@ class PolicyApproach:
         the rest of the config is the cell's, and so is the depth noise.
     closed_at: the hand's pose when it closed, None until then.
 
-    The approach ends when both fingers have gripped something for a quarter of a second, which a
-    gripper feels; then the object is held, lifted and judged like any other.
+    The approach ends when both fingers have gripped something for a quarter of a second and stand
+    still, which a gripper feels; then the object is held, lifted and judged like any other.
     """
 
     def __init__(
