@@ -62,7 +62,7 @@ class PolicyApproach:
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """Raises GraspFailure when nothing is gripped within the actions of a training episode."""
-        self.closed_at, ended, gripped = None, False, 0
+        self.closed_at, ended, gripped, touches = None, False, 0, False
         before = cell.robot.opening
         try:
             observation, info = self.env.take_over()
@@ -71,8 +71,9 @@ class PolicyApproach:
                 observation, _, terminated, truncated, info = self.env.step(action)
                 ended = terminated or truncated
                 moved, before = abs(cell.robot.opening - before), cell.robot.opening
-                gripped = gripped + 1 if cell.robot.grips() and moved < _STILL else 0
-                if gripped == 1:
+                touched, touches = touches, cell.robot.grips()
+                gripped = gripped + 1 if touches and moved < _STILL else 0
+                if touches and not touched:
                     self.closed_at = _grasp_of(cell)
         finally:
             self.env.hand_over()
