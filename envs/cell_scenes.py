@@ -17,6 +17,7 @@ so that all simulators start from the same poses. The scene itself is data
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -257,21 +258,37 @@ def _stand_close(
     bodies: list[int] = []
     for model in models:
         upright = Rotation.align_vectors([[0, 0, 1]], [np.eye(3)[np.argmax(model.extents)]])[0]
-        for _ in range(_TRIES):
+
+        def anywhere(model=model, upright=upright) -> tuple[np.ndarray, Rotation]:
             rotation = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * upright
             place = config.workspace.center + rng.uniform(-_PACKED_REGION, _PACKED_REGION, 2)
-            position = np.append(place, 0.001 - _lowest(model, rotation))
-            body = table.put(model, position, rotation.as_quat())
-            near = not bodies or table.is_near(body, bodies, _TALL_GAP)
-            if near and not table.is_near(body, bodies, _PACKED_GAP):
-                break
-            table.remove(body)
-        else:
+            return np.append(place, 0.001 - _lowest(model, rotation)), rotation
+
+        if not _put_free(table, model, bodies, anywhere, within=_TALL_GAP):
             return None
-        if not _stands(table, body, rotation, bodies):
-            return None
-        bodies.append(body)
     return bodies
+
+
+def _put_free(
+    table: LayoutTable,
+    model: ObjectModel,
+    bodies: list[int],
+    draw: Callable[[], tuple[np.ndarray, Rotation]],
+    within: float | None = None,
+) -> bool:
+    """Put an object at the first pose that `draw` gives, of _TRIES, at which it touches none of the
+    `bodies`, and is nearer than `within` m to one of them; False where there is none or it does not
+    stay. The object is appended to `bodies`."""
+    for _ in range(_TRIES):
+        position, rotation = draw()
+        body = table.put(model, position, rotation.as_quat())
+        near = within is None or not bodies or table.is_near(body, bodies, within)
+        if near and not table.is_near(body, bodies, _PACKED_GAP):
+            stays = _stands(table, body, rotation, bodies)
+            bodies.append(body)
+            return stays
+        table.remove(body)
+    return False
 
 
 def _lean(table: LayoutTable, models: list[ObjectModel], rng, config: Config) -> list[int] | None:
@@ -333,7 +350,8 @@ def _overhang(
     x, y = config.workspace.center
     for model in models:
         level = Rotation.align_vectors([[0, 0, 1]], [np.eye(3)[np.argmin(model.extents)]])[0]
-        for _ in range(_TRIES):
+
+        def over_the_edge(model=model, level=level) -> tuple[np.ndarray, Rotation]:
             rotation = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * level
             corners = rotation.apply(np.concatenate(model.parts))
             room = max(_BLOCK[0] / 2 - np.abs(corners[:, 0]).max(), 0.0)
@@ -343,15 +361,10 @@ def _overhang(
                 min(edge + rng.uniform(*_OVERHANG) - corners[:, 1].max(), edge - 0.01),
                 _BLOCK[2] + 0.001 - corners[:, 2].min(),
             ])  # fmt: skip
-            body = table.put(model, position, rotation.as_quat())
-            if not table.is_near(body, bodies, _PACKED_GAP):
-                break
-            table.remove(body)
-        else:
+            return position, rotation
+
+        if not _put_free(table, model, bodies, over_the_edge):
             return None
-        if not _stands(table, body, rotation, bodies):
-            return None
-        bodies.append(body)
     return bodies
 
 

@@ -201,6 +201,17 @@ def test_a_crumb_is_nothing_to_grasp(name: str) -> None:
     assert planner(name)(boxes_frame([((0.004, 0.006, 0.012), 0.0, (0.5, 0.0))])) == []
 
 
+def printed_without_a_simulator(code: str, folder: Path) -> str:
+    """What a program prints in a process of its own, which may import no simulator."""
+    check = f"{code}\nassert not {{'pybullet', 'mujoco', 'envs'}} & set(sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", check], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_planners_run_on_a_bare_frame_without_a_simulator(tmp_path) -> None:
     """A script of one's own that has the image of a box: depth, colours, K and T_WC alone."""
     frame = boxes_frame([((0.04, 0.10, 0.05), 0.3, (0.5, 0.0))])
@@ -214,14 +225,9 @@ def test_planners_run_on_a_bare_frame_without_a_simulator(tmp_path) -> None:
         "from utils.transforms import RGBDFrame\n"
         "frame = RGBDFrame(**np.load('frame.npz'))\n"
         f"for name in {names}:\n"
-        "    assert make_planner(name, GripperGeometry(), Workspace(), seed=0)(frame), name\n"
-        "assert not {'pybullet', 'mujoco', 'envs'} & set(sys.modules)"
+        "    assert make_planner(name, GripperGeometry(), Workspace(), seed=0)(frame), name"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    printed_without_a_simulator(check, tmp_path)
     assert {"heuristic", "graspnet", "heuristic6d", "graspnet6d"} <= set(names)
 
 
@@ -230,16 +236,9 @@ def test_the_planner_of_the_docs_runs_without_a_simulator(tmp_path, monkeypatch)
     text = (ROOT / "docs" / "planner.md").read_text(encoding="utf-8")
     code = text.split("```python\n")[1].split("```")[0]
     (tmp_path / "top_object.py").write_text(code, encoding="utf-8")
-    check = (
-        "import runpy, sys; runpy.run_path('top_object.py', run_name='__main__');"
-        "assert not {'pybullet', 'mujoco', 'envs'} & set(sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["[0.5", "0.", "0.037]", "0", "degrees"]
+    check = "import runpy, sys; runpy.run_path('top_object.py', run_name='__main__')"
+    printed = printed_without_a_simulator(check, tmp_path)
+    assert printed.split() == ["[0.5", "0.", "0.037]", "0", "degrees"]
     monkeypatch.syspath_prepend(tmp_path)
     frame = boxes_frame([((0.04, 0.10, 0.05), 0.4, (0.5, 0.0))])
     best = planner("top_object:TopObject")(frame)[0]
