@@ -25,15 +25,10 @@ from envs.simulators import make_cell
 from models.planner_fan import FanPlanner
 from models.planners import needs_truth
 from utils.errors import UserError
-from utils.height_map import (
-    HeightMap,
-    height_map_from_frame,
-    tilted_height_map,
-    tilted_view,
-    without_holes,
-)
+from utils.height_map import HeightMap, height_map_from_frame, tilted_height_map, tilted_view
 from utils.image_overlay import contact_sheet
 from utils.runs import parse_args, run_script
+from utils.seen_heights import without_holes
 from utils.transforms import Grasp, RGBDFrame, look_at
 
 _VIEW = Intrinsics(360, 300, fov_deg=34.0, near=0.05, far=3.0)

@@ -25,8 +25,8 @@ from utils.height_map import (
     height_map_from_scene,
     tilted_height_map,
     tilted_view,
-    without_holes,
 )
+from utils.seen_heights import without_holes
 from utils.target import object_of_target, only_object, only_target
 from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
 

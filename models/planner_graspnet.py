@@ -47,9 +47,9 @@ from utils.height_map import (
     height_map_from_frame,
     local_maxima,
     tilted_height_map,
-    without_holes,
 )
 from utils.images import PixelScaling
+from utils.seen_heights import without_holes
 from utils.target import only_target
 from utils.transforms import (
     Grasp,

@@ -15,7 +15,6 @@ from models.planners import HeuristicPlanner
 from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
-    HOLE_RISE,
     WALL_LABEL,
     base_heights,
     height_map_from_frame,
@@ -23,8 +22,8 @@ from utils.height_map import (
     local_maxima,
     tilted_height_map,
     tilted_view,
-    without_holes,
 )
+from utils.seen_heights import HOLE_RISE, without_holes
 from utils.transforms import inverse_pose, project, transform_points
 
 IMAGES = arrays.arrays(

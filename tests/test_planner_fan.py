@@ -28,11 +28,10 @@ from utils.height_map import (
     HeightMap,
     height_map_from_frame,
     height_map_from_scene,
-    table_slope,
     tilted_height_map,
     tilted_view,
-    without_holes,
 )
+from utils.seen_heights import table_slope, without_holes
 from utils.transforms import DOWN, Grasp, tilt_rotation, transform_points
 
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])

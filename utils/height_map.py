@@ -8,50 +8,32 @@ peaks of such a map, or of any image. This module knows no simulator and no netw
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from utils.depth import (
-    HOLE_REACH,
-    at_edges,
-    depth_of_plane,
-    near_side,
-    nearest_values,
-    reach_in_pixels,
-)
+from utils.depth import nearest_values
 from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_lines
-from utils.transforms import (
-    RGBDFrame,
-    deproject,
-    inverse_pose,
-    known_depth,
-    tilt_rotation,
-    transform_points,
+from utils.seen_heights import (
+    FARTHEST,
+    MARGIN,
+    Complete,
+    seen_heights,
+    table_slope,
+    without_holes,
 )
+from utils.transforms import RGBDFrame, inverse_pose, tilt_rotation, transform_points
 
-# Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole that is
-# not at an edge may be this much higher than the surface beside it.
-HOLE_RISE = 0.015  # m
-WALL = 0.05  # m over all that is known: height assumed in holes that are too wide to fill
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
-MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
-# What stands as near as this around the workspace is in the way of a hand that comes from a side:
-# the hand is 0.2 m long and starts 0.1 m before the grasp.
-_HAND_REACH, _STANDS = 0.30, 0.02  # m, and m over the table
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
-STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
-FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
 
 
 @dataclass(frozen=True)
@@ -140,31 +122,26 @@ def tilted_view(approach: np.ndarray, workspace: Workspace) -> np.ndarray:
     return T
 
 
-def table_slope(
-    shape: tuple[int, int], origin: np.ndarray, cell: float, table: float, T_WV: np.ndarray
-) -> np.ndarray:
-    """(R, C) float32 metres in V: the table, `table` m high in W, in each cell of a grid."""
-    steep_x, steep_y, up = T_WV[2, :3]
-    rows, columns = (np.arange(count) for count in shape)
-    # Where the hand comes along the table, the table is a wall on one side.
-    level = (table - T_WV[2, 3]) - steep_x * (origin[0] + cell * columns)
-    slope = (level - steep_y * (origin[1] + cell * rows)[:, None]) / max(up, STEEPEST)
-    return np.clip(slope, -FARTHEST, FARTHEST).astype(np.float32)
-
-
 def height_map_from_frame(
-    frame: RGBDFrame, workspace: Workspace, cell: float = 0.002, margin: float = MARGIN
+    frame: RGBDFrame,
+    workspace: Workspace,
+    cell: float = 0.002,
+    margin: float = MARGIN,
+    complete: Complete | None = None,
 ) -> HeightMap:
     """The height map of a depth image from above; uses nothing of the frame but depth, K and T_WC.
 
     Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over those
     that are not `at_edges` is a little higher. Labels are the pieces between height
     discontinuities; their centres are volume centroids of the columns between the table and the
-    visible surface.
+    visible surface. complete: guesses what the frame does not show.
     """
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
-    seen = _seen(*without_holes(frame, workspace), np.eye(4), grid.shape[:2], origin, cell, table)
+    filled, hiding = without_holes(frame, workspace)
+    seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
+    if complete is not None:
+        seen = complete(seen)
     if not frame.fixtures:
         label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
         centres = _column_centroids(seen.height - table, label, grid, table)
@@ -219,15 +196,21 @@ def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
 
 
 def tilted_height_map(
-    overhead: HeightMap, filled: RGBDFrame, hiding: np.ndarray, T_WV: np.ndarray
+    overhead: HeightMap,
+    filled: RGBDFrame,
+    hiding: np.ndarray,
+    T_WV: np.ndarray,
+    complete: Complete | None = None,
 ) -> HeightMap:
     """The map of the same scene in another frame, on a grid like that of the map from above.
 
     filled, hiding: the frame `without_holes`. Objects are those of the map from above: a surface
-    belongs to the object over its place on the table.
+    belongs to the object over its place on the table. complete: as in `height_map_from_frame`.
     """
     shape, origin, cell = overhead.height.shape, overhead.origin, overhead.cell
-    seen = _seen(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
+    seen = seen_heights(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
+    if complete is not None:
+        seen = complete(seen)
     row, column = np.indices(shape, sparse=True)
     surface = np.broadcast_arrays(origin[0] + cell * column, origin[1] + cell * row, seen.height)
     points = transform_points(T_WV, np.stack(surface, axis=-1))
@@ -253,90 +236,6 @@ def tilted_height_map(
         fixed = None
     table = overhead.table_height
     return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed)
-
-
-class _Seen(NamedTuple):
-    """height, ceiling: as in `HeightMap`, without walls. unknown: (R, C) bool, cells of which not
-    even the surroundings are known."""
-
-    height: np.ndarray
-    ceiling: np.ndarray
-    unknown: np.ndarray
-
-    def walled(self) -> tuple[np.ndarray, np.ndarray]:
-        """Height and ceiling, with walls where any matter is possible."""
-        height = np.where(self.unknown, self.height.max() + WALL, self.height)
-        return height, np.maximum(self.ceiling, height)
-
-
-def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
-    """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
-    which of them (H, W) may hide matter: those that are not `at_edges`. Both without the rows and
-    columns in which nothing lies over the workspace or stands around it."""
-    measured = known_depth(frame.depth)
-    hiding = ~measured & ~at_edges(frame.depth)
-    if not measured.all():
-        reach = reach_in_pixels(frame, HOLE_REACH)
-        frame = replace(frame, depth=near_side(frame.depth, reach))
-    rows, columns = _around(frame, workspace)
-    return frame.part(rows, columns), hiding[rows, columns]
-
-
-def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
-    """The rows and the columns whose points lie over the grid, or stand where they are in the way
-    of a hand that comes from a side; what has no depth counts as table."""
-    known = known_depth(frame.depth)
-    depth = np.where(known, frame.depth, depth_of_plane(frame, workspace.table_height))
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
-    ahead = np.isfinite(depth) & (depth > 0)
-    places = deproject(np.stack([u, v], axis=-1), np.where(ahead, depth, 0), frame.K, frame.T_WC)
-    apart = np.abs(places[..., :2] - workspace.centre).max(axis=-1)
-    near = ahead & (apart <= workspace.size / 2 + MARGIN)
-    stands = places[..., 2] > workspace.table_height + _STANDS
-    near |= ahead & stands & (apart <= workspace.size / 2 + _HAND_REACH)
-    if not near.any():
-        return slice(0, depth.shape[0]), slice(0, depth.shape[1])
-    # Two pixels more: the rays that graze an edge pass between a pixel and the next.
-    rows, columns = (
-        slice(max(int(found[0]) - 2, 0), min(int(found[-1]) + 3, side))
-        for found, side in zip((np.flatnonzero(near.any(axis=k)) for k in (1, 0)), depth.shape)
-    )
-    return rows, columns
-
-
-def _seen(
-    frame: RGBDFrame,
-    hiding: np.ndarray,
-    T_WV: np.ndarray,
-    shape: tuple[int, int],
-    origin: np.ndarray,
-    cell: float,
-    table: float,
-) -> _Seen:
-    """What a frame without holes tells about the cells of a grid in V."""
-    slope = table_slope(shape, origin, cell, table, T_WV)
-    unknown = ~known_depth(frame.depth)
-    to_table = np.where(unknown, depth_of_plane(frame, table), 0) if unknown.any() else None
-    frame = replace(frame, T_WC=inverse_pose(T_WV) @ frame.T_WC)
-    seen = _highest(_surface_points(frame, origin, cell), shape)
-    hidden = ~np.isfinite(seen)
-    # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
-    # OpenCV pads with the largest float, which a cell far outside the view would inherit.
-    lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
-    height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
-    # The rays that graze an edge bound the matter in its shadow.
-    ceiling = _highest(_grazing_points(frame, origin, cell), shape)
-    ceiling = np.maximum(ceiling, height)
-    if T_WV[2, 2] == 1.0:  # a camera above has seen what is over a surface that it sees
-        ceiling = np.where(hidden, ceiling, height)
-    if hiding.any():
-        nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
-        risen = _highest(_surface_points(nearer, origin, cell), shape)
-        ceiling = np.maximum(ceiling, risen)
-    if to_table is None:
-        return _Seen(height, ceiling, np.zeros(shape, bool))
-    below = _highest(_surface_points(replace(frame, depth=to_table), origin, cell), shape)
-    return _Seen(height, ceiling, hidden & np.isfinite(below))
 
 
 def height_map_from_scene(
@@ -469,71 +368,6 @@ def _column_centroids(
     x, y = (np.bincount(label, rise * along, count) / weight for along in place)
     z = np.bincount(label, rise**2, count) / (2 * weight)
     return np.column_stack([x, y, table + z])
-
-
-def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
-    """(R, C) float32 highest z of the points in each cell; -inf where there is none.
-
-    Each part holds columns and rows, in cells, and z (metres) of points, (3, ...).
-    """
-    rows, cols = shape
-    height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for points outside
-    for col, row, z in parts:
-        index = np.rint(np.clip(row, -1, rows)) + 1
-        index *= cols + 2
-        index += np.rint(np.clip(col, -1, cols)) + 1
-        index, z = index.astype(np.intp), z.astype(np.float32)
-        np.maximum.at(height.reshape(-1), index.ravel(), z.ravel())
-    return height[1:-1, 1:-1]
-
-
-def _surface_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int = 2
-) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns, rows and z (H, W) of points, split x split times: each pixel stands for that many
-    points of its square, because it covers about 2 mm of the table and single points would leave
-    gaps in a 2 mm grid. Without a depth, z is -inf.
-    """
-    depth = frame.depth.astype(float)
-    unknown = ~known_depth(depth)
-    depth[unknown] = 0
-    to_cells = np.diag([1 / cell, 1 / cell, 1.0])
-    start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
-    # A ray is the sum of three parts: for the pixel's column, for its row, and the optical axis.
-    by_u, by_v, axis = (to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)).T
-    v, u = (np.arange(count, dtype=float) for count in depth.shape)
-    sub = (np.arange(split) + 0.5) / split - 0.5
-    for dv, du in itertools.product(sub, sub):
-        col, row, z = (
-            depth * ((a * (u + du) + c) + (b * (v + dv))[:, None]) + d
-            for a, b, c, d in zip(by_u, by_v, axis, start)
-        )
-        z[unknown] = -np.inf
-        yield col, row, z
-
-
-def _grazing_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = 0.006
-) -> Iterator[np.ndarray]:
-    """Columns, rows and z (3, S, N) of points on the rays between neighbouring pixels whose depths
-    differ by a jump: beside each other, and one below the other."""
-    for step in ((1, 0), (0, 1)):
-        here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
-        there = frame.depth[step[1] :, step[0] :]
-        edge = (np.abs(here - there) > jump) & (here > 0) & (there > 0)
-        row, column = np.divmod(np.flatnonzero(edge), edge.shape[1])
-        pixel = np.stack([column, row], axis=-1)
-        if len(pixel) == 0:
-            continue
-        near, far = (
-            deproject(at, depth[edge], frame.K, frame.T_WC).T
-            for at, depth in ((pixel, here), (pixel + step, there))
-        )
-        for end in (near, far):
-            end[:2] = (end[:2] - origin[:, None]) / cell
-        cells = np.linalg.norm((far - near)[:2], axis=0).max()
-        share = np.linspace(0, 1, int(np.clip(2 * cells, 2, 60)))[:, None]
-        yield near[:, None] + share * (far - near)[:, None]
 
 
 # --- Local maxima ---------------------------------------------------------------------------
