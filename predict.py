@@ -23,11 +23,11 @@ and `clearing` holds grasps that first move aside what is in its way, if anythin
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
 the table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture
-in OUT/grasps.png; OUT is runs/predict/<name of the image>, with a number where another image of
-that name was first. Each grasp has `pixel` (u, v) and `image_angle` (from right towards down),
-where its position and closing line lie on the image, `width` between the finger pads, `tilt` of the
-approach from the table's normal, and in `camera` and `world` the pose of the middle between the
-pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
+in OUT/grasps.png; OUT is runs/predict/<time>-<name of the image>, or the folder of --out, where
+they replace an earlier run's. Each grasp has `pixel` (u, v) and `image_angle` (from right towards
+down), where its position and closing line lie on the image, `width` between the finger pads, `tilt`
+of the approach from the table's normal, and in `camera` and `world` the pose of the middle between
+the pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
 line. `quality` is the chance of success where `calibrated` is true, and else the planner's score.
 Units are metres and radians; quaternions are x, y, z, w. If there is nothing to grasp the list is
 empty. `remarks` say what to mistrust. Bad input ends with one sentence and status 2.
@@ -60,13 +60,12 @@ from utils.grasp_files import (
     FORMAT,
     VERSION,
     check_output,
-    free_folder,
     grasps_as_plain,
     scene_as_plain,
 )
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
-from utils.runs import run_script, write_atomic
+from utils.runs import run_script, timed_folder, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
@@ -86,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"wrote {options.export}", file=sys.stderr)
         return 0
 
-    out = options.out or free_folder(Path("runs/predict") / options.rgb.stem, options.rgb)
-    check_output(out)
+    if options.out is not None:
+        check_output(options.out)
     image = read_image(options)
     options.mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
@@ -119,12 +118,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         "remarks": remarks,
     }
     text = json.dumps(content, indent=2, allow_nan=False)
+    out = options.out or timed_folder(Path("runs/predict"), options.rgb.stem)
+    verb = "replaced" if (out / "grasps.json").exists() else "wrote"
     write_atomic(out / "grasps.png", grasp_picture(frame, grasps, clearing or []))
     write_atomic(out / "grasps.json", text + "\n")
     print(text)
     for remark in remarks:
         print(f"remark: {remark}", file=sys.stderr)
-    print(f"wrote {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
+    print(f"{verb} {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
     return 0
 
 
@@ -153,7 +154,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     which.add_argument("--mask", type=Path, metavar="FILE", help="the object's pixels, PNG or NPY")
     parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<name of the image>"
+        "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<time>-<name of --rgb>"
     )
     parser.add_argument("--count", type=int, metavar="N", help="largest number of grasps; 20")
     parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -562,23 +563,23 @@ def test_bad_input_is_one_sentence_and_writes_nothing(files, capsys, spoil, mess
     assert after == before
 
 
-def test_images_of_one_name_get_folders_of_their_own(files, tmp_path, monkeypatch, capsys):
+def test_every_run_has_a_folder_of_its_own(files, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    command = files.command(out=None)
-    first = tmp_path / "runs" / "predict" / "rgb" / "grasps.json"
-    assert predict.main(command) == 0
-    before = first.read_bytes()
-    assert predict.main(command) == 0, "the same image again writes the same folder"
-    (files.folder / "second").mkdir()
-    other = files.folder / "second" / "rgb.png"
-    other.write_bytes((files.folder / "rgb.png").read_bytes())
-    for _ in range(2):
-        assert predict.main(files.command(out=None, rgb=other)) == 0
-    assert first.read_bytes() == before
-    names = sorted(path.name for path in first.parent.parent.iterdir())
-    assert names == ["rgb", "rgb-2"]
-    second = json.loads((first.parent.parent / "rgb-2" / "grasps.json").read_text())
-    assert second["rgb"] == str(other)
+    runs = tmp_path / "runs" / "predict"
+    assert predict.main(files.command(out=None)) == 0
+    (first,) = runs.iterdir()
+    before = (first / "grasps.json").read_bytes()
+    assert predict.main(files.command(out=None, count=1)) == 0
+    folders = sorted(runs.iterdir())
+    assert len(folders) == 2 and first in folders
+    assert (first / "grasps.json").read_bytes() == before
+    assert all(re.fullmatch(r"\d{8}-\d{6}-rgb(-2)?", folder.name) for folder in folders)
+
+
+def test_a_folder_that_is_named_keeps_the_last_result_and_says_so(files, capsys):
+    for verb in ("wrote", "replaced"):
+        assert predict.main(files.command()) == 0
+        assert f"{verb} {files.folder / 'out' / 'grasps.json'}" in capsys.readouterr().err
 
 
 def test_intrinsics_may_come_from_a_file(files, capsys):

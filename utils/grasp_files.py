@@ -5,7 +5,6 @@ This module knows no planner and no network.
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,16 +27,6 @@ from utils.transforms import (
 
 FORMAT = "robot-grasping grasps"  # marks a grasps.json of predict.py
 VERSION = 2  # 1 had no planner, tilt, workspace, target, clearing and remarks
-
-
-def free_folder(folder: Path, rgb: Path) -> Path:
-    """`folder`, or `folder`-2, -3, ...: the first that holds no grasps of another image."""
-    for number in itertools.count(1):
-        numbered = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
-        before = own_json(numbered / "grasps.json")
-        if before is None or Path(before["rgb"]).resolve() == rgb.resolve():
-            return numbered
-    raise AssertionError("itertools.count ended")
 
 
 def check_output(folder: Path) -> None:

@@ -254,11 +254,17 @@ def new_run_folder(
             f"run name: got {name!r}, expected letters, digits and . _ + - starting with a letter, "
             "digit or _; choose another name"
         )
-    stem = datetime.now().strftime("%Y%m%d-%H%M%S") + (f"-{name}" if name else "")
-    folder = _make_new(root / script, stem)
+    folder = timed_folder(root / script, name)
     write_atomic(folder / "config.yaml", dump_config(config))
     write_json_atomic(folder / "environment.json", environment())
     return folder
+
+
+def timed_folder(parent: Path, name: str | None = None) -> Path:
+    """Make parent/<time>-<name>/, which no other run has; returns its path. Raises UserError where
+    that cannot be done."""
+    stem = datetime.now().strftime("%Y%m%d-%H%M%S") + (f"-{name}" if name else "")
+    return _make_new(parent, stem)
 
 
 def run_of_job(script: str, config: Config, root: Path = Path("runs")) -> Path | None:
