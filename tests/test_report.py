@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, attempt
+from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round, attempt
 from utils.errors import UserError
 from utils.report import GalleryItem, balanced, write_report
 from utils.result_records import FAILURES
@@ -64,6 +64,21 @@ def test_a_privileged_planner_is_a_bound_not_the_headline(tmp_path, name, contro
     assert "succeed with <strong>heuristic" in page
     assert f"{name}, which knows the true scene: 100 %" in page
     assert f"succeed with <strong>{name}" in report(tmp_path, rounds), "unless it is fair"
+
+
+def test_where_one_object_is_wanted_the_headline_is_the_share_of_targets(tmp_path):
+    """All seven grasps succeed; two of three targets are retrieved, Wilson's interval [21, 94]."""
+    page = report(tmp_path, RETRIEVED)
+    assert re.search(r"<b>67<small> % \[21–94\]</small></b>\s*<span[^>]*>of targets are", page)
+    assert "retrieved with <strong>heuristic</strong>, after 2.5 picks on average" in page
+    measures = re.findall(r'class="measure">([^<]*)', page)
+    assert measures == ["target in hand, %", "success, %"]
+    assert "heuristic: 2 of 3" in page and "heuristic: 7 of 7" in page
+    assert "Target in hand:" not in report(tmp_path)
+    other = [replace(record, policy="lucky", target_in_hand=True) for record in RETRIEVED]
+    other = [replace(record, attempts=(attempt("missed"),)) for record in other]
+    both = report(tmp_path, [*RETRIEVED, *other])
+    assert "retrieved with <strong>lucky" in both, "the best retrieves most"
 
 
 def test_each_depth_noise_has_its_own_cards(tmp_path):

@@ -3,12 +3,13 @@
 import csv
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.helpers.records import CONFIG, OLD, ROUNDS, STOPS, a_round, stopped
+from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round, stopped
 from utils import result_formats
 from utils.report import write_report
 from utils.result_formats import (
@@ -86,19 +87,14 @@ def test_a_closed_loop_s_turns_have_a_column():
 
 
 def test_the_target_has_columns_where_one_was_wanted():
-    """Two of three rounds end with the target in the bin, after 1 and 4 grasps."""
-    ends = [(1, True), (4, True), (2, False)]
-    rounds = [
-        replace(
-            ROUNDS[0], seed=seed, scenario="retrieve", target_in_hand=found,
-            attempts=ROUNDS[0].attempts[:1] * picks, ended="target" if found else "picks",
-        )
-        for seed, (picks, found) in enumerate(ends)
-    ]  # fmt: skip
-    row = summarise(rounds, 0)[0]
+    row = summarise(RETRIEVED, 0)[0]
     assert (row.targets, row.targets_in_hand, row.picks_to_target) == (3, 2, 2.5)
     table = format_table([row]).splitlines()
-    assert "target in hand" in table[0] and "67 % [21, 94] 2/3" in table[2] and "2.5" in table[2]
+    assert re.split("  +", table[0])[3:6] == ["target in hand", "picks to it", "success"]
+    assert "67 % [21, 94] 2/3" in table[2] and "2.5" in table[2]
+    assert "cleared" not in table[0], "a round ends once the target is in hand"
+    both = format_table([row, *summarise(ROUNDS, 0)]).splitlines()
+    assert "cleared" in both[0] and "6/15" not in both[2] and "30 % [11, 60] 3/10" in both[3]
     assert "target" not in format_table(summarise(ROUNDS, 0))
     assert summarise(ROUNDS, 0)[0].target_in_hand_rate is None
 

@@ -82,6 +82,7 @@ def write_report(
         depth_in_words=depth_in_words,
         stops=stop_reasons(rounds),
         reliability=_reliability(rounds),
+        targets_known=any(row.targets for row in rows),
         turns_known=any(row.turn_ms_p95 is not None for row in rows),
         rows=rows,
         columns=columns_of(rows),
@@ -105,8 +106,8 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 
 def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, Any]]:
-    """The rows by (scenario, objects, depth noise), each with its best row and its stacked
-    outcomes."""
+    """The rows by (scenario, objects, depth noise), each with its best row, its measures and its
+    stacked outcomes."""
     cells: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         cells.setdefault((row.scenario, row.objects, row.depth_noise), []).append(row)
@@ -118,9 +119,9 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
             {
                 "scenario": scenario,
                 "objects": _objects_in_words(objects, noise),
-                "rows": cell,
-                "best": best,
-                "bounds": [row for row in bounds if row != best],
+                "best": (best, _headline(best)),
+                "bounds": [(row, _headline(row)) for row in bounds if row != best],
+                "measures": list(zip(*([(row, m) for m in _measures(row)] for row in cell))),
                 "outcomes": [(row, _outcomes(row)) for row in cell],
             }
         )
@@ -137,9 +138,51 @@ def _sees_truth(row: Row, privileged: Collection[str]) -> bool:
     return any(row.policy == policy_name(planner, row.controller) for planner in privileged)
 
 
+@dataclass(frozen=True)
+class _Measure:
+    """A share of a row: what of what, as a title, in words, and in numbers. rate: None of
+    nothing."""
+
+    title: str
+    words: str
+    rate: float | None
+    interval: tuple[float, float]
+    count: int
+    total: int
+
+
+def _measures(row: Row) -> list[_Measure]:
+    """What matters of a row, the headline first. Where one object was wanted, its round ends once
+    it is in hand: what else was cleared says nothing."""
+    success = _Measure(
+        "success", "of grasps succeed", row.success_rate, row.success_ci95, row.successes,
+        row.attempts,
+    )  # fmt: skip
+    if row.targets:
+        in_hand = _Measure(
+            "target in hand", "of targets are retrieved", row.target_in_hand_rate,
+            row.target_in_hand_ci95, row.targets_in_hand, row.targets,
+        )  # fmt: skip
+        return [in_hand, success]
+    cleared = _Measure(
+        "cleared", "of objects are cleared", row.cleared_rate, row.cleared_ci95,
+        row.objects_cleared, row.objects_total,
+    )  # fmt: skip
+    return [success, cleared]
+
+
+def _headline(row: Row) -> _Measure:
+    return _measures(row)[0]
+
+
 def _best(rows: Sequence[Row]) -> Row:
-    """The row with the best success rate."""
-    return max(rows, key=lambda row: -1 if row.success_rate is None else row.success_rate)
+    """The row with the best headline."""
+
+    def rate(row: Row) -> float:
+        known = _headline(row).rate
+        return -1 if known is None else known
+
+    return max(rows, key=rate)
 
 
 def _outcomes(row: Row) -> list[dict[str, Any]]:

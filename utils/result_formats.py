@@ -122,6 +122,12 @@ def failures_in_words(row: Row) -> str:
     return ", ".join(f"{count} {FAILURES[reason]}" for reason, count in counts if count) or "none"
 
 
+def cleared_in_words(row: Row) -> str:
+    """' 50 % [19, 81] 3/6'; '-' where one object was wanted: its round ends once it is in hand."""
+    rate = None if row.targets else row.cleared_rate
+    return _share(rate, row.cleared_ci95, row.objects_cleared, row.objects_total)
+
+
 def firm_in_words(row: Row) -> str:
     """'94 %': share of the attempts in which the object also kept its place in the hand."""
     return f"{100 * row.firm / row.attempts:.0f} %" if row.attempts else "-"
@@ -165,17 +171,6 @@ COLUMNS = (
     TableColumn("depth", lambda row: row.depth_noise, known=lambda row: row.depth_noise != CLEAN),
     TableColumn("rounds", lambda row: str(row.rounds), number=True, printed=False),
     TableColumn(
-        "success",
-        lambda row: _share(row.success_rate, row.success_ci95, row.successes, row.attempts),
-    ),
-    TableColumn("firm", firm_in_words, number=True),
-    TableColumn(
-        "cleared",
-        lambda row: _share(
-            row.cleared_rate, row.cleared_ci95, row.objects_cleared, row.objects_total
-        ),
-    ),
-    TableColumn(
         "target in hand",
         lambda row: _share(
             row.target_in_hand_rate, row.target_in_hand_ci95, row.targets_in_hand, row.targets
@@ -188,6 +183,12 @@ COLUMNS = (
         number=True,
         known=lambda row: row.targets > 0,
     ),
+    TableColumn(
+        "success",
+        lambda row: _share(row.success_rate, row.success_ci95, row.successes, row.attempts),
+    ),
+    TableColumn("firm", firm_in_words, number=True),
+    TableColumn("cleared", cleared_in_words, known=lambda row: row.targets == 0),
     TableColumn(
         "success, cleared of graspable",
         graspable_in_words,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from utils.config import load_config
 from utils.result_records import AttemptRecord, RoundRecord
 
@@ -34,6 +36,16 @@ CONFIG = load_config(
     ["evaluate.policies=heuristic,random", "evaluate.scenarios=pile", "evaluate.rounds=2",
      "evaluate.object_sets=box", "evaluate.depth_noises=none"],
 )  # fmt: skip
+
+# One object was wanted: two of three rounds end with it in the bin, after 1 and 4 grasps.
+RETRIEVED = [
+    replace(
+        a_round("heuristic", seed, 5, 2, [attempt("success")] * picks, "target" if found else
+                "picks", "retrieve"),
+        target_in_hand=found,
+    )
+    for seed, (picks, found) in enumerate([(1, True), (4, True), (2, False)])
+]  # fmt: skip
 
 OLD = "stopped: what was seen last is {} ms old, the watchdog allows 100 ms"
 STOPS = [
