@@ -91,6 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     announce(config, run)
 
     outcome = play(config, run, work)
+    if outcome.error is not None and not outcome.rounds:
+        raise outcome.error
 
     rows = summarise(outcome.rounds, config.seed)
     comparisons = compare(outcome.rounds, config.seed)

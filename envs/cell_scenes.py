@@ -85,6 +85,7 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
     """
     if layout not in LAYOUTS:
         raise SceneError(f"unknown scene layout {layout!r}; allowed are {', '.join(LAYOUTS)}")
+    check_suited(layout, objects, config)
     rng = np.random.default_rng([seed, LAYOUTS.index(layout)])
     arrange = _ARRANGEMENTS[layout]
     count = _COUNTS.get(layout, config.scene.count)
@@ -122,13 +123,7 @@ def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:
     """Numbers (count,) of objects of mixed sizes, in random order: those that the hand spans where
     they are narrowest are sorted by that width and cut into `count` equal parts, and one is drawn
     from each. No object is scaled, so that sizes and masses are true."""
-    widest = config.gripper.max_opening - 2 * RELAXED.room
-    fitting = objects.by_width(widest)
-    if not fitting:
-        raise SceneError(
-            f"no object of {objects.name!r} is less than {widest:.3f} m wide, so that the hand "
-            "spans none; use smaller objects (objects.scale, objects.fit)"
-        )
+    fitting = objects.by_width(_widest(config))
     places = (np.arange(count) + rng.uniform(size=count)) * len(fitting) / count
     return rng.permutation(np.array(fitting)[places.astype(int)])
 
@@ -159,17 +154,35 @@ def _covered(placements: tuple[Placement, ...], config: Config) -> int | None:
 def _suited(objects: ObjectSet, count: int, rng, layout: str) -> np.ndarray:
     """Numbers (count,) of objects of a shape that belongs into the layout, drawn without repetition
     while the set has enough of them."""
-    suits, what = _SUITED[layout]
+    suits, _ = _SUITED[layout]
     found = list(itertools.islice(
         (index for index in rng.permutation(len(objects)).tolist()
          if suits(np.sort(objects[index].extents))), count
     ))  # fmt: skip
-    if not found:
-        raise SceneError(
-            f"no object of {objects.name!r} is {what}, as the layout {layout} needs it; use the "
-            f"set {'flat' if layout == 'flat' else 'tall'}"
-        )
     return np.resize(found, count)
+
+
+def check_suited(layout: str, objects: ObjectSet, config: Config) -> None:
+    """Raise SceneError for a set of which no object belongs into a layout."""
+    if layout == "household":
+        widest = _widest(config)
+        if not any(model.narrowest <= widest for model in objects):
+            raise SceneError(
+                f"no object of {objects.name!r} is less than {widest:.3f} m wide, so that the hand "
+                "spans none; use smaller objects (objects.scale, objects.fit)"
+            )
+    elif layout in _SUITED:
+        suits, what = _SUITED[layout]
+        if not any(suits(np.sort(model.extents)) for model in objects):
+            raise SceneError(
+                f"no object of {objects.name!r} is {what}, as the layout {layout} needs it; use "
+                f"the set {'flat' if layout == 'flat' else 'tall'}"
+            )
+
+
+def _widest(config: Config) -> float:
+    """m, of what the hand spans with relaxed margins."""
+    return config.gripper.max_opening - 2 * RELAXED.room
 
 
 def _walls_around(config: Config) -> tuple[Box, ...]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from envs.cell import require_arm
-from envs.cell_scenes import TARGET_LAYOUT, make_scene
+from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
 from envs.policy_approach import (
@@ -85,6 +85,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
         for name, objects in sets.items():
             if name not in OBJECT_SETS:
                 prepare(objects, workers, config.gripper.geometry)
+            for scenario in config.evaluate.scenarios:
+                check_suited(SCENARIOS[scenario].layout, objects, config)
 
 
 def privileged_policies(config: Config) -> set[str]:

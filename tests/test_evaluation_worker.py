@@ -30,3 +30,11 @@ def test_a_planner_that_cannot_tell_objects_apart_does_not_retrieve(config):
     with pytest.raises(UserError, match="random does not tell objects apart.*play 'retrieve'"):
         check_everything(asked("random"))
     check_everything(asked("heuristic"))
+
+
+@pytest.mark.parametrize(("layout", "what"), [("flat", "0.016 m thick"), ("tall", "0.12 m long")])
+def test_a_set_of_which_no_object_suits_a_layout_is_refused_before_any_round(config, layout, what):
+    """A cube of 6 cm is neither flat nor tall."""
+    changes = {"policies": ("random",), "scenarios": ("pile", layout), "object_sets": ("box",)}
+    with pytest.raises(UserError, match=f"no object of 'box' is .*{what}.* use the set {layout}"):
+        check_everything(with_settings(config, "evaluate", changes))
