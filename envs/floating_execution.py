@@ -46,9 +46,10 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     """
     hand = floating_hand(cell)
     cell.check_physics()
-    start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
+    start, held, motion = cell.seconds, None, None
+    reason, met, detail = "success", "", ""
     try:
-        _approach(cell, hand, grasp)
+        met = _approach(cell, hand, grasp)
         hand.yield_to_fingers()
         close_fingers(cell, cell.step)
         hand.hold()
@@ -57,7 +58,7 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
         _retreat(cell, hand, grasp)
         _judge(cell, hand, held, motion)
     except GraspFailure as failure:
-        reason, detail = failure.reason, failure.detail
+        reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
     stopped_at = None
     if reason == "collision" and hand.palm_touches():
         stopped_at = hand.tip_pose()[:3, 3].copy()
@@ -75,22 +76,28 @@ def floating_hand(cell: Cell) -> FloatingHand:
     return cast(FloatingHand, cell.robot)
 
 
-def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
-    """Raises GraspFailure where the hand meets something."""
+def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> str:
+    """Bring the open hand to a grasp; where it met something on its way and closes there, says
+    how far before the grasp. Raises GraspFailure where a contact is a collision."""
     pregrasp = grasp.pose
     pregrasp[:3, 3] -= PREGRASP * grasp.approach
     hand.put(pregrasp, cell.gripper.opening_before(grasp.width))
     if hand.overlaps():
-        raise GraspFailure("collision", "there is something where the hand starts")
+        raise GraspFailure(
+            "collision",
+            f"the open hand has no room where it starts, {1000 * PREGRASP:.0f} mm before the grasp",
+        )
     for q, velocity in zip(*hand.line(grasp.position, cell.config.execution.approach_speed)):
         hand.command(q, velocity)
         cell.step()
         if hand.contact_force() > 0.0:
-            if cell.config.execution.on_contact == "grip":
-                hand.hold()
-                return
             left = float((grasp.position - hand.tip_pose()[:3, 3]) @ grasp.approach)
-            raise GraspFailure("collision", f"{1000 * left:.0f} mm before the grasp")
+            met = f"the open hand met something {1000 * left:.0f} mm before the grasp"
+            if cell.config.execution.on_contact == "fail":
+                raise GraspFailure("collision", met)
+            hand.hold()
+            return f"{met} and closed there"
+    return ""
 
 
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
@@ -111,7 +118,11 @@ def _judge(
         raise GraspFailure("slipped")
     least = LEAST_WIDTH * hand.max_opening
     if hand.opening <= least:
-        raise GraspFailure("missed", f"{1000 * hand.opening:.1f} mm wide, under {1000 * least:g}")
+        raise GraspFailure(
+            "missed",
+            f"the fingers are {1000 * hand.opening:.1f} mm apart after the retreat, where "
+            f"{1000 * least:g} mm or less count as empty",
+        )
     motion.look()
     moved = loose(motion.turned, motion.slid)
     if moved and cell.config.execution.strict:

@@ -99,9 +99,9 @@ def test_report_refuses_bad_videos(tmp_path):
 
 def test_what_stopped_the_arm_is_on_the_page(tmp_path):
     page = report(tmp_path, [*ROUNDS, *STOPS])
-    assert "What stopped the arm" in page and OLD.format(104) in page and "8.0, 14.0" in page
+    assert "Why attempts failed" in page and OLD.format(104) in page and "8.0, 14.0" in page
     without = report(tmp_path)
-    assert "What stopped the arm" not in without and "turn ms" not in without
+    assert "Why attempts failed" not in without and "turn ms" not in without
 
 
 def test_half_of_the_pictures_are_failures_of_each_policy_in_turn():
