@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round, attempt
+from utils.config import with_settings
 from utils.errors import UserError
 from utils.report import GalleryItem, balanced, write_report
 from utils.result_records import FAILURES
 from utils.results import compare, summarise
 from utils.runs import REPOSITORY
+from utils.transforms import ImageGrasp
 
 
 def report(tmp_path, rounds=ROUNDS, **more) -> str:
@@ -79,6 +81,20 @@ def test_where_one_object_is_wanted_the_headline_is_the_share_of_targets(tmp_pat
     other = [replace(record, attempts=(attempt("missed"),)) for record in other]
     both = report(tmp_path, [*RETRIEVED, *other])
     assert "retrieved with <strong>lucky" in both, "the best retrieves most"
+
+
+def test_a_floating_hands_chances_are_said_to_be_the_arms(tmp_path):
+    graded = attempt("success"), attempt("missed")
+    seen = ImageGrasp(pixel=np.zeros(2), angle=0.0, width=0.05, depth=0.5, quality=0.9)
+    graded = [replace(one, grasp=seen) for one in graded]
+    rounds = [replace(a_round("heuristic", 0, 2, 1, graded), calibration=(1.0, 0.0))]
+    words = "for the floating hand they are scores that only rank"
+    for arm, said in (("none", True), ("panda", False)):
+        config = with_settings(CONFIG, "robot", {"arm": arm})
+        path = tmp_path / f"{arm}.html"
+        write_report(path, summarise(rounds, 0), rounds, [], config)
+        page = path.read_text(encoding="utf-8")
+        assert "How sure the planners are" in page and (words in page) == said
 
 
 def test_each_depth_noise_has_its_own_cards(tmp_path):

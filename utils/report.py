@@ -82,6 +82,7 @@ def write_report(
         depth_in_words=depth_in_words,
         stops=stop_reasons(rounds),
         reliability=_reliability(rounds),
+        has_arm=config.robot.arm != "none",
         targets_known=any(row.targets for row in rows),
         turns_known=any(row.turn_ms_p95 is not None for row in rows),
         rows=rows,
