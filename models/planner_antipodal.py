@@ -49,7 +49,8 @@ class SearchPlanner:
         self.settings = settings or SearchSettings()
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
-        """The map from above of a frame, cut into objects as the planner sees them."""
+        """The map from above of a frame that is corrected by its table, cut into objects as the
+        planner sees them."""
         raise NotImplementedError
 
     def segments(self, frame: RGBDFrame) -> np.ndarray:

@@ -183,6 +183,7 @@ class GraspNetPlanner(SearchPlanner):
         self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace)
         heights = only_target(seen.heights, frame)
         return self.grasps(self.search(heights, partial(seen.value, heights)))
@@ -201,6 +202,7 @@ class GraspNetDirectPlanner(GraspNetPlanner):
     """
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, crop=True)
         heights = only_target(seen.heights, frame)
         value = partial(seen.value, heights)
@@ -252,6 +254,7 @@ class GraspNetFanPlanner(FanPlanner):
         self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace)
         overhead = only_target(seen.heights, frame)
         filled, hiding = without_holes(seen.frame, self.workspace)
@@ -268,16 +271,16 @@ class GraspNetFanPlanner(FanPlanner):
 class NetworkView:
     """What a network tells about a frame: heights with its objects, and the quality of candidates.
 
-    frame: corrected by its table, holes of its depth filled where colours tell what is there.
-    heights: the map from above. crop: whether only the part of the image is looked at in which
-    something stands. Raises UserError for an image that the network cannot take.
+    The given frame is corrected by its table (`utils.depth_correction`). frame: the same, holes of
+    its depth filled where colours tell what is there. heights: the map from above. crop: whether
+    only the part of the image is looked at in which something stands. Raises UserError for an image
+    that the network cannot take.
     """
 
     def __init__(
         self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace, crop: bool = False
     ):
         model, metres_per_pixel, *_ = network
-        frame = corrected(frame, workspace.table_height)
         self._scaling = training_scale(frame, metres_per_pixel)
         if crop:
             frame = around_matter(frame, workspace.table_height)

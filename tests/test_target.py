@@ -10,6 +10,7 @@ import pytest
 from models.planner_antipodal import SearchPlanner
 from models.planners import PLANNERS, HeuristicPlanner, make_planner, takes_targets
 from tests.helpers.box_frames import boxes_frame
+from utils import depth_correction
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import OTHER_LABEL, height_map_from_frame
@@ -144,6 +145,26 @@ def test_nothing_else_is_between_the_fingers(name: str) -> None:
     for grasp in grasps:
         if abs(grasp.closing_direction[1]) > 0.9:  # across the box; pads are 2 cm wide
             assert abs(grasp.position[0] - 0.5) > 0.010
+
+
+@pytest.mark.parametrize("name", [name for name in SEARCHING if not name.startswith("oracle")])
+def test_a_rough_frame_is_smoothed_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depth with 6 mm of noise at each pixel is still rough after a filter that does nothing."""
+    calls = []
+
+    def smoothed(frame: RGBDFrame) -> np.ndarray:
+        calls.append(name)
+        return frame.depth
+
+    monkeypatch.setattr(depth_correction, "smoothed_by_colour", smoothed)
+    frame = two_boxes()
+    noise = np.random.default_rng(0).normal(0.0, 0.006, frame.depth.shape)
+    frame = replace(frame, depth=(frame.depth + noise).astype(np.float32))
+    plan = make_planner(name, GripperGeometry(), Workspace(), 0)
+    plan.segments(frame)
+    assert len(calls) == 1
+    plan(frame)
+    assert len(calls) == 2
 
 
 def test_the_random_planner_takes_no_targets() -> None:
