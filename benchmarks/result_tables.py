@@ -13,11 +13,27 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
+from benchmarks.table_cells import (
+    Figures,
+    Say,
+    cleared,
+    decimal,
+    metrics_table,
+    noise_of,
+    noises_of,
+    origin,
+    planner_cells,
+    points,
+    rate,
+    rounds_in_words,
+    rows_of,
+    success,
+    table,
+    with_depths,
+)
 from utils.result_records import CLEAN
 from utils.runs import write_atomic
-from utils.statistics import wilson_interval
 
 PAGES = (
     "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/graspnet.md",
@@ -25,9 +41,6 @@ PAGES = (
     "docs/scaling.md", "docs/reliability.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
-
-Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
-Say = Callable[[str], str]  # a word in the page's language
 
 _SURVEY = "arXiv 2507.18847, tables I and II"
 # Success per attempt and objects removed, as published; none of these systems moves a whole arm in
@@ -111,99 +124,6 @@ def with_tables(text: str, folder: Path, chinese: bool = False) -> str:
     return _BLOCK.sub(block, text)
 
 
-# --- Cells ------------------------------------------------------------------------------------
-
-
-def rate(successes: int, trials: int) -> str:
-    """'97 % [95, 98] (488/502)', with the 95 % Wilson interval; '-' of nothing."""
-    if trials == 0:
-        return "-"
-    low, high = (100 * bound for bound in wilson_interval(successes, trials))
-    return f"{100 * successes / trials:.0f} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
-
-
-def success(row: Figures) -> str:
-    return rate(row["successes"], row["attempts"])
-
-
-def cleared(row: Figures) -> str:
-    return rate(row["objects_cleared"], row["objects_total"])
-
-
-def points(difference: Figures | None) -> str:
-    """'+1.5 [+0.7, +2.2]' percentage points."""
-    if difference is None:
-        return "-"
-    value, low, high = (100 * difference[key] for key in ("value", "low", "high"))
-    if value == low == high == 0:
-        return "0 (alike in every round)"
-    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
-
-
-def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    rows = [header, ["---"] * len(header), *lines]
-    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
-
-
-def with_depths(
-    header: Sequence[str],
-    lines: Sequence[Sequence[str]],
-    noises: Sequence[str],
-    place: int,
-    say: Say = str,
-) -> str:
-    """A Markdown table whose first rows have these depth noises, in column number `place`; the
-    column is left out where there is no noise."""
-    if set(noises) <= {CLEAN}:
-        return table(header, lines)
-    column = [say("depth"), *(f"`{noise}`" for noise in noises), *["-"] * len(lines)]
-    wider = [[*line[:place], cell, *line[place:]] for line, cell in zip([header, *lines], column)]
-    return table(wider[0], wider[1:])
-
-
-def metrics_table(metrics: Figures) -> str:
-    """What a benchmark reports, as a Markdown table."""
-    lines = [
-        [f"`{name}`", f"{one['value']:.3g} {one['unit']}", one["target"] or "-",
-         {True: "yes", False: "no", None: "-"}[one["holds"]]]
-        for name, one in metrics.items()
-    ]  # fmt: skip
-    return table(["what", "measured", "aim", "reached"], lines)
-
-
-def origin(say: Say, *parts: Figures) -> str:
-    """The line under a table: commit, date, seed, and each command with the rounds of its rows."""
-    said = []
-    for part in parts:
-        commands = "; ".join(
-            f"`{one['command']}`{_rounds(say, one)}" for one in part["commands"].values()
-        )
-        said.append(
-            f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']}), "
-            f"{_seed(say, part)}{commands}</sub>"
-        )
-    return "\n".join(said)
-
-
-def _seed(say: Say, part: Figures) -> str:
-    """'seed 2027: ', or nothing for benchmarks, whose scenes have seeds of their own."""
-    seeded = any("seed=" in one["command"] for one in part["commands"].values())
-    return f"{say('seed')} {part['seed']}: " if seeded else ""
-
-
-def _rounds(say: Say, command: Figures) -> str:
-    """' (30 rounds a row)', or nothing for what has no rounds."""
-    counts = sorted({row["rounds"] for row in command.get("rows", ()) if "rounds" in row})
-    return f" ({say('{} rounds a row').format(' / '.join(map(str, counts)))})" if counts else ""
-
-
-def rows_of(part: Figures, command: str | None = None) -> list[Figures]:
-    """The rows of a part's command, the first one by default."""
-    commands = part["commands"]
-    return commands[command or next(iter(commands))]["rows"]
-
-
 # --- Tables -----------------------------------------------------------------------------------
 
 
@@ -211,7 +131,7 @@ def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
     """The README's: four planners on piles of 5 and of 15 objects, noisy rows first, and published
     systems."""
     few, many = (
-        {(_noise(row), row["policy"]): [success(row), cleared(row)] for row in rows}
+        {(noise_of(row), row["policy"]): [success(row), cleared(row)] for row in rows}
         for rows in (
             [row for row in rows_of(scoreboard) if _is(row, "pile", "random_urdfs")],
             rows_of(clutter),
@@ -225,7 +145,7 @@ def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
         lines.append([say(name), *five, *fifteen])
     noises = [noise for noise, _ in kinds]
     pair = _pair(clutter, "graspnet", "heuristic")
-    noisy = "" if _noise(pair) == CLEAN else say(" with `{}` depth").format(_noise(pair))
+    noisy = "" if noise_of(pair) == CLEAN else say(" with `{}` depth").format(noise_of(pair))
     ahead = say(_AHEAD).format(noisy, points(pair["success"]))
     others = say("In real bins of 300 objects AnyGrasp reaches 93 %.")
     below = f"{ahead} {others} {_short(say, scoreboard, clutter)}"
@@ -242,8 +162,8 @@ def published(say: Say) -> str:
 def scoreboard(say: Say, part: Figures) -> str:
     header = ["objects", "scenario", "planner", "success", "cleared", "picks an hour"]
     rows = [row for command in part["commands"].values() for row in command["rows"]]
-    lines = [[f"`{row['objects']}`", row["scenario"], *_planner_cells(row)] for row in rows]
-    return "\n\n".join([with_depths(header, lines, _noises(rows), 2), origin(say, part)])
+    lines = [[f"`{row['objects']}`", row["scenario"], *planner_cells(row)] for row in rows]
+    return "\n\n".join([with_depths(header, lines, noises_of(rows), 2), origin(say, part)])
 
 
 def differences(say: Say, part: Figures) -> str:
@@ -259,7 +179,7 @@ def differences(say: Say, part: Figures) -> str:
         for pair in pairs
     ]
     header = ["objects", "scenario", "success, points", "cleared, points"]
-    return "\n\n".join([with_depths(header, lines, _noises(pairs), 2), origin(say, part)])
+    return "\n\n".join([with_depths(header, lines, noises_of(pairs), 2), origin(say, part)])
 
 
 def variants(say: Say, part: Figures) -> str:
@@ -277,7 +197,7 @@ def variants(say: Say, part: Figures) -> str:
         for pair in pairs
     ]  # fmt: skip
     header = ["objects", "scenario", "difference", "success, points", "cleared, points"]
-    beside = with_depths(header, lines, _noises(pairs), 2)
+    beside = with_depths(header, lines, noises_of(pairs), 2)
     return "\n\n".join([scoreboard(say, part), beside])
 
 
@@ -285,17 +205,17 @@ def retrieve(say: Say, part: Figures) -> str:
     rows = rows_of(part)
     lines = [
         [f"`{row['objects']}`", f"`{row['policy']}`",
-         rate(row["targets_in_hand"], row["targets"]), _decimal(row["picks_to_target"])]
+         rate(row["targets_in_hand"], row["targets"]), decimal(row["picks_to_target"])]
         for row in rows
     ]  # fmt: skip
     header = ["objects", "planner", "target in hand", "picks to it"]
-    return "\n\n".join([with_depths(header, lines, _noises(rows), 1), origin(say, part)])
+    return "\n\n".join([with_depths(header, lines, noises_of(rows), 1), origin(say, part)])
 
 
 def calibration(say: Say, part: Figures) -> str:
     """What each planner stated, what came of it, and how far both are apart in ten bins."""
     lines = [
-        [f"`{one['policy']}`", simulator, _noise(one), one["grasps"], f"{one['chance']:.3f}",
+        [f"`{one['policy']}`", simulator, noise_of(one), one["grasps"], f"{one['chance']:.3f}",
          f"{one['success']:.3f}", f"{one['error']:.3f}"]
         for simulator, command in part["commands"].items()
         for one in command["calibration"]
@@ -307,8 +227,8 @@ def calibration(say: Say, part: Figures) -> str:
 
 def clutter15(say: Say, part: Figures) -> str:
     header = ["planner", "success", "cleared", "picks an hour"]
-    lines = [_planner_cells(row) for row in rows_of(part)]
-    return "\n\n".join([with_depths(header, lines, _noises(rows_of(part)), 1), origin(say, part)])
+    lines = [planner_cells(row) for row in rows_of(part)]
+    return "\n\n".join([with_depths(header, lines, noises_of(rows_of(part)), 1), origin(say, part)])
 
 
 def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
@@ -319,8 +239,8 @@ def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
         for row in command["rows"]:
             cells.setdefault(_key(row), {})[name] = success(row)
     for row in rows_of(scoreboard):
-        cells.get(_key(row), {})[_noise(row)] = success(row)
-    noises = dict.fromkeys([*_noises(rows_of(scoreboard)), *part["commands"]])
+        cells.get(_key(row), {})[noise_of(row)] = success(row)
+    noises = dict.fromkeys([*noises_of(rows_of(scoreboard)), *part["commands"]])
     lines = [
         [f"`{objects}`", scenario, f"`{policy}`", *(of.get(noise, "-") for noise in noises)]
         for (policy, scenario, objects), of in cells.items()
@@ -462,20 +382,10 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
 }
 
 
-def _decimal(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
-
-
-def _planner_cells(row: Figures) -> list[str]:
-    an_hour = row["picks_per_hour"]
-    picks = "-" if an_hour is None else f"{an_hour:.0f}"
-    return [f"`{row['policy']}`", success(row), cleared(row), picks]
-
-
 def _short(say: Say, few: Figures, many: Figures) -> str:
     origins = "; ".join(
         f"{say(objects)}: {say('measured at commit')} `{part['commit'][:10]}`, {say('seed')} "
-        f"{part['seed']}{_rounds(say, next(iter(part['commands'].values())))}"
+        f"{part['seed']}{rounds_in_words(say, next(iter(part['commands'].values())))}"
         for objects, part in (("5 objects", few), ("15 objects", many))
     )
     return f"<sub>{origins}; 95 % Wilson; [docs/results.md](docs/results.md)</sub>"
@@ -489,15 +399,6 @@ def _pair(part: Figures, first: str, second: str) -> Figures:
 
 def _is(row: Figures, scenario: str, objects: str) -> bool:
     return (row["scenario"], row["objects"]) == (scenario, objects)
-
-
-def _noise(row: Figures) -> str:
-    """The depth noise of a row or a pair; older figures do not name it."""
-    return row.get("depth_noise", CLEAN)
-
-
-def _noises(rows: Sequence[Figures]) -> list[str]:
-    return [_noise(row) for row in rows]
 
 
 def _key(row: Figures) -> tuple[str, str, str]:

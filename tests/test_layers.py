@@ -96,3 +96,9 @@ def test_no_script_imports_another(script):
         )
     }  # fmt: skip
     assert not imported & {*SCRIPTS, "tests", "benchmarks"}
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_can_be_read_at_a_sitting(script):
+    """CONTRIBUTING.md allows it 250 lines."""
+    assert len((ROOT / f"{script}.py").read_text(encoding="utf-8").splitlines()) <= 250

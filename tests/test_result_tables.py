@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks import results
-from benchmarks.result_tables import PAGES, TABLES, rate, with_tables, write_tables
+from benchmarks.result_tables import PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import PARTS, chosen_parts, main
+from benchmarks.table_cells import rate
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError

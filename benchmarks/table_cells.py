@@ -1,0 +1,133 @@
+"""Cells, Markdown and origins, of which `benchmarks.result_tables` makes the tables of the pages.
+
+Figures are plain data, as docs/results/*.json hold them. This module knows no single table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from utils.result_records import CLEAN
+from utils.statistics import wilson_interval
+
+Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
+Say = Callable[[str], str]  # a word in the page's language
+
+
+# --- Cells ------------------------------------------------------------------------------------
+
+
+def rate(successes: int, trials: int) -> str:
+    """'97 % [95, 98] (488/502)', with the 95 % Wilson interval; '-' of nothing."""
+    if trials == 0:
+        return "-"
+    low, high = (100 * bound for bound in wilson_interval(successes, trials))
+    return f"{100 * successes / trials:.0f} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
+
+
+def success(row: Figures) -> str:
+    return rate(row["successes"], row["attempts"])
+
+
+def cleared(row: Figures) -> str:
+    return rate(row["objects_cleared"], row["objects_total"])
+
+
+def points(difference: Figures | None) -> str:
+    """'+1.5 [+0.7, +2.2]' percentage points."""
+    if difference is None:
+        return "-"
+    value, low, high = (100 * difference[key] for key in ("value", "low", "high"))
+    if value == low == high == 0:
+        return "0 (alike in every round)"
+    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def decimal(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def planner_cells(row: Figures) -> list[str]:
+    an_hour = row["picks_per_hour"]
+    picks = "-" if an_hour is None else f"{an_hour:.0f}"
+    return [f"`{row['policy']}`", success(row), cleared(row), picks]
+
+
+def noise_of(row: Figures) -> str:
+    """The depth noise of a row or a pair; older figures do not name it."""
+    return row.get("depth_noise", CLEAN)
+
+
+def noises_of(rows: Sequence[Figures]) -> list[str]:
+    return [noise_of(row) for row in rows]
+
+
+# --- Markdown ---------------------------------------------------------------------------------
+
+
+def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    rows = [header, ["---"] * len(header), *lines]
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+
+
+def with_depths(
+    header: Sequence[str],
+    lines: Sequence[Sequence[str]],
+    noises: Sequence[str],
+    place: int,
+    say: Say = str,
+) -> str:
+    """A Markdown table whose first rows have these depth noises, in column number `place`; the
+    column is left out where there is no noise."""
+    if set(noises) <= {CLEAN}:
+        return table(header, lines)
+    column = [say("depth"), *(f"`{noise}`" for noise in noises), *["-"] * len(lines)]
+    wider = [[*line[:place], cell, *line[place:]] for line, cell in zip([header, *lines], column)]
+    return table(wider[0], wider[1:])
+
+
+def metrics_table(metrics: Figures) -> str:
+    """What a benchmark reports, as a Markdown table."""
+    lines = [
+        [f"`{name}`", f"{one['value']:.3g} {one['unit']}", one["target"] or "-",
+         {True: "yes", False: "no", None: "-"}[one["holds"]]]
+        for name, one in metrics.items()
+    ]  # fmt: skip
+    return table(["what", "measured", "aim", "reached"], lines)
+
+
+# --- Origin -----------------------------------------------------------------------------------
+
+
+def origin(say: Say, *parts: Figures) -> str:
+    """The line under a table: commit, date, seed, and each command with the rounds of its rows."""
+    said = []
+    for part in parts:
+        commands = "; ".join(
+            f"`{one['command']}`{rounds_in_words(say, one)}" for one in part["commands"].values()
+        )
+        said.append(
+            f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']}), "
+            f"{_seed(say, part)}{commands}</sub>"
+        )
+    return "\n".join(said)
+
+
+def _seed(say: Say, part: Figures) -> str:
+    """'seed 2027: ', or nothing for benchmarks, whose scenes have seeds of their own."""
+    seeded = any("seed=" in one["command"] for one in part["commands"].values())
+    return f"{say('seed')} {part['seed']}: " if seeded else ""
+
+
+def rounds_in_words(say: Say, command: Figures) -> str:
+    """' (30 rounds a row)', or nothing for what has no rounds."""
+    counts = sorted({row["rounds"] for row in command.get("rows", ()) if "rounds" in row})
+    return f" ({say('{} rounds a row').format(' / '.join(map(str, counts)))})" if counts else ""
+
+
+def rows_of(part: Figures, command: str | None = None) -> list[Figures]:
+    """The rows of a part's command, the first one by default."""
+    commands = part["commands"]
+    return commands[command or next(iter(commands))]["rows"]
