@@ -77,15 +77,29 @@ def test_a_large_box_is_not_taken_for_the_table() -> None:
 @pytest.mark.parametrize("height", [0.01, 0.02, 0.03])
 def test_a_known_board_is_not_taken_for_the_table(height: float) -> None:
     """It covers two thirds of the table that is seen, or all of it; without its place its top is
-    the table."""
+    the table where nothing else is seen."""
     for side in (0.36, 1.0):
         frame = boxes_frame([((side, side, height), 0.0, (0.5, 0.0))], walls=1)
         knowing = replace(frame, fixtures=frame.truth.walls)
         assert scale_to_table(knowing, 0.0) == pytest.approx(1.0, abs=1e-4)
-        assert scale_to_table(frame, 0.0) == pytest.approx(0.8 / (0.8 - height), abs=5e-3)
+        alone = 1.0 if side == 0.36 else 0.8 / (0.8 - height)
+        assert scale_to_table(frame, 0.0) == pytest.approx(alone, abs=5e-3)
     frame = boxes_frame([((0.36, 0.36, height), 0.0, (0.5, 0.0))], walls=1)
     scaled = replace(frame, depth=frame.depth * np.float32(0.95), fixtures=frame.truth.walls)
     assert scale_to_table(scaled, 0.0) == pytest.approx(1 / 0.95, abs=1e-4)
+
+
+@pytest.mark.parametrize("height", [0.015, 0.03, 0.05])
+@pytest.mark.parametrize("scale", [0.97, 1.0, 1.05])
+def test_what_has_a_flat_surface_under_it_is_not_the_table(height: float, scale: float) -> None:
+    """A board that nobody knows leaves a quarter of the image to the table. The camera measures all
+    depths `scale` times too far, with 2 mm of noise at each pixel."""
+    frame, rng = scene(), np.random.default_rng(0)
+    depth = np.full_like(frame.depth, EYE - height)
+    depth[:, : SIZE // 4] = EYE
+    depth = scale * (depth + rng.normal(0, 0.002, depth.shape)).astype(np.float32)
+    found = scale_to_table(replace(frame, depth=depth.astype(np.float32)), 0.0)
+    assert found == pytest.approx(1 / scale, abs=1e-3)
 
 
 @pytest.mark.parametrize("x", [0.2, 0.5, -0.5])

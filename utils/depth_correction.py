@@ -41,6 +41,8 @@ def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
 
     Each pixel asks for a factor; those of the table ask for the same one. It is the densest of all,
     weighted by how likely a camera is to be that wrong, because the top of a box asks alike, too.
+    But nothing lies under a table: where a flat surface is seen beneath that one, it is the table,
+    and what asked alike was the top of something wide.
     """
     asked = _ratio_to_table(frame, table_height)
     least = _LEAST_SHARE * len(asked)
@@ -52,6 +54,11 @@ def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
     middle = (edges[1:] + edges[:-1]) / 2
     density = cv2.GaussianBlur(count[None], (0, 0), _BLUR / _BIN)[0]
     best = float(middle[(density * np.exp(-(((middle - 1) / SCALE_SPREAD) ** 2) / 2)).argmax()])
+    peaks = middle[1:-1][(density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])]
+    for lower in peaks[peaks < best - 2 * _BLUR]:  # the farthest first
+        if (np.abs(asked - lower) < 2 * _BLUR).sum() > least:
+            best = float(lower)
+            break
     for _ in range(_REFITS):
         alike = asked[np.abs(asked - best) < 2 * _BLUR]
         if len(alike) <= least:
