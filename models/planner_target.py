@@ -26,17 +26,19 @@ class ClearingSettings:
     """When to take the target, and what is in its way; metres unless said.
 
     promising: least chance of success with which the target, or what is in its way, is grasped
-    while there is an alternative. near: a surface at this distance from the target, seen from
-    above, counts exp(-1) of one right beside it. over: height over the target at which it counts in
-    full. beside: what a surface counts that is not over the target. in_the_way: cm2 of such surface
-    from which an object is in the way. covering: cm2 of surface over the target and half as near,
-    from which an object may rest on it, so that it goes first even where the target's grasps look
-    promising. points: of each object that are looked at. enough: objects with promising grasps
-    after which the search for others ends; one more than is needed, for the case that a grasp
-    fails.
+    while there is an alternative. share: the same for planners whose qualities are scores, as a
+    share of the best score in the whole scene: of such scores only the order means anything. near:
+    a surface at this distance from the target, seen from above, counts exp(-1) of one right beside
+    it. over: height over the target at which it counts in full. beside: what a surface counts that
+    is not over the target. in_the_way: cm2 of such surface from which an object is in the way.
+    covering: cm2 of surface over the target and half as near, from which an object may rest on it,
+    so that it goes first even where the target's grasps look promising. points: of each object that
+    are looked at. enough: objects with promising grasps after which the search for others ends; one
+    more than is needed, for the case that a grasp fails.
     """
 
     promising: float = 0.9
+    share: float = 0.1  # on training scenes it decides as 0.9 does where chances are known
     near: float = 0.02
     over: float = 0.02
     beside: float = 0.2
@@ -69,7 +71,8 @@ class TargetPlanner:
         if frame.target is None:
             return self.plan(frame)
         grasps = self.plan(frame) if frame.target.any() else []
-        clearing, least = self.clearing(frame, grasps), self.settings.promising
+        objects = self._objects(frame)
+        clearing, least = self._clearing(objects, grasps), objects.promising
         first = [grasp for grasp in clearing if grasp.quality >= least]
         others = [grasp for grasp in clearing if grasp.quality < least]
         return [*first, *sorted([*grasps, *others], key=lambda grasp: -grasp.quality)]
@@ -77,17 +80,26 @@ class TargetPlanner:
     def clearing(self, frame: RGBDFrame, grasps: list[Grasp]) -> list[Grasp]:
         """Grasps that move aside what is in the way of the target, the promising ones of the object
         most in the way first; where its own `grasps` are promising, only of what may rest on it."""
+        return self._clearing(self._objects(frame), grasps)
+
+    def _objects(self, frame: RGBDFrame) -> _Objects:
         segments = self.plan.segments(frame)  # type: ignore[attr-defined]
-        objects = _Objects(frame, segments, self.settings)
+        promising = self.settings.promising
+        if self.calibration is None:
+            best = self.plan(replace(frame, target=None))[:1]
+            promising = self.settings.share * best[0].quality if best else 0.0
+        return _Objects(frame, segments, self.settings, promising)
+
+    def _clearing(self, objects: _Objects, grasps: list[Grasp]) -> list[Grasp]:
         shown = objects.surface(objects.target)
         if len(shown):
             self._last = shown
-        if self._promising(grasps):
+        if objects.promise(grasps):
             return self._grasps_of(objects, objects.covering(self._last))[0]
-        promising, others = self._clearing(objects)
+        promising, others = self._around(objects)
         return [*promising, *sorted(others, key=lambda grasp: -grasp.quality)]
 
-    def _clearing(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
+    def _around(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
         """Promising grasps and others of what is in the target's way, of the object most in the way
         first; where none is promising, of what is in the way of these objects, and so on."""
         ring, visited, others = [self._last], set(), []
@@ -107,27 +119,30 @@ class TargetPlanner:
         promising, others, enough = [], [], self.settings.enough
         for number in numbers:
             found = self.plan(replace(objects.frame, target=objects.labels == number))
-            least = self.settings.promising
-            promising += [grasp for grasp in found if grasp.quality >= least]
-            others += [grasp for grasp in found if grasp.quality < least]
-            enough -= self._promising(found)
+            promising += [grasp for grasp in found if grasp.quality >= objects.promising]
+            others += [grasp for grasp in found if grasp.quality < objects.promising]
+            enough -= objects.promise(found)
             if enough == 0:
                 break
         return promising, others
-
-    def _promising(self, grasps: list[Grasp]) -> bool:
-        return bool(grasps) and grasps[0].quality >= self.settings.promising
 
 
 class _Objects:
     """The objects of a frame but the target, as a planner tells them apart.
 
-    labels: (H, W) numbers of the objects, -1 elsewhere.
+    labels: (H, W) numbers of the objects, -1 elsewhere. promising: least quality of a grasp that is
+    worth trying while there is an alternative.
     """
 
-    def __init__(self, frame: RGBDFrame, segments: np.ndarray, settings: ClearingSettings):
+    def __init__(
+        self,
+        frame: RGBDFrame,
+        segments: np.ndarray,
+        settings: ClearingSettings,
+        promising: float,
+    ):
         assert frame.target is not None
-        self.frame, self.settings = frame, settings
+        self.frame, self.settings, self.promising = frame, settings, promising
         self.target = frame.target
         self.labels = np.where(frame.target, -1, segments)
         self._points = frame.points()
@@ -142,6 +157,10 @@ class _Objects:
             for number, count in zip(numbers, counts)
             if count >= (1 - MOSTLY) * whole[number]
         ]
+
+    def promise(self, grasps: list[Grasp]) -> bool:
+        """Whether the best of an object's grasps is promising."""
+        return bool(grasps) and grasps[0].quality >= self.promising
 
     def surface(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 3) points in W that some pixels (H, W) show, at most `points`, evenly."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.planner_target import TargetPlanner
-from models.planners import make_planner
+from models.planners import HeuristicPlanner, make_planner
 from tests.helpers.box_frames import boxes_frame
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
@@ -54,6 +54,30 @@ def test_neighbours_in_the_way_come_first_and_the_target_when_they_are_gone(name
     assert any(is_of(first, box) for box in TALL)
     # With both gone the target is free; the box 11 cm away is never touched.
     assert is_of(plan(frame_of([FLAT, FAR]))[0], FLAT)
+
+
+def test_scores_that_are_no_chances_are_compared_with_each_other_alone() -> None:
+    """The same planner without its calibration, and all of its scores divided by a thousand: what
+    goes first is the same, of a free target and of one that is walled in."""
+
+    class Faint(HeuristicPlanner):
+        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+            return [replace(g, quality=g.quality / 1000) for g in super().__call__(frame)]
+
+    beside = ((0.04, 0.06, 0.05), 0.0, (0.5, 0.085))
+    for boxes in ([FLAT, beside], [FLAT, *TALL, FAR]):
+        frame = frame_of(boxes)
+        known, scored, faint = (
+            TargetPlanner(plan)(frame)
+            for plan in (
+                make_planner("heuristic", GripperGeometry(), Workspace(), 0),
+                HeuristicPlanner(GripperGeometry(), Workspace()),
+                Faint(GripperGeometry(), Workspace()),
+            )
+        )
+        first = [grasps[0].position for grasps in (known, scored, faint)]
+        np.testing.assert_array_equal(first[1], first[2])
+        assert is_of(known[0], FLAT) == is_of(scored[0], FLAT) == (boxes[1] is beside)
 
 
 def test_what_lies_where_the_target_was_last_seen_is_moved_aside() -> None:
