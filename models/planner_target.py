@@ -27,7 +27,7 @@ class ClearingSettings:
 
     promising: least chance of success with which the target, or what is in its way, is grasped
     while there is an alternative. share: the same for planners whose qualities are scores, as a
-    share of the best score in the whole scene: of such scores only the order means anything. near:
+    share of the best score in the whole scene: scores are compared with each other alone. near:
     a surface at this distance from the target, seen from above, counts exp(-1) of one right beside
     it. over: height over the target at which it counts in full. beside: what a surface counts that
     is not over the target. in_the_way: cm2 of such surface from which an object is in the way.
@@ -96,10 +96,10 @@ class TargetPlanner:
             self._last = shown
         if objects.promise(grasps):
             return self._grasps_of(objects, objects.covering(self._last))[0]
-        promising, others = self._around(objects)
+        promising, others = self._neighbours(objects)
         return [*promising, *sorted(others, key=lambda grasp: -grasp.quality)]
 
-    def _around(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
+    def _neighbours(self, objects: _Objects) -> tuple[list[Grasp], list[Grasp]]:
         """Promising grasps and others of what is in the target's way, of the object most in the way
         first; where none is promising, of what is in the way of these objects, and so on."""
         ring, visited, others = [self._last], set(), []

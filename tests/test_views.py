@@ -1,11 +1,18 @@
 """Views from the side that a scene's seed draws."""
 
+import re
+import shlex
+
 import numpy as np
 import pytest
 
+from envs.cell_layout import Placement, Scene
+from envs.objects import load_object_set
+from envs.simulators import make_cell
 from envs.views import side_view
 from utils.config import load_config
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 
 
 def test_side_views_look_at_the_workspace_from_all_sides_within_their_ranges():
@@ -58,3 +65,20 @@ def test_the_cameras_of_the_protocols(name):
     assert config.camera.view == "fixed" and tuple(config.camera.target) == (0.5, 0.0, 0.05)
     assert np.linalg.norm(away) == pytest.approx(0.6, abs=1e-4)
     assert np.degrees(np.arccos(away[2] / np.linalg.norm(away))) == pytest.approx(60, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["vgn", "giga"])
+def test_the_whole_arm_plays_the_protocols_as_the_page_says(name):
+    """The page's command makes a cell whose cameras see a cube in the workspace's middle, in all of
+    ten scenes, for the arm at rest is in none of their ways."""
+    page = (REPOSITORY / "docs" / "vgn.md").read_text(encoding="utf-8")
+    (line,) = re.findall(rf"configs/{name}\.yaml (robot\.arm=panda .*)", page)
+    config = load_config(REPOSITORY / "configs" / f"{name}.yaml", shlex.split(line))
+    cubes = load_object_set("box", cache_dir=config.cache_folder)
+    at = Placement(cubes[0], np.array([*config.workspace.center, 0.03]), np.eye(4)[3])
+    with make_cell(config) as cell:
+        for seed in range(10):
+            cell.load(Scene("isolated", seed, (at,)))
+            frame = cell.frame()
+            # From 0.75 m a face is 43 pixels wide, and no view of a cube shows less than a face.
+            assert (frame.segmentation == 0).sum() > 43 * 43
