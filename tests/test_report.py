@@ -81,6 +81,8 @@ def test_where_one_object_is_wanted_the_headline_is_the_share_of_targets(tmp_pat
     other = [replace(record, attempts=(attempt("missed"),)) for record in other]
     both = report(tmp_path, [*RETRIEVED, *other])
     assert "retrieved with <strong>lucky" in both, "the best retrieves most"
+    (pair,) = compare([*RETRIEVED, *other], 0)
+    assert pair.cleared is None and pair.success.value == -1.0
 
 
 def test_a_floating_hands_chances_are_said_to_be_the_arms(tmp_path):

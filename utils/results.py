@@ -208,7 +208,8 @@ def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two policies on the rounds that both have played; a difference is first - second."""
+    """Two policies on the rounds that both have played; a difference is first - second, None where
+    it is undefined, as that of cleared objects is where one object was wanted."""
 
     first: str
     second: str
@@ -265,7 +266,9 @@ def _compared(
     shared = [scene for scene in rounds[first] if scene in rounds[second]]
     a, b = ([rounds[name][scene] for scene in shared] for name in (first, second))
     success = _difference(a, b, "successes", "executed", seed)
-    cleared = _difference(a, b, "objects_cleared", "objects_total", seed)
+    # A round with a target ends once it is in hand: what else was cleared is no merit.
+    wanted = any(record.target_in_hand is not None for record in [*a, *b])
+    cleared = None if wanted else _difference(a, b, "objects_cleared", "objects_total", seed)
     return Comparison(first, second, *kind, success, cleared)
 
 
