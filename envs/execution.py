@@ -305,7 +305,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = cell.robot.tip_pose()[:3, 3].copy()
-    detail = "; ".join(filter(None, [detail, _go_home(cell)]))
+    detail = "; ".join(filter(None, [detail, go_home(cell)]))
     if reason == "success":
         cell.retire(held)  # in the bin, into which it has fallen meanwhile
     cell.check_physics()
@@ -386,7 +386,7 @@ def close_fingers(cell: Cell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: Cell) -> str:
+def go_home(cell: Cell) -> str:
     """Open, rise on a straight line if the hand is low, and return to the home posture. Returns a
     remark for the outcome's detail where the arm cannot do so by itself, else an empty text."""
     robot, speed = cell.robot, cell.config.execution.approach_speed

@@ -9,20 +9,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.cell import ROBOT, Cell, Intrinsics, wrist_mount
 from envs.cell_layout import Box, distance_to_box
-from envs.execution import LOOK_EVERY, arm_is_clear, follow, speed_scales
+from envs.execution import LOOK_EVERY, arm_is_clear, follow, go_home, speed_scales
 from envs.robot_kinematics import (
     UnreachableError,
     arm_points,
-    forward_kinematics,
     inverse_kinematics,
+    tip_position,
 )
 from envs.robot_motion import Trajectory
+from envs.robot_safety import ArmStoppedError
 from utils.depth import NoiseStream, seeded_noise
 from utils.depth_correction import corrected
 from utils.geometry import Workspace
@@ -42,13 +44,12 @@ class SecondLook:
     least: m3 of open space that the second frame has to show past what is known; 0: none is taken.
     calibrated: gives a frame that was just taken with the wrist camera the pose that the program
     assumes. plan_seconds, sim_seconds: wall-clock time of the last choice of a view, and simulated
-    time of the last motion there and back. looks: number of second frames so far.
+    time of the last motion there and back.
     """
 
     def __init__(self, cell: Cell, least: float, calibrated: Callable[[RGBDFrame], RGBDFrame]):
         self._cell, self._least, self._calibrated = cell, least, calibrated
         self.plan_seconds = self.sim_seconds = 0.0
-        self.looks = 0
 
     def __call__(self, frame: RGBDFrame) -> RGBDFrame:
         """The frame, with a second one where that is worth it. The arm begins and ends at home."""
@@ -58,18 +59,22 @@ class SecondLook:
         way = way_to_look(self._cell, frame, self._least)
         self.plan_seconds = time.perf_counter() - start
         if way is not None:
-            self.looks += 1
             frame = replace(frame, second=self._taken(way))
         self.sim_seconds = self._cell.seconds - began
         return frame
 
-    def _taken(self, way: Trajectory) -> RGBDFrame:
+    def _taken(self, way: Trajectory) -> RGBDFrame | None:
+        """The frame from the end of a way from home; None where something is in the arm's way."""
         cell = self._cell
-        follow(cell, way)
-        cell.step(round(_STILL_SECONDS / cell.dt))
-        frame = self._calibrated(wrist_frame(cell))
-        back = cell.robot.joint_move(way.positions[-1], cell.home, **speed_scales(cell))
-        follow(cell, back)
+        careful = partial(cell.robot.stop_on_contact, cell.config.execution.contact_stop)
+        try:
+            follow(cell, way, careful)
+            cell.step(round(_STILL_SECONDS / cell.dt))
+            frame = self._calibrated(wrist_frame(cell))
+            follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **speed_scales(cell)))
+        except ArmStoppedError:
+            go_home(cell)
+            return None
         return frame
 
 
@@ -129,13 +134,13 @@ def _postures(cell: Cell, T_WC: np.ndarray) -> Iterator[np.ndarray]:
 
 def _is_clear(cell: Cell, way: Trajectory, things: Box) -> bool:
     """Whether E stays in the workspace's box, and the arm clear of the cell and of `things`."""
-    q, safety = way.positions[::LOOK_EVERY], cell.config.safety
-    q = np.vstack([q, way.positions[-1:]])
-    hands = np.array([forward_kinematics(each) for each in q])
-    tips = hands[:, :3, 3]
+    safety = cell.config.safety
+    tips = np.array([tip_position(q) for q in way.positions.tolist()])
     if (tips < safety.box_lower).any() or (tips > safety.box_upper).any():
         return False
-    points = np.concatenate([arm_points(q), tips[:, None]], axis=1)
+    some = np.append(np.arange(0, len(way), LOOK_EVERY), len(way) - 1)
+    q = way.positions[some]
+    points = np.concatenate([arm_points(q), tips[some, None]], axis=1)
     return bool(distance_to_box(points, things).min() > _HAND_RADIUS) and arm_is_clear(cell, q)
 
 

@@ -122,9 +122,7 @@ def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
     also = _highest(_surface_points(second, first.origin, cell), shape)
     seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
     height, hidden = _filled(seen, first.slope, cell), ~np.isfinite(seen)
-    # A ceiling that is no higher than a height which was borrowed from nearby bounds nothing.
-    bound = np.where(first.ceiling > first.height, first.ceiling, height)
-    ceiling = _carved(np.maximum(bound, height), height, second, first.origin, cell)
+    ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
     # As near a surface as this, the cameras' disagreement is all that is left of it.
     just = ~hidden & (ceiling < height + 2 * _SEEN_THROUGH + _CARVED * cell)
     ceiling = np.where(just, height, ceiling)
