@@ -30,7 +30,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.floating_execution import clears_table, execute_floating
 from envs.objects import fits
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
-from envs.second_look import SecondLook
+from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.errors import TargetLostError, one_line
@@ -49,7 +49,6 @@ TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
 ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
-CM3 = 1e-6  # m3
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
 

@@ -32,6 +32,7 @@ from utils.height_map import HeightMap, height_map_from_frame
 from utils.next_view import OpenSpace, dome
 from utils.transforms import RGBDFrame, inverse_pose
 
+CM3 = 1e-6  # m3
 _ROLLS = np.deg2rad(np.arange(0, 360, 45))  # of the camera about its axis, which are tried
 _HAND_RADIUS = 0.11  # m around points of arm and hand: half the hand's width
 _STANDS = 0.02  # m over the table, of matter that the arm keeps clear of

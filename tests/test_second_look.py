@@ -11,7 +11,7 @@ from envs.cell import ROBOT
 from envs.cell_layout import Scene
 from envs.evaluation_worker import check_everything
 from envs.rounds import run_round
-from envs.second_look import SecondLook, way_to_look, wrist_frame
+from envs.second_look import CM3, SecondLook, way_to_look, wrist_frame
 from envs.simulators import cell_class
 from tests.helpers.cubes import cube_scene
 from tests.helpers.simulators import INSTALLED
@@ -19,7 +19,6 @@ from utils.config import DEFAULTS, load_config
 from utils.errors import UserError
 
 AZIMUTH = 60.0  # degrees, of the first camera: clear of the arm
-CM3 = 1e-6
 
 
 @pytest.fixture(scope="module", params=INSTALLED)

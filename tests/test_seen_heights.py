@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from models.planners import make_planner
 from tests.helpers.box_frames import boxes_frame
 from utils.geometry import GripperGeometry, Workspace
