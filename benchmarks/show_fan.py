@@ -2,7 +2,8 @@
 
 FILE_views.png shows the height maps of the first scene from each direction of the fan; FILE.png
 shows the arm at the grasp that the planner prefers in each of some scenes, seen across its tilt.
-Options choose the planner and the scenes, and, as with every script, keys of the config.
+Options choose the planner and the scenes, and, as with every script, keys of the config; with
+evaluate.second_look the planner gets a second frame where it is worth it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from envs.evaluation_worker import load_objects, new_planner
 from envs.execution import reaches
 from envs.robot_kinematics import choose_posture
 from envs.rounds import first_untried, within_reach
+from envs.second_look import CM3, SecondLook
 from envs.simulators import make_cell
 from models.planner_fan import FanPlanner
 from models.planners import needs_truth
@@ -52,6 +54,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         for seed in range(config.seed, config.seed + chosen.scenes):
             cell.load(make_scene(chosen.layout, objects, seed, config))
             frame = cell.frame(needs_truth(planner))
+            if not needs_truth(planner):
+                least = config.evaluate.second_look * CM3
+                frame = SecondLook(cell, least, calibrated=lambda second: second)(frame)
             if not pictures:
                 path = chosen.output.with_stem(f"{chosen.output.stem}_views")
                 iio.imwrite(path, views(planner, frame.without_truth()))

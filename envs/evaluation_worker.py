@@ -77,6 +77,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
                 f"evaluate.abstain: {name} states no chances of success; allowed with it are "
                 f"{', '.join(calibrations())}, or evaluate.abstain=0"
             )
+    if config.evaluate.second_look > 0:
+        require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")
     make_cell(config).close()
     if config.robot.arm != "none":
         check_bin(config)
@@ -147,7 +149,7 @@ def work(config: Config, task: Task) -> TaskResult:
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
                 max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
-                scenario=task.scenario,
+                second_look=config.evaluate.second_look, scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )
         )  # fmt: skip

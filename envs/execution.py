@@ -46,7 +46,7 @@ _HOLD_MARGIN = 1.5  # times the force that this friction needs
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
 _ARM_RADIUS = 0.065  # m of the links between elbow and flange
-_LOOK_EVERY = 12  # references between two at which the arm's links are looked at
+LOOK_EVERY = 12  # references between two at which the arm's links are looked at
 _LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
@@ -152,12 +152,12 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     start = cell.robot.q  # all is planned before anything moves
     reach, down, target = _planned(cell, grasp)
     corner = _farther_than(settings.pregrasp_height - _CORNER, target, down)
-    way = cell.robot.blended_moves(start, reach, down, corner, **_scales(cell))
+    way = cell.robot.blended_moves(start, reach, down, corner, **speed_scales(cell))
 
     cell.robot.command_gripper(cell.gripper.opening_before(grasp.width))
     above = len(way) - len(down)
-    _follow(cell, way[:above])
-    _follow(cell, way[above:], partial(cell.robot.stop_on_contact, settings.contact_stop))
+    follow(cell, way[:above])
+    follow(cell, way[above:], partial(cell.robot.stop_on_contact, settings.contact_stop))
     return ApproachResult(cell.step, target)
 
 
@@ -195,7 +195,7 @@ def _plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
             failures.append(error)
             continue
         found = True
-        yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **_scales(cell)), down, target
+        yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **speed_scales(cell)), down, target
     if not found:
         raise failures[0]
 
@@ -208,7 +208,13 @@ def _is_clear(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
         lift = _line(cell, down.positions[-1], _raised(cell, target, grasp.position[2]))
     except UnreachableError:
         return False
-    way = np.concatenate([part.positions[::_LOOK_EVERY] for part in (reach, down, lift)])
+    way = np.concatenate([part.positions[::LOOK_EVERY] for part in (reach, down, lift)])
+    return arm_is_clear(cell, way)
+
+
+def arm_is_clear(cell: Cell, way: np.ndarray) -> bool:
+    """Whether joint positions (N, 7) keep within the limits, and the arm, but for its hand, clear
+    of table, bin and walls."""
     margin = cell.config.safety.joint_margin
     if (way < JOINT_LOWER + margin).any() or (way > JOINT_UPPER - margin).any():
         return False  # where a curve between waypoints may leave the limits
@@ -235,7 +241,7 @@ def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
     # when the first one ends, so that both together are no faster than the approach.
     left = _distances(target, slow)
     speeding = int(np.argmax(-np.diff(left) > settings.approach_speed * cell.dt / 2))
-    return cell.robot.blended_moves(q, quick, slow, speeding, **_scales(cell))
+    return cell.robot.blended_moves(q, quick, slow, speeding, **speed_scales(cell))
 
 
 def _distances(target: np.ndarray, trajectory: Trajectory) -> np.ndarray:
@@ -299,7 +305,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = cell.robot.tip_pose()[:3, 3].copy()
-    detail = "; ".join(filter(None, [detail, _go_home(cell)]))
+    detail = "; ".join(filter(None, [detail, go_home(cell)]))
     if reason == "success":
         cell.retire(held)  # in the bin, into which it has fallen meanwhile
     cell.check_physics()
@@ -344,12 +350,12 @@ def _carry_to_bin(
     over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
     over_bin[2] = max(over_bin[2], lifted[2, 3] - _LIFT_MARGIN)
     posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
-    carry = robot.joint_move(lift.positions[-1], posture, **_scales(cell))
+    carry = robot.joint_move(lift.positions[-1], posture, **speed_scales(cell))
     corner = _higher_than(lifted[2, 3] - _CORNER, lift)
-    way = robot.blended_moves(start, lift, carry, corner, **_scales(cell))
+    way = robot.blended_moves(start, lift, carry, corner, **speed_scales(cell))
     grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
     for first in range(0, len(lift), every):
-        _follow(cell, way[first : min(first + every, len(lift))], grip.feel)
+        follow(cell, way[first : min(first + every, len(lift))], grip.feel)
         grip.press()
     if index is None or motion is None:
         raise GraspFailure("missed")
@@ -357,7 +363,7 @@ def _carry_to_bin(
         raise GraspFailure("slipped")
     end = cell.seconds + settings.hold_seconds
     for first in range(len(lift), len(way), every):
-        _follow(cell, way[first : first + every], grip.feel)
+        follow(cell, way[first : first + every], grip.feel)
         grip.press()
         _still_lifted(cell, index, motion)
     while cell.seconds < end:
@@ -380,7 +386,7 @@ def close_fingers(cell: Cell, wait: Callable[[int], None]) -> None:
         before = opening
 
 
-def _go_home(cell: Cell) -> str:
+def go_home(cell: Cell) -> str:
     """Open, rise on a straight line if the hand is low, and return to the home posture. Returns a
     remark for the outcome's detail where the arm cannot do so by itself, else an empty text."""
     robot, speed = cell.robot, cell.config.execution.approach_speed
@@ -392,13 +398,13 @@ def _go_home(cell: Cell) -> str:
         up[2, 3] = 0.2
         # Without the line, the joint motion below goes up as well, only less straight.
         with contextlib.suppress(UnreachableError, ArmStoppedError):
-            _follow(cell, _line(cell, robot.q, up, speed))
+            follow(cell, _line(cell, robot.q, up, speed))
     try:
         try:
-            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+            follow(cell, robot.joint_move(robot.q, cell.home, **speed_scales(cell)))
         except ArmStoppedError:  # the joint motion leaves the workspace; a straight line does not
-            _follow(cell, _line(cell, robot.q, forward_kinematics(cell.home), speed))
-            _follow(cell, robot.joint_move(robot.q, cell.home, **_scales(cell)))
+            follow(cell, _line(cell, robot.q, forward_kinematics(cell.home), speed))
+            follow(cell, robot.joint_move(robot.q, cell.home, **speed_scales(cell)))
     except (UnreachableError, ArmStoppedError):
         # An arm stretched to the edge of the workspace can bend its elbow only by leaving it.
         robot.place(cell.home)
@@ -412,10 +418,10 @@ def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _line(cell: Cell, q: np.ndarray, pose: np.ndarray, speed: float = np.inf) -> Trajectory:
-    return cell.robot.straight_move(q, pose, speed, cell.home, **_scales(cell))
+    return cell.robot.straight_move(q, pose, speed, cell.home, **speed_scales(cell))
 
 
-def _scales(cell: Cell) -> dict[str, float]:
+def speed_scales(cell: Cell) -> dict[str, float]:
     robot = cell.config.robot
     return {
         "velocity_scale": robot.velocity_scale,
@@ -423,7 +429,7 @@ def _scales(cell: Cell) -> dict[str, float]:
     }
 
 
-def _follow(
+def follow(
     cell: Cell, trajectory: Trajectory, after_step: Callable[[], object] | None = None
 ) -> None:
     """Run a trajectory. Raises what `after_step` raises, and ArmStoppedError where the gate refuses

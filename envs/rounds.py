@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -29,6 +30,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.floating_execution import clears_table, execute_floating
 from envs.objects import fits
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
+from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.errors import TargetLostError, one_line
@@ -77,6 +79,7 @@ def run_round(
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
     approach_by: GraspFinder | None = None,
     abstain: float = 0.0,
+    second_look: float = 0.0,
 ) -> RoundRecord:
     """Load a scene, let a planner work on it, and return the record.
 
@@ -88,6 +91,8 @@ def run_round(
     approach_by: a policy that finds its own grasps on the way; the planned ones are ignored.
     abstain: grasps of less quality are not tried; where there are no others, the round ends as if
         the planner had found none.
+    second_look: cm3 of open space that a second frame has to show for the arm to take it before an
+        attempt; 0: it takes none. Planners that see the truth need none, nor do learned policies.
     """
     scenario = scenario or scene.layout
     conditions = SCENARIOS[scenario]
@@ -100,6 +105,12 @@ def run_round(
         for index, placed in enumerate(scene.placements)
         if not fits(placed.model, cell.gripper)
     }
+    sees_all = privileged or approach_by is not None
+    look_again = SecondLook(
+        cell,
+        0.0 if sees_all else second_look * CM3,
+        partial(calibrated, cell, calibration, "wrist"),
+    )
     wanted = scene.target
     if wanted is not None:
         plan = TargetPlanner(plan)
@@ -112,7 +123,9 @@ def run_round(
         with planner_errors(policy):
             reset_planner(plan, scene.seed)
         while cell.remaining and len(failed) < max_failures:
-            frame = calibrated(cell, calibration, cell.frame(privileged))
+            mount = cell.config.camera.mount
+            frame = calibrated(cell, calibration, mount, cell.frame(privileged))
+            frame = look_again(frame)
             if wanted is not None:
                 assert frame.segmentation is not None  # a cell's frames have it
                 frame = replace(frame, target=frame.segmentation == wanted)
@@ -124,11 +137,12 @@ def run_round(
                         planar=controller != OPEN_LOOP,
                     )
             finally:
-                plan_seconds = time.perf_counter() - start
+                plan_seconds = time.perf_counter() - start + look_again.plan_seconds
             worth = [grasp for grasp in grasps if grasp.quality >= abstain]
             if not worth:
                 detail = _abstained(grasps, abstain)
-                attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, 0.0, detail=detail))
+                spent = look_again.sim_seconds
+                attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
                 break
             reached: Iterable[Grasp] = within_reach(cell, worth)
@@ -158,7 +172,7 @@ def run_round(
                     outcome.success,
                     outcome.reason,
                     plan_seconds,
-                    outcome.sim_seconds,
+                    outcome.sim_seconds + look_again.sim_seconds,
                     grasp_to_image(grasp, frame.K, frame.T_WC),
                     detail=outcome.detail,
                     held=_name_of(scene, held),
@@ -226,10 +240,12 @@ def checked_grasps(grasps: object, planar: bool = False) -> Sequence[Grasp]:
     return grasps
 
 
-def calibrated(cell: Cell, calibration: CameraCalibration, frame: RGBDFrame) -> RGBDFrame:
-    """A frame of the camera, taken now, with the camera pose of the calibration. An image
-    in which no table is found cannot be levelled."""
-    mount, T_WE = cell.config.camera.mount, cell.robot.encoder_pose()
+def calibrated(
+    cell: Cell, calibration: CameraCalibration, mount: str, frame: RGBDFrame
+) -> RGBDFrame:
+    """A frame of the overhead or the wrist camera, taken now, with the camera pose of the
+    calibration. An image in which no table is found cannot be levelled."""
+    T_WE = cell.robot.encoder_pose()
     try:
         return calibration.frame(frame, mount, T_WE)
     except TargetLostError:

@@ -33,6 +33,7 @@ from models.planner_fan import FanPlanner
 from utils.depth import (
     TABLE_FLATNESS,
     depth_of_plane,
+    nearest_values,
     reach_in_pixels,
     surfaces_in_holes,
     table_in_holes,
@@ -49,7 +50,7 @@ from utils.height_map import (
     tilted_height_map,
 )
 from utils.images import PixelScaling
-from utils.seen_heights import without_holes
+from utils.seen_heights import hides, without_holes
 from utils.target import only_target
 from utils.transforms import (
     Grasp,
@@ -97,6 +98,10 @@ def labelled_by_centres(
     votes = place + offset[:, v, u].T
     # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
     seen = heights.ceiling[row, column] <= height
+    behind = np.zeros(len(row), bool)
+    if frame.second is not None:
+        behind = hides(frame, surface)
+    seen &= ~behind
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
     if len(centres) == 0:
         return heights
@@ -105,6 +110,8 @@ def labelled_by_centres(
     owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
+    if behind.any():
+        label = _as_beside(label, heights.label, row[behind], column[behind], count)
 
     rise, base = height - heights.table_height, np.zeros(count)
     if heights.fixed is not None:
@@ -118,6 +125,23 @@ def labelled_by_centres(
     share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
     found = eye + share[:, None] * (ahead - eye)
     return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
+
+
+def _as_beside(
+    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, count: int
+) -> np.ndarray:
+    """Labels (R, C) whose cells (N,) that only a second frame shows are those of the nearest other
+    cell of the same `piece` (R, C), or the piece itself, after `count` objects, where there is
+    none."""
+    others = label >= 0
+    others[row, column] = False
+    label = label.copy()
+    label[row, column] = count + piece[row, column]
+    if others.any():
+        nearest, its_piece = (nearest_values(values, others) for values in (label, piece))
+        same = its_piece[row, column] == piece[row, column]
+        label[row[same], column[same]] = nearest[row[same], column[same]]
+    return label
 
 
 def vote_centres(
@@ -273,30 +297,31 @@ class NetworkView:
 
     The given frame is corrected by its table (`utils.depth_correction`). frame: the same, holes of
     its depth filled where colours tell what is there. heights: the map from above. crop: whether
-    only the part of the image is looked at in which something stands. Raises UserError for an image
-    that the network cannot take.
+    only the part of the image is looked at in which something stands. Where the frame has a second
+    one, its network maps serve for what the first does not show. Raises UserError for an image that
+    the network cannot take.
     """
 
     def __init__(
         self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace, crop: bool = False
     ):
-        model, metres_per_pixel, *_ = network
-        self._scaling = training_scale(frame, metres_per_pixel)
-        if crop:
-            frame = around_matter(frame, workspace.table_height)
-        self.frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
-        knows_centres = model.centre_head is not None
-        self._maps = run_network(model, self.frame, self._scaling, knows_centres)
+        table = workspace.table_height
+        self._first = _Prediction(network, frame, table, crop)
+        self._second = None
+        if frame.second is not None:
+            self._second = _Prediction(network, frame.second, table)
+        self.frame = self._first.frame
         self.heights = height_map_from_frame(self.frame, workspace)
-        if knows_centres:
-            offset = self._maps[3][0].numpy()
-            self.heights = labelled_by_centres(self.heights, self.frame, self._scaling, offset)
+        if network.model.centre_head is not None:
+            offset = self._first.maps[3][0].numpy()
+            scaling = self._first.scaling
+            self.heights = labelled_by_centres(self.heights, self.frame, scaling, offset)
 
     def peaks(self, settings: PeakSettings) -> np.ndarray:
         """(N, 3) points in W of the surface at the peaks of the quality, the highest peak first."""
-        quality, angle, width = self._maps[:3]
+        quality, angle, width = self._first.maps[:3]
         found = find_peaks(quality, angle, width, settings)
-        pixels = self._scaling.original_pixels(found.pixel)
+        pixels = self._first.scaling.original_pixels(found.pixel)
         depth = surface_depth(self.frame.depth, pixels)
         points = deproject(pixels, depth, self.frame.K, self.frame.T_WC)
         return points[np.isfinite(depth)]
@@ -307,9 +332,28 @@ class NetworkView:
         surface = np.column_stack([xy, heights.height[heights.index(xy)]])
         ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
         ends = transform_points(heights.T_WV, ends)
-        pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
-        quality = quality_between(self._maps, *self._scaling.pixels(pixels))
+        quality = self._first.quality(ends)
+        if self._second is not None:
+            hidden = hides(self.frame, ends.mean(axis=0))
+            quality[hidden] = self._second.quality(ends[:, hidden])
         return np.maximum(quality, LEAST)
+
+
+class _Prediction:
+    """A network's maps of one image. frame: as in `NetworkView`, the part that was looked at."""
+
+    def __init__(self, network: SavedGraspNet, frame: RGBDFrame, table: float, crop: bool = False):
+        self.scaling = training_scale(frame, network.metres_per_pixel)
+        if crop:
+            frame = around_matter(frame, table)
+        self.frame = surfaces_in_holes(table_in_holes(frame, table))
+        model = network.model
+        self.maps = run_network(model, self.frame, self.scaling, model.centre_head is not None)
+
+    def quality(self, ends: np.ndarray) -> np.ndarray:
+        """(N,) quality of closing along the lines between points (2, N, 3) in W."""
+        pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
+        return quality_between(self.maps, *self.scaling.pixels(pixels))
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:

@@ -215,6 +215,7 @@ class EvaluateConfig(Section):
     workers: Count | None
     max_failures: Count
     abstain: Annotated[float, Field(ge=0, le=1)]
+    second_look: Annotated[float, Field(ge=0)]
     videos: Annotated[int, Field(ge=0)]
     film_format: Literal["mp4", "gif"]
     gallery: Annotated[int, Field(ge=0)]

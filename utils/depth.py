@@ -445,6 +445,7 @@ class NoiseStream(IntEnum):
     PLANNING = 1  # frames that planners see (`envs.cell.Cell.frame`)
     WRIST = 3  # images of the closed loop (`envs.closed_loop_tracker.WristCamera`)
     OBSERVATION = 5  # images of the environment (`envs.env_observations.Observer`)
+    SECOND = 9  # second frames (`envs.second_look.SecondLook`)
 
 
 def measure(

@@ -26,7 +26,10 @@ COLOUR_NOISE = 0.01  # standard deviation of colours, 0..1, that are one surface
 
 def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     """The frame with its depth scaled until the table lies at `table_height` (m in W), and smoothed
-    where the table is rough; the frame itself where its camera is as good as that already."""
+    where the table is rough; the frame itself where its camera is as good as that already. So is
+    its second frame."""
+    if frame.second is not None:
+        frame = replace(frame, second=corrected(frame.second, table_height))
     scale = scale_to_table(frame, table_height)
     if abs(scale - 1) > TRUSTED_SCALE:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))

@@ -19,7 +19,6 @@ from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_line
 from utils.seen_heights import (
     FARTHEST,
     MARGIN,
-    Complete,
     seen_heights,
     table_slope,
     without_holes,
@@ -127,21 +126,18 @@ def height_map_from_frame(
     workspace: Workspace,
     cell: float = 0.002,
     margin: float = MARGIN,
-    complete: Complete | None = None,
 ) -> HeightMap:
     """The height map of a depth image from above; uses nothing of the frame but depth, K and T_WC.
 
     Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over those
     that are not `at_edges` is a little higher. Labels are the pieces between height
     discontinuities; their centres are volume centroids of the columns between the table and the
-    visible surface. complete: guesses what the frame does not show.
+    visible surface.
     """
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
     filled, hiding = without_holes(frame, workspace)
     seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
-    if complete is not None:
-        seen = complete(seen)
     if not frame.fixtures:
         label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
         centres = _column_centroids(seen.height - table, label, grid, table)
@@ -200,17 +196,14 @@ def tilted_height_map(
     filled: RGBDFrame,
     hiding: np.ndarray,
     T_WV: np.ndarray,
-    complete: Complete | None = None,
 ) -> HeightMap:
     """The map of the same scene in another frame, on a grid like that of the map from above.
 
     filled, hiding: the frame `without_holes`. Objects are those of the map from above: a surface
-    belongs to the object over its place on the table. complete: as in `height_map_from_frame`.
+    belongs to the object over its place on the table.
     """
     shape, origin, cell = overhead.height.shape, overhead.origin, overhead.cell
     seen = seen_heights(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
-    if complete is not None:
-        seen = complete(seen)
     row, column = np.indices(shape, sparse=True)
     surface = np.broadcast_arrays(origin[0] + cell * column, origin[1] + cell * row, seen.height)
     points = transform_points(T_WV, np.stack(surface, axis=-1))

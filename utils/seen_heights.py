@@ -2,14 +2,14 @@
 
 The image's points are drawn again on a grid in a frame V whose -z is the direction of a hand's
 approach. A cell then has a surface that was seen, or none; and the rays that graze an edge bound
-the matter in its shadow. `models.completion` guesses the surface in that shadow. This module knows
-neither objects nor networks.
+the matter in its shadow. A second frame of the same scene raises surfaces and carves ceilings.
+This module knows neither objects nor networks.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +17,7 @@ import numpy as np
 
 from utils.depth import HOLE_REACH, at_edges, depth_of_plane, near_side, reach_in_pixels
 from utils.geometry import Workspace
-from utils.transforms import RGBDFrame, deproject, inverse_pose, known_depth
+from utils.transforms import RGBDFrame, deproject, inverse_pose, known_depth, project
 
 # Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole that is
 # not at an edge may be this much higher than the surface beside it.
@@ -27,6 +27,11 @@ MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
 # What stands as near as this around the workspace is in the way of a hand that comes from a side:
 # the hand is 0.2 m long and starts 0.1 m before the grasp.
 _HAND_REACH, _STANDS = 0.30, 0.02  # m, and m over the table
+# A surface this much behind a point is seen through it: more than two cameras disagree, less than
+# the least step that separates objects.
+_SEEN_THROUGH = 0.004  # m
+_HIDDEN_BEHIND = 0.01  # m, by which a point has to lie behind a surface to be hidden for certain
+_CARVED = 2  # cells of height that are carved from a ceiling at once
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
 FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
 
@@ -38,9 +43,8 @@ class SeenHeights:
     height: the highest surface seen; hidden cells hold the lowest one nearby. ceiling: the highest
     that matter could reach which was hidden or not measured; equals `height` where there is none.
     hidden: bool, cells in which no surface was seen. unknown: bool, cells of which not even the
-    surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`.
-    T_WV: (4, 4) the grid's frame in W. eye: (3,) the
-    camera in V.
+    surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`. T_WV: (4, 4)
+    the grid's frame in W.
     """
 
     height: np.ndarray
@@ -51,16 +55,11 @@ class SeenHeights:
     origin: np.ndarray
     cell: float
     T_WV: np.ndarray
-    eye: np.ndarray
 
     def walled(self) -> tuple[np.ndarray, np.ndarray]:
         """Height and ceiling, with walls where any matter is possible."""
         height = np.where(self.unknown, self.height.max() + WALL, self.height)
         return height, np.maximum(self.ceiling, height)
-
-
-Complete = Callable[[SeenHeights], SeenHeights]
-"""Guesses the surfaces that a frame does not show."""
 
 
 def seen_heights(
@@ -72,7 +71,7 @@ def seen_heights(
     cell: float,
     table: float,
 ) -> SeenHeights:
-    """What a frame tells about the cells of a grid in V.
+    """What a frame, and its second one if it has any, tell about the cells of a grid in V.
 
     frame, hiding: the frame `without_holes`. shape, origin, cell: as of `HeightMap`. table: metres
     in W.
@@ -81,13 +80,9 @@ def seen_heights(
     unknown = ~known_depth(frame.depth)
     to_table = np.where(unknown, depth_of_plane(frame, table), 0) if unknown.any() else None
     frame = replace(frame, T_WC=inverse_pose(T_WV) @ frame.T_WC)
-    eye = frame.T_WC[:3, 3]
     seen = _highest(_surface_points(frame, origin, cell), shape)
     hidden = ~np.isfinite(seen)
-    # The lowest surface within 2 cm, so that an occluded flank does not widen the object.
-    # OpenCV pads with the largest float, which a cell far outside the view would inherit.
-    lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
-    height = np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
+    height = _filled(seen, slope, cell)
     # The rays that graze an edge bound the matter in its shadow.
     ceiling = _highest(_grazing_points(frame, origin, cell), shape)
     ceiling = np.maximum(ceiling, height)
@@ -97,12 +92,90 @@ def seen_heights(
         nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
         risen = _highest(_surface_points(nearer, origin, cell), shape)
         ceiling = np.maximum(ceiling, risen)
-    if to_table is None:
-        unknown = np.zeros(shape, bool)
-        return SeenHeights(height, ceiling, hidden, unknown, slope, origin, cell, T_WV, eye)
-    below = _highest(_surface_points(replace(frame, depth=to_table), origin, cell), shape)
-    unknown = hidden & np.isfinite(below)
-    return SeenHeights(height, ceiling, hidden, unknown, slope, origin, cell, T_WV, eye)
+    unknown = np.zeros(shape, bool)
+    if to_table is not None:
+        below = _highest(_surface_points(replace(frame, depth=to_table), origin, cell), shape)
+        unknown = hidden & np.isfinite(below)
+    first = SeenHeights(height, ceiling, hidden, unknown, slope, origin, cell, T_WV)
+    return first if frame.second is None else with_second(first, frame.second)
+
+
+def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
+    """What is known once a second frame of the same still scene is added; pixels without a depth
+    add nothing.
+
+    Its surfaces raise the heights. What was possible under a ceiling is none where the second
+    camera sees through it: from the top down, as long as each point of a cell's column lies before
+    the surface at its pixel (space carving: Kutulakos and Seitz, IJCV 2000). A cell is hidden, or
+    unknown, only where neither frame saw a surface.
+    """
+    shape, cell = first.height.shape, first.cell
+    second = replace(second, T_WC=inverse_pose(first.T_WV) @ second.T_WC)
+    also = _highest(_surface_points(second, first.origin, cell), shape)
+    seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
+    height, hidden = _filled(seen, first.slope, cell), ~np.isfinite(seen)
+    ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
+    # As near a surface as this, the cameras' disagreement is all that is left of it.
+    just = ~hidden & (ceiling < height + 2 * _SEEN_THROUGH + _CARVED * cell)
+    ceiling = np.where(just, height, ceiling)
+    unknown = first.unknown & hidden
+    return replace(first, height=height, ceiling=ceiling, hidden=hidden, unknown=unknown)
+
+
+def sees_through(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether the surface at the pixel of each point (N, 3) in W was measured, and lies
+    behind the point."""
+    depth, surface = _on_its_ray(frame, points)
+    return surface > depth + _SEEN_THROUGH
+
+
+def hides(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether a frame shows something nearer at the pixel of each point (N, 3) in W, or
+    the point lies outside its image."""
+    depth, surface = _on_its_ray(frame, points)
+    return ~(surface > depth - _HIDDEN_BEHIND)
+
+
+def _on_its_ray(frame: RGBDFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (N,) of points and of the surfaces at their pixels, NaN where none was measured."""
+    pixels, depth = project(points, frame.K, frame.T_WC)
+    rows, columns = frame.depth.shape
+    u, v = np.rint(pixels).T
+    within = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)  # NaN, behind the camera, is not
+    u, v = (np.where(within, along, 0).astype(np.intp) for along in (u, v))
+    surface = frame.depth[v, u]
+    return depth, np.where(within & known_depth(surface), surface, np.nan)
+
+
+def _carved(
+    ceiling: np.ndarray, height: np.ndarray, second: RGBDFrame, origin: np.ndarray, cell: float
+) -> np.ndarray:
+    """(R, C) float32 ceilings, lowered as far as a frame in V sees through what is under them, and
+    to `height` at the lowest."""
+    at = np.flatnonzero(ceiling > height)
+    row, column = np.divmod(at, ceiling.shape[1])
+    place = origin + cell * np.stack([column, row], axis=-1)
+    lowest, level = height.take(at), ceiling.take(at)
+    result, left = ceiling.copy(), np.arange(len(at))
+    while len(left):
+        free = sees_through(second, np.column_stack([place[left], level[left]]))
+        left = left[free]
+        # A point is free, and so is what is over it: matter begins below.
+        result.flat[at[left]] = level[left]
+        level[left] -= _CARVED * cell
+        below = level[left] <= lowest[left]
+        result.flat[at[left[below]]] = lowest[left[below]]
+        left = left[~below]
+    return result
+
+
+def _filled(seen: np.ndarray, slope: np.ndarray, cell: float) -> np.ndarray:
+    """(R, C) heights over the table of the surfaces `seen`, -inf where there is none: there it is
+    the lowest surface within 2 cm, so that an occluded flank does not widen the object."""
+    hidden = ~np.isfinite(seen)
+    # OpenCV pads with the largest float, which a cell far outside the view would inherit.
+    lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
+    return np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
 
 
 def table_slope(

@@ -148,6 +148,8 @@ class RGBDFrame:
         such as shelves.
     target: (H, W) bool, the visible pixels of the one object that is wanted, as a click or a
         segmenter gives them; None: any object.
+    second: another frame of the same still scene, from another side, which adds to what this one
+        shows; None: there is none. Its own fixtures, target and second count for nothing.
     """
 
     rgb: np.ndarray
@@ -158,6 +160,7 @@ class RGBDFrame:
     truth: SceneGeometry | None = None  # type: ignore[name-defined]  # noqa: F821 - utils.geometry
     fixtures: tuple[ConvexSolid, ...] = ()  # type: ignore[name-defined]  # noqa: F821 - as above
     target: np.ndarray | None = None
+    second: RGBDFrame | None = None
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
@@ -168,11 +171,13 @@ class RGBDFrame:
 
     def without_truth(self) -> RGBDFrame:
         """The same frame as an unprivileged planner may see it."""
-        return replace(self, segmentation=None, truth=None)
+        second = None if self.second is None else self.second.without_truth()
+        return replace(self, segmentation=None, truth=None, second=second)
 
     def part(self, rows: slice, columns: slice) -> RGBDFrame:
         """Some rows and columns of the image, both without a step, as a frame of its own. What
-        else is known of its pixels (segmentation, target) stays behind."""
+        else is known of its pixels (segmentation, target) stays behind; the second frame stays
+        whole."""
         K = self.K.copy()
         K[:2, 2] -= columns.start, rows.start
         rgb, depth = self.rgb[rows, columns], self.depth[rows, columns]

@@ -20,9 +20,10 @@ def boxes_frame(
     boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]],
     walls: int = 0,
     focal: float = 390.6,
+    T_WC: np.ndarray = T_WC,
 ) -> RGBDFrame:
     """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula. The
-    last `walls` of them are walls. focal: pixels."""
+    last `walls` of them are walls. focal: pixels. T_WC: the camera's pose, looking down."""
     v, u = np.mgrid[0:224, 0:224]
     rays = (
         np.stack([(u - 111.5) / focal, (v - 111.5) / focal, np.ones_like(u)], axis=-1)

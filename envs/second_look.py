@@ -1,0 +1,158 @@
+"""A second look: the wrist camera goes where it sees most of what the first frame leaves open.
+
+`utils.next_view` ranks the poses; this module asks which of them the arm can take, moves it there
+and back, and takes the frame. It does not know who plans with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from envs.cell import ROBOT, Cell, Intrinsics, wrist_mount
+from envs.cell_layout import Box, distance_to_box
+from envs.execution import LOOK_EVERY, arm_is_clear, follow, go_home, speed_scales
+from envs.robot_kinematics import (
+    UnreachableError,
+    arm_points,
+    inverse_kinematics,
+    tip_position,
+)
+from envs.robot_motion import Trajectory
+from envs.robot_safety import ArmStoppedError
+from utils.depth import NoiseStream, seeded_noise
+from utils.depth_correction import corrected
+from utils.geometry import Workspace
+from utils.height_map import HeightMap, height_map_from_frame
+from utils.next_view import OpenSpace, dome
+from utils.transforms import RGBDFrame, inverse_pose
+
+CM3 = 1e-6  # m3
+_ROLLS = np.deg2rad(np.arange(0, 360, 45))  # of the camera about its axis, which are tried
+_HAND_RADIUS = 0.11  # m around points of arm and hand: half the hand's width
+_STANDS = 0.02  # m over the table, of matter that the arm keeps clear of
+_STILL_SECONDS = 0.1  # for which the arm stands still before the image
+
+
+class SecondLook:
+    """Adds a second frame (`RGBDFrame.second`) to the first, where it promises enough.
+
+    least: m3 of open space that the second frame has to show past what is known; 0: none is taken.
+    calibrated: gives a frame that was just taken with the wrist camera the pose that the program
+    assumes. plan_seconds, sim_seconds: wall-clock time of the last choice of a view, and simulated
+    time of the last motion there and back.
+    """
+
+    def __init__(self, cell: Cell, least: float, calibrated: Callable[[RGBDFrame], RGBDFrame]):
+        self._cell, self._least, self._calibrated = cell, least, calibrated
+        self.plan_seconds = self.sim_seconds = 0.0
+
+    def __call__(self, frame: RGBDFrame) -> RGBDFrame:
+        """The frame, with a second one where that is worth it. The arm begins and ends at home."""
+        if self._least == 0.0:
+            return frame
+        start, began = time.perf_counter(), self._cell.seconds
+        way = way_to_look(self._cell, frame, self._least)
+        self.plan_seconds = time.perf_counter() - start
+        if way is not None:
+            frame = replace(frame, second=self._taken(way))
+        self.sim_seconds = self._cell.seconds - began
+        return frame
+
+    def _taken(self, way: Trajectory) -> RGBDFrame | None:
+        """The frame from the end of a way from home; None where something is in the arm's way."""
+        cell = self._cell
+        careful = partial(cell.robot.stop_on_contact, cell.config.execution.contact_stop)
+        try:
+            follow(cell, way, careful)
+            cell.step(round(_STILL_SECONDS / cell.dt))
+            frame = self._calibrated(wrist_frame(cell))
+            follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **speed_scales(cell)))
+        except ArmStoppedError:
+            go_home(cell)
+            return None
+        return frame
+
+
+def wrist_frame(cell: Cell) -> RGBDFrame:
+    """The frame of the wrist camera as the arm stands, with the noise of `camera.depth_noise`, a
+    function of the scene's seed and the number of first frames. The robot, which knows its own
+    shape and posture, leaves itself out."""
+    assert cell.scene is not None  # a cell with a frame has one
+    camera = cell.config.camera
+    intrinsics = Intrinsics(
+        camera.width, camera.height, camera.wrist_fov_deg, camera.near, camera.far
+    )
+    frame = cell.look(intrinsics, cell.camera_pose("wrist"))
+    noise = camera.make_noise(float(frame.K[0, 0]))
+    measure = seeded_noise(noise, NoiseStream.SECOND, cell.scene.seed, cell.frames)
+    assert frame.segmentation is not None  # a cell's frames have it
+    depth = np.where(frame.segmentation == ROBOT, 0, measure(frame.depth, frame.rgb))
+    return replace(frame, depth=depth.astype(np.float32))
+
+
+def way_to_look(cell: Cell, frame: RGBDFrame, least: float) -> Trajectory | None:
+    """From home to the pose from which the wrist camera sees most of what a frame leaves open; None
+    where no pose that the arm can take shows more than `least` m3 of it."""
+    camera, area = cell.config.camera, cell.config.workspace
+    workspace = Workspace(tuple(area.center), area.size)
+    heights = height_map_from_frame(corrected(frame, workspace.table_height), workspace)
+    space = OpenSpace(heights, workspace)
+    if space.volume <= least:
+        return None
+    shape = camera.height, camera.width
+    K = Intrinsics(camera.width, camera.height, camera.wrist_fov_deg).K
+    views = [(space.shown(K, shape, T_WC), T_WC) for T_WC in dome(workspace)]
+    things = _box_around(heights)
+    for shown, T_WC in sorted(views, key=lambda view: -view[0]):
+        if shown <= least:
+            return None
+        for q in _postures(cell, T_WC):
+            way = cell.robot.joint_move(cell.home, q, **speed_scales(cell))
+            if _is_clear(cell, way, things):
+                return way
+    return None
+
+
+def _postures(cell: Cell, T_WC: np.ndarray) -> Iterator[np.ndarray]:
+    """Joint positions (7,) that bring the wrist camera to T_WC (4, 4), but for the turn about its
+    axis, the nearest to home first."""
+    hand_in_camera, found = inverse_pose(wrist_mount(cell.config.camera)), []
+    for roll in _ROLLS:
+        turned = T_WC.copy()
+        turned[:3, :3] = T_WC[:3, :3] @ Rotation.from_euler("z", roll).as_matrix()
+        try:
+            found.append(inverse_kinematics(turned @ hand_in_camera, cell.home, cell.home))
+        except UnreachableError:
+            continue
+    yield from sorted(found, key=lambda q: float(abs(q - cell.home).max()))
+
+
+def _is_clear(cell: Cell, way: Trajectory, things: Box) -> bool:
+    """Whether E stays in the workspace's box, and the arm clear of the cell and of `things`."""
+    safety = cell.config.safety
+    tips = np.array([tip_position(q) for q in way.positions.tolist()])
+    if (tips < safety.box_lower).any() or (tips > safety.box_upper).any():
+        return False
+    some = np.append(np.arange(0, len(way), LOOK_EVERY), len(way) - 1)
+    q = way.positions[some]
+    points = np.concatenate([arm_points(q), tips[some, None]], axis=1)
+    return bool(distance_to_box(points, things).min() > _HAND_RADIUS) and arm_is_clear(cell, q)
+
+
+def _box_around(heights: HeightMap) -> Box:
+    """Of all that stands, or may stand, on the table."""
+    stands = heights.ceiling > heights.table_height + _STANDS
+    if not stands.any():
+        return Box(np.zeros(3), np.array([*heights.origin, heights.table_height]))
+    row, column = np.nonzero(stands)
+    first = heights.origin + heights.cell * np.array([column.min(), row.min()])
+    last = heights.origin + heights.cell * np.array([column.max(), row.max()])
+    low = np.array([*first, heights.table_height])
+    high = np.array([*last, float(heights.ceiling[stands].max())])
+    return Box((high - low) / 2, (high + low) / 2)

@@ -1,0 +1,127 @@
+"""What one frame, and what two frames of a scene, show and hide, on boxes of known shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.planners import make_planner
+from tests.helpers.box_frames import boxes_frame
+from utils.geometry import GripperGeometry, Workspace
+from utils.height_map import (
+    HeightMap,
+    height_map_from_frame,
+    height_map_from_scene,
+    tilted_height_map,
+    tilted_view,
+)
+from utils.seen_heights import hides, sees_through, without_holes
+from utils.transforms import RGBDFrame, look_at
+
+BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))
+MIDDLE = np.array([0.5, 0.0, 0.0])
+
+
+def from_side(azimuth: float, tilt: float = 45.0, distance: float = 0.6) -> np.ndarray:
+    """T_WC of a camera that looks at the workspace's middle; degrees and metres."""
+    turn, lean = np.deg2rad(azimuth), np.deg2rad(tilt)
+    out = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
+    return look_at(MIDDLE + distance * out, MIDDLE)
+
+
+def seen_from(*azimuths: float, boxes=(BOX,)) -> RGBDFrame:
+    first, *others = (boxes_frame(list(boxes), T_WC=from_side(turn)) for turn in azimuths)
+    return replace(first, second=others[0]) if others else first
+
+
+def map_along(frame: RGBDFrame, approach: np.ndarray) -> HeightMap:
+    filled, hiding = without_holes(frame, Workspace())
+    overhead = height_map_from_frame(frame, Workspace())
+    return tilted_height_map(overhead, filled, hiding, tilted_view(approach, Workspace()))
+
+
+def open_volume(heights: HeightMap) -> float:
+    """cm3 between what was seen and what may be there."""
+    return 1e6 * heights.cell**2 * float((heights.ceiling - heights.height).sum())
+
+
+def test_a_box_seen_from_two_opposite_sides_casts_no_shadow() -> None:
+    """The shadow of a box of height h in parallel light, 45 degrees off the vertical, is a wedge of
+    volume h * h / 2 * depth: 400 cm3 here, somewhat more where the light spreads."""
+    one, both = (height_map_from_frame(f, Workspace()) for f in (seen_from(0), seen_from(0, 180)))
+    assert 400 < open_volume(one) < 600
+    assert open_volume(both) < 0.08 * open_volume(one)
+    exact = height_map_from_scene(seen_from(0).truth, Workspace(), cell=both.cell)
+    wrong = np.abs(both.height - exact.height) > 0.003
+    rims = 2 * (0.06 + 0.08) / both.cell  # cells
+    assert wrong.sum() < 2 * rims
+    # The single frame takes the box to be longer than it is: the lowest height near it is its own.
+    assert (np.abs(one.height - exact.height) > 0.003).sum() > 2 * wrong.sum()
+
+
+@pytest.mark.parametrize("azimuth", [0, 180])
+def test_both_flanks_of_a_box_are_known_to_a_hand_that_comes_from_either_side(azimuth) -> None:
+    turn, lean = np.deg2rad(azimuth), np.deg2rad(60)
+    approach = np.array([-np.sin(lean) * np.cos(turn), -np.sin(lean) * np.sin(turn), -np.cos(lean)])
+    one, both = (map_along(frame, approach) for frame in (seen_from(0), seen_from(0, 180)))
+    exact = height_map_from_scene(seen_from(0).truth, Workspace(), both.cell, T_WV=both.T_WV)
+    on_box = exact.label == 0
+    error = np.abs(both.height - exact.height)[on_box]
+    assert np.mean(error < 0.004) > 0.97
+    assert np.mean((both.ceiling - both.height)[on_box] < 0.004) > 0.9
+    if azimuth == 180:  # which the first frame alone does not see
+        assert np.mean(np.abs(one.height - exact.height)[on_box] < 0.004) < 0.7
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_second_frame_never_denies_what_is_there(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    boxes = [
+        (tuple(rng.uniform(0.02, (0.08, 0.08, 0.15))), rng.uniform(0, 3.1), place)
+        for place in rng.uniform((0.4, -0.1), (0.6, 0.1), (rng.integers(1, 5), 2))
+    ]
+    azimuth, other = rng.uniform(0, 360, 2)
+    one = height_map_from_frame(seen_from(azimuth, boxes=boxes), Workspace())
+    frame = seen_from(azimuth, other, boxes=boxes)
+    both = height_map_from_frame(frame, Workspace())
+    exact = height_map_from_scene(frame.truth, Workspace(), cell=both.cell)
+    denied = [(exact.height > heights.ceiling + 0.006).sum() for heights in (both, one)]
+    assert denied[0] <= denied[1] + 5  # cells at edges, where a pixel is wider than they are
+    assert (both.ceiling <= np.maximum(one.ceiling, both.height) + 1e-6).all()
+    assert (both.ceiling >= both.height).all()
+
+
+def test_a_second_frame_without_a_depth_adds_nothing() -> None:
+    frame = seen_from(0, 180)
+    blind = replace(frame.second, depth=np.zeros_like(frame.second.depth))
+    one = height_map_from_frame(seen_from(0), Workspace())
+    both = height_map_from_frame(replace(frame, second=blind), Workspace())
+    for name in ("height", "ceiling", "label"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(both, name))
+
+
+def test_what_a_frame_sees_through_and_what_it_hides() -> None:
+    """From straight above: over a box, in it, under it, beside it, under the table, out of sight;
+    and where nothing was measured."""
+    frame = boxes_frame([BOX])
+    box, beside = (0.5, 0.0), (0.5, 0.1)
+    points = np.array([(*box, 0.12), (*box, 0.05), (*beside, 0.05), (*beside, -0.05), (2, 2, 0.1)])
+    assert sees_through(frame, points).tolist() == [True, False, True, False, False]
+    assert hides(frame, points).tolist() == [False, True, False, True, True]
+    blind = replace(frame, depth=np.zeros_like(frame.depth))
+    assert not sees_through(blind, points).any() and hides(blind, points).all()
+
+
+def test_only_the_first_frame_tells_a_privileged_planner_the_truth() -> None:
+    frame = seen_from(0, 180).without_truth()
+    assert frame.truth is None and frame.second.truth is None
+
+
+@pytest.mark.parametrize("name", ["heuristic", "heuristic6d", "graspnet", "graspnet6d"])
+def test_planners_take_two_frames(name) -> None:
+    plan = make_planner(name, GripperGeometry(), Workspace(), 0)
+    best = plan(seen_from(0, 180).without_truth())[0]
+    beyond = np.abs(best.position - (0.5, 0, 0.05)) - (0.03, 0.04, 0.05)
+    assert (beyond < 0.005).all()  # the point between the fingertips is in the box
