@@ -361,7 +361,13 @@ def measure(
     feasible = np.zeros(N, bool)
     feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
-    return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score * feasible)
+    facts = np.column_stack([
+        wedge, tilt_left, tilt_right, cover, arm_across, arm_along, arm_up, engagement, covered,
+        (opening - width) / 2, ends[0] == ends[1],
+    ])  # fmt: skip
+    facts = np.nan_to_num(facts, posinf=np.pi, neginf=-np.pi)  # of what touches nothing
+    score *= feasible
+    return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score, facts)
 
 
 def _cells(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:

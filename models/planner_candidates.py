@@ -16,6 +16,15 @@ from utils.geometry import GripperGeometry
 from utils.grasp_quality import RELAXED
 from utils.transforms import Grasp, angle_difference
 
+# What the search measures of a candidate, metres and radians: half the angle between the faces in
+# plan view; each face's tilt; the smaller share of a pad in touch; lever arms to the centre of
+# mass; how far the matter rises over the tips; the share of the hand under which matter may be
+# hidden; the room beside each contact; 1 where both ends lie on one object.
+FACTS = (
+    "wedge", "tilt_left", "tilt_right", "cover", "arm_across", "arm_along", "arm_up", "engagement",
+    "covered", "room", "one_object",
+)  # fmt: skip
+
 
 @dataclass
 class Candidates:
@@ -24,7 +33,8 @@ class Candidates:
     xy: (N, 2) middle between the fingertips in W. angle: (N,) of the closing line. tip: (N,) height
     of the fingertips' lowest point in W. width: (N,) of the matter between the fingers. opening:
     (N,) of the hand before closing. turn: (N,) rotation that would bring the pads flat onto the
-    faces. label: (N,) the object in the height map. score: (N,), 0 for an infeasible grasp.
+    faces. label: (N,) the object in the height map. score: (N,), 0 for an infeasible grasp. facts:
+    (N, len(FACTS)) what was measured, 0 before.
     """
 
     xy: np.ndarray
@@ -35,13 +45,17 @@ class Candidates:
     turn: np.ndarray
     label: np.ndarray
     score: np.ndarray
+    facts: np.ndarray
 
     @staticmethod
     def rough(xy, angle, tip, width, score) -> Candidates:
         """Candidates of the dense stage, which are not measured yet."""
-        return Candidates(
-            xy, angle, tip, width, width, np.zeros(len(tip)), np.full(len(tip), -1), score
+        turn, label, facts = (
+            np.zeros(len(tip)),
+            np.full(len(tip), -1),
+            np.zeros((len(tip), len(FACTS))),
         )
+        return Candidates(xy, angle, tip, width, width, turn, label, score, facts)
 
     @staticmethod
     def joined(parts: Sequence[Candidates]) -> Candidates:

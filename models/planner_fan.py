@@ -32,6 +32,8 @@ from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
 
 Value = Callable[[HeightMap, Candidates], np.ndarray]
 """A factor (N,) on the scores of candidates that were found on a map."""
+Judge = Callable[[HeightMap, Candidates], Candidates]
+"""The candidates of one view, best first, with other scores; perhaps fewer."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +96,21 @@ class FanPlanner(SearchPlanner):
         self.fan = replace(self.fan, returned=max(count, self.fan.returned))
 
     def search_fan(
-        self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
+        self,
+        maps: Callable[[np.ndarray], HeightMap],
+        value: Value | None = None,
+        judge: Judge | None = None,
     ) -> list[Grasp]:
         """The grasps of all views, best first; may be empty.
 
-        maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
-        margins, relaxed ones serve.
+        maps: gives the height map in a frame T_WV (4, 4). judge: has the last word on what a view's
+        candidates are worth. Where nothing in any view meets the margins, relaxed ones serve.
         """
         views = list(self._views(maps))
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
-                grasps += self._search_view(heights, settings, value)
+                grasps += self._search_view(heights, settings, value, judge)
             if grasps:
                 best = distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
                 return with_chances(best, self.calibration)
@@ -125,14 +130,20 @@ class FanPlanner(SearchPlanner):
             yield heights
 
     def _search_view(
-        self, heights: HeightMap, settings: SearchSettings, value: Value | None
+        self,
+        heights: HeightMap,
+        settings: SearchSettings,
+        value: Value | None,
+        judge: Judge | None,
     ) -> list[Grasp]:
         tilt = np.arccos(np.clip(heights.T_WV[2, 2], -1.0, 1.0))
         on_map = None if value is None else lambda candidates: value(heights, candidates)
         found = search_once(
             heights, self._with_wrist, self.workspace, settings, on_map, 2 if tilt > 0 else 1
         )
-        found = self.judged(heights, found).distinct(
+        if judge is not None and len(found):
+            found = judge(heights, found)
+        found = found.distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
         factor = np.exp(-((min(tilt, _TILTED) / self.fan.tilt_scale) ** 2))
@@ -140,10 +151,6 @@ class FanPlanner(SearchPlanner):
             Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
             for grasp in found.grasps(self.gripper)
         ]
-
-    def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
-        """The candidates of one view, best first, perhaps with other scores."""
-        return found
 
 
 def distinct(grasps: Sequence[Grasp], fan: FanSettings) -> list[Grasp]:
@@ -201,27 +208,23 @@ class OracleFanPlanner(FanPlanner):
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         overhead, truth = self.heights(frame), frame.truth
         assert truth is not None  # `heights` needs it
-        self._truth = truth
-        self._buried = buried_share(truth, overhead)
+        buried = buried_share(truth, overhead)
         wanted = None if frame.target is None else object_of_target(overhead, frame)
 
         def exact(T_WV: np.ndarray) -> HeightMap:
             heights = height_map_from_scene(truth, self.workspace, T_WV=T_WV)
             return heights if frame.target is None else only_object(heights, wanted)
 
-        return self.search_fan(exact)
+        def by_contacts(heights: HeightMap, found: Candidates) -> Candidates:
+            found = found.distinct(self.count, 0.004, np.deg2rad(8))
+            scene = truth.transformed(inverse_pose(heights.T_WV))
+            quality = exact_quality(found, scene, self.gripper)
+            found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
+            return found.best(len(found))
+
+        return self.search_fan(exact, judge=by_contacts)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
         return height_map_from_scene(frame.truth, self.workspace)
-
-    def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
-        found = found.distinct(self.count, 0.004, np.deg2rad(8))
-        if len(found) == 0:
-            return found
-        scene = self._truth.transformed(inverse_pose(heights.T_WV))
-        quality = exact_quality(found, scene, self.gripper)
-        buried = self._buried[found.label]
-        found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried)
-        return found.best(len(found))

@@ -16,6 +16,7 @@ CVPR 2020). Parts whose votes do not meet keep the height map's label.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ import cv2
 import numpy as np
 import torch
 
+from models.grasp_critic import INPUTS, GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
 from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
@@ -173,6 +175,7 @@ PEAKS = PeakSettings(threshold=0.02, count=80, radius=3)
 DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of the labels
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 CROP_MARGIN = 0.04  # m around what stands on the table
+JUDGED = 12  # candidates of a view that the critic judges
 LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
 
@@ -264,7 +267,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
 
 class GraspNetFanPlanner(FanPlanner):
-    """A fan of views, its grasps ranked by what a network predicts for the image that was taken."""
+    """A fan of views: a network values the candidates by the image that was taken, and a critic has
+    the last word on what was measured of them (`models.grasp_critic`)."""
 
     def __init__(
         self,
@@ -273,11 +277,20 @@ class GraspNetFanPlanner(FanPlanner):
         seed: int = 0,
         checkpoint: Path = SHIPPED,
         network: SavedGraspNet | None = None,
+        critic: GraspCritic | None = None,
     ):
         super().__init__(gripper, workspace, seed)
         self.network = network or loaded(checkpoint)
+        self.critic = critic or shipped_critic()
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        return self.judged_by(frame, self.by_critic)
+
+    def judged_by(
+        self, frame: RGBDFrame, judge: Callable[[HeightMap, Candidates, np.ndarray], Candidates]
+    ) -> list[Grasp]:
+        """The grasps of a frame, ranked by `judge`, which gets a view's map, its best candidates
+        and what the critic sees of them (`models.grasp_critic.critic_inputs`)."""
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace)
         overhead = only_target(seen.heights, frame)
@@ -286,7 +299,21 @@ class GraspNetFanPlanner(FanPlanner):
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(tilted, seen.value)
+        towards = frame.T_WC[:3, 3] - [*self.workspace.centre, self.workspace.table_height]
+        towards = towards / np.linalg.norm(towards)
+
+        def of_view(heights: HeightMap, found: Candidates) -> Candidates:
+            found = found.distinct(JUDGED, self.fan.distinct_distance, self.fan.distinct_turn)
+            value = seen.value(heights, found)
+            return judge(heights, found, critic_inputs(found, heights, value, towards))
+
+        return self.search_fan(tilted, seen.value, of_view)
+
+    def by_critic(self, heights: HeightMap, found: Candidates, inputs: np.ndarray) -> Candidates:
+        """Candidates ranked by the critic's chance."""
+        # The top of a pile first: what lies below may be held down.
+        rise = np.clip(inputs[:, INPUTS.index("tip_rise")], 0, 0.15)
+        return replace(found, score=self.critic.chance(inputs) * (1 + rise)).best(len(found))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace).heights

@@ -43,8 +43,8 @@ class SeenHeights:
     height: the highest surface seen; hidden cells hold the lowest one nearby. ceiling: the highest
     that matter could reach which was hidden or not measured; equals `height` where there is none.
     hidden: bool, cells in which no surface was seen. unknown: bool, cells of which not even the
-    surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`. T_WV: (4, 4)
-    the grid's frame in W.
+    surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`. T_WV:
+    (4, 4) the grid's frame in W.
     """
 
     height: np.ndarray
