@@ -94,14 +94,17 @@ class FanPlanner(SearchPlanner):
         self.fan = replace(self.fan, returned=max(count, self.fan.returned))
 
     def search_fan(
-        self, maps: Callable[[np.ndarray], HeightMap], value: Value | None = None
+        self,
+        overhead: HeightMap,
+        maps: Callable[[np.ndarray], HeightMap],
+        value: Value | None = None,
     ) -> list[Grasp]:
         """The grasps of all views, best first; may be empty.
 
-        maps: gives the height map in a frame T_WV (4, 4). Where nothing in any view meets the
-        margins, relaxed ones serve.
+        overhead: the map from above, without what hangs over the table. maps: gives the height map
+        in a frame T_WV (4, 4). Where nothing in any view meets the margins, relaxed ones serve.
         """
-        views = list(self._views(maps))
+        views = list(self._views(overhead, maps))
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
@@ -111,18 +114,16 @@ class FanPlanner(SearchPlanner):
                 return with_chances(best, self.calibration)
         return []
 
-    def _views(self, maps: Callable[[np.ndarray], HeightMap]) -> Iterator[HeightMap]:
+    def _views(
+        self, overhead: HeightMap, maps: Callable[[np.ndarray], HeightMap]
+    ) -> Iterator[HeightMap]:
         """The maps of the fan, the one from above first. Those of a hand that comes nearly level
         are left out where nothing is high enough for it."""
-        over_table = -np.inf
+        rises = overhead.height[overhead.label >= 0] - overhead.table_height
+        level = rises.max(initial=-np.inf) >= _LEVEL_FROM
         for approach in self.fan.directions():
-            if over_table < _LEVEL_FROM and approach[2] > -_LEVEL:
-                continue
-            heights = maps(tilted_view(approach, self.workspace))
-            if approach[2] == -1.0:
-                rises = heights.height[heights.label >= 0] - heights.table_height
-                over_table = rises.max(initial=-np.inf)
-            yield heights
+            if level or approach[2] <= -_LEVEL:
+                yield maps(tilted_view(approach, self.workspace))
 
     def _search_view(
         self, heights: HeightMap, settings: SearchSettings, value: Value | None
@@ -183,10 +184,10 @@ class HeuristicFanPlanner(FanPlanner):
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(seen)
+        return self.search_fan(overhead, seen)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
-        return height_map_from_frame(frame, self.workspace)
+        return height_map_from_frame(frame, self.workspace, below=True)
 
 
 class OracleFanPlanner(FanPlanner):
@@ -205,16 +206,18 @@ class OracleFanPlanner(FanPlanner):
         self._buried = buried_share(truth, overhead)
         wanted = None if frame.target is None else object_of_target(overhead, frame)
 
-        def exact(T_WV: np.ndarray) -> HeightMap:
-            heights = height_map_from_scene(truth, self.workspace, T_WV=T_WV)
+        def of_target(heights: HeightMap) -> HeightMap:
             return heights if frame.target is None else only_object(heights, wanted)
 
-        return self.search_fan(exact)
+        def exact(T_WV: np.ndarray) -> HeightMap:
+            return of_target(height_map_from_scene(truth, self.workspace, T_WV=T_WV))
+
+        return self.search_fan(of_target(overhead), exact)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
-        return height_map_from_scene(frame.truth, self.workspace)
+        return height_map_from_scene(frame.truth.uncovered(), self.workspace)
 
     def judged(self, heights: HeightMap, found: Candidates) -> Candidates:
         found = found.distinct(self.count, 0.004, np.deg2rad(8))

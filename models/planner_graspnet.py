@@ -252,17 +252,17 @@ class GraspNetFanPlanner(FanPlanner):
         self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        seen = NetworkView(self.network, frame, self.workspace)
+        seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)
         filled, hiding = without_holes(seen.frame, self.workspace)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(tilted, seen.value)
+        return self.search_fan(overhead, tilted, seen.value)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
-        return NetworkView(self.network, frame, self.workspace).heights
+        return NetworkView(self.network, frame, self.workspace, below=True).heights
 
 
 class NetworkView:
@@ -270,11 +270,17 @@ class NetworkView:
 
     frame: corrected by its table, holes of its depth filled where colours tell what is there.
     heights: the map from above. crop: whether only the part of the image is looked at in which
-    something stands. Raises UserError for an image that the network cannot take.
+    something stands. below: as in `height_map_from_frame`. Raises UserError for an image that the
+    network cannot take.
     """
 
     def __init__(
-        self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace, crop: bool = False
+        self,
+        network: SavedGraspNet,
+        frame: RGBDFrame,
+        workspace: Workspace,
+        crop: bool = False,
+        below: bool = False,
     ):
         model, metres_per_pixel, *_ = network
         frame = corrected(frame, workspace.table_height)
@@ -284,7 +290,7 @@ class NetworkView:
         self.frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
         knows_centres = model.centre_head is not None
         self._maps = run_network(model, self.frame, self._scaling, knows_centres)
-        self.heights = height_map_from_frame(self.frame, workspace)
+        self.heights = height_map_from_frame(self.frame, workspace, below=below)
         if knows_centres:
             offset = self._maps[3][0].numpy()
             self.heights = labelled_by_centres(self.heights, self.frame, self._scaling, offset)

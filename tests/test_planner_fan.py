@@ -338,5 +338,6 @@ def test_level_views_are_searched_where_something_is_high():
     for height, tilts in ((0.08, {0, 30, 60}), (0.12, {0, 30, 60, 85})):
         plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
         truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
-        views = plan._views(partial(_exact_map, truth))
+        overhead = height_map_from_scene(truth, Workspace())
+        views = plan._views(overhead, partial(_exact_map, truth))
         assert {round(np.degrees(np.arccos(view.T_WV[2, 2]))) for view in views} == tilts

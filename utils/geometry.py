@@ -14,6 +14,9 @@ from scipy.spatial import ConvexHull
 from utils.transforms import transform_points
 
 
+_HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
+
+
 @dataclass(frozen=True)
 class ConvexSolid:
     """vertices (V, 3) in metres; outward unit normals (F, 3) and offsets (F,)."""
@@ -33,6 +36,10 @@ class ConvexSolid:
         return ConvexSolid(
             transform_points(T, self.vertices), normals, self.offsets + normals @ T[:3, 3]
         )
+
+    def hangs(self, table_height: float) -> bool:
+        """Whether the solid, in W, leaves room below it on a table, as the board of a shelf does."""
+        return bool(self.vertices[:, 2].min() > table_height + _HANGS_FROM)
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,11 @@ class SceneGeometry:
         )
         walls = tuple(wall.transformed(T) for wall in self.walls)
         return SceneGeometry(objects, self.table_height, walls)
+
+    def uncovered(self) -> SceneGeometry:
+        """The scene in W without walls that hang over the table."""
+        walls = tuple(wall for wall in self.walls if not wall.hangs(self.table_height))
+        return replace(self, walls=walls)
 
 
 @dataclass(frozen=True)
