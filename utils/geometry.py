@@ -13,8 +13,7 @@ from scipy.spatial import ConvexHull
 
 from utils.transforms import transform_points
 
-
-_HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
+HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,8 @@ class ConvexSolid:
         )
 
     def hangs(self, table_height: float) -> bool:
-        """Whether the solid, in W, leaves room below it on a table, as the board of a shelf does."""
-        return bool(self.vertices[:, 2].min() > table_height + _HANGS_FROM)
+        """Whether the solid, in W, leaves room below it on a table, as a shelf's board does."""
+        return bool(self.vertices[:, 2].min() > table_height + HANGS_FROM)
 
 
 @dataclass(frozen=True)

@@ -165,9 +165,7 @@ def height_map_from_frame(
     return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
 
 
-def _uncovered(
-    filled: RGBDFrame, hiding: np.ndarray, table: float
-) -> tuple[RGBDFrame, np.ndarray]:
+def _uncovered(filled: RGBDFrame, hiding: np.ndarray, table: float) -> tuple[RGBDFrame, np.ndarray]:
     """A frame `without_holes` and without what hangs over the table: its pixels are unknown."""
     hanging = [solid for solid in filled.fixtures if solid.hangs(table)]
     if not hanging:
