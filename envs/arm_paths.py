@@ -39,6 +39,7 @@ _ARM_RADIUS = 0.065  # m of the links between elbow and flange
 _HAND_RADIUS = 0.02  # m kept around the points on hand and object
 _LENGTH = 0.105  # m of the hand, from its flange to the fingertips
 _OUT = 0.09  # m before what hangs over the table, where an object in the hand is out from under it
+_LEVEL = 0.3  # least level part of an approach that leads out from under something
 _FARTHEST = 0.4  # m, of a way out
 _STEP = 0.01  # m, between two places that are looked at
 _OVER = 0.04  # m over what hangs over the table, at which the lower end of an object passes
@@ -81,7 +82,8 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
 
 def standoff(cell: Cell, grasp: Grasp) -> float:
     """Metres before a grasp at which the straight approach starts."""
-    return max(cell.config.execution.pregrasp_height, way_out(cell, grasp.pose))
+    out = way_out(cell, grasp.position, -grasp.approach)
+    return max(cell.config.execution.pregrasp_height, out)
 
 
 def _from_above(cell: Cell, q: np.ndarray) -> Trajectory:
@@ -92,8 +94,7 @@ def _from_above(cell: Cell, q: np.ndarray) -> Trajectory:
     rise = line(cell, q, above)
     back = np.vstack([rise.positions[-2::-1], q])
     fall = Trajectory(back, np.vstack([-rise.velocities[-2::-1], np.zeros(7)]))
-    reach = cell.robot.joint_move(cell.robot.q, rise.positions[-1], **scales(cell))
-    return cell.robot.blended_moves(cell.robot.q, reach, fall, 0, **scales(cell))
+    return _joined([cell.robot.joint_move(cell.robot.q, rise.positions[-1], **scales(cell)), fall])
 
 
 def clears(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
@@ -135,19 +136,31 @@ def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
 
 def way_up(cell: Cell, q: np.ndarray, T_WE: np.ndarray, height: float) -> Trajectory:
     """From joint positions q (7,) the way on which an object is lifted that the hand gripped at
-    T_WE (4, 4), `height` m over the table: straight up, or where something hangs over it, back
-    along the approach before. Raises UnreachableError."""
-    out = way_out(cell, T_WE)
-    if out == 0.0:
+    T_WE (4, 4), `height` m over the table: straight up, or where something hangs over it, level out
+    from under it before. Raises UnreachableError."""
+    before = withdrawn(cell, T_WE)
+    if before is T_WE:
         return line(cell, q, raised(cell, T_WE, height))
     off = T_WE.copy()
-    off[2, 3] += _OFF_TABLE
-    before = backed(off, out)
+    off[2, 3] = before[2, 3]
     parts: list[Trajectory] = []
     for pose in (off, before, raised(cell, before, height)):
         parts.append(line(cell, parts[-1].positions[-1] if parts else q, pose))
-    positions, velocities = zip(*((part.positions, part.velocities) for part in parts))
-    return Trajectory(np.concatenate(positions), np.concatenate(velocities))
+    return _joined(parts)
+
+
+def withdrawn(cell: Cell, T_WE: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a hand at T_WE that has gone out from under what hangs over the table: the
+    same object where nothing does. It goes level, because the object may be nearly as high as the
+    room below, and a little over the table."""
+    back = -T_WE[:3, 2] * (1.0, 1.0, 0.0)
+    size = np.linalg.norm(back)
+    out = way_out(cell, T_WE[:3, 3], back / size) if size > _LEVEL else 0.0
+    if out == 0.0:
+        return T_WE
+    before = T_WE.copy()
+    before[:3, 3] += out * back / size + (0.0, 0.0, _OFF_TABLE)
+    return before
 
 
 def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
@@ -159,12 +172,22 @@ def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
 
 
 def way_to_bin(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
-    """From joint positions q (7,), at which an object has been lifted `top` m high, to the bin.
-    Raises UnreachableError."""
+    """From joint positions q (7,), at which an object has been lifted `top` m high, to the bin; by
+    way of home, where the hand is high, if something hangs over the table. Raises
+    UnreachableError."""
     over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
     over_bin[2] = max(over_bin[2], top - _LIFT_MARGIN)
     posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
-    return cell.robot.joint_move(q, posture, **scales(cell))
+    if not hanging(cell):
+        return cell.robot.joint_move(q, posture, **scales(cell))
+    first = cell.robot.joint_move(q, cell.home, **scales(cell))
+    return _joined([first, cell.robot.joint_move(cell.home, posture, **scales(cell))])
+
+
+def _joined(parts: list[Trajectory]) -> Trajectory:
+    """Motions after each other, with a rest between them."""
+    positions, velocities = zip(*((part.positions, part.velocities) for part in parts))
+    return Trajectory(np.concatenate(positions), np.concatenate(velocities))
 
 
 def backed(T_WE: np.ndarray, distance: float) -> np.ndarray:
@@ -213,11 +236,11 @@ def hanging(cell: Cell) -> list[Box]:
     return [wall for wall in walls if wall.position[2] - wall.half_size[2] > HANGS_FROM]
 
 
-def way_out(cell: Cell, T_WE: np.ndarray) -> float:
-    """Metres by which a hand at T_WE (4, 4) has to go back along its approach to be out from under
-    all that hangs over the table; 0 where it is out already, or cannot get out so."""
+def way_out(cell: Cell, place: np.ndarray, back: np.ndarray) -> float:
+    """Metres by which E has to go from a place (3,) along `back` (3,), a unit vector, to be out
+    from under all that hangs over the table; 0 where it is out already, or cannot get out so."""
     steps = np.arange(0.0, _FARTHEST, _STEP)
-    places = T_WE[:3, 3] - steps[:, None] * T_WE[:3, 2]
+    places = place + steps[:, None] * back
     below = np.zeros(len(steps), bool)
     for box in hanging(cell):
         apart = np.maximum(abs(places - box.position) - box.half_size, 0.0)[:, :2]

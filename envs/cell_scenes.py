@@ -74,10 +74,10 @@ _FLAT, _SPAN = 0.016, 0.085  # m, of the layout flat: greatest thickness, least 
 _BLOCK = np.array([0.34, 0.16, 0.15])  # m, on which flat things lie; half a hand high and more
 _OVERHANG = (0.02, 0.06)  # m
 # m, of the layout shelf: its board's length, depth, thickness and lower side, and by how much its
-# front edge is beyond the middle of the workspace; the arm goes in level up to 0.2 m deep.
+# front edge is beyond the middle of the workspace; the arm goes in level up to 0.15 m deep.
 _BOARD, _BOARD_HEIGHT, _FRONT = np.array([0.40, 0.26, 0.02]), 0.30, 0.07
 _SHELVED = (0.12, 0.25)  # m, longest sides of what stands under the board
-_SHELF_MIDDLE, _SHELF_REACH = np.array([0.0, -0.045]), np.array([0.12, 0.055])  # m, of the places
+_SHELF_MIDDLE, _SHELF_REACH = np.array([0.0, -0.02]), np.array([0.12, 0.05])  # m, of the places
 _SHELF_GAP = 0.03  # m, least between neighbours: a finger with its room needs 0.02 m
 
 

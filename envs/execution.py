@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from envs.arm_paths import (
     OVER_BIN,
     all_plans,
-    backed,
     clears,
     farther_than,
     first_plan,
@@ -30,9 +29,9 @@ from envs.arm_paths import (
     raised,
     scales,
     standoff,
-    way_out,
     way_to_bin,
     way_up,
+    withdrawn,
 )
 from envs.cell import Cell, require_arm
 from envs.panda_model import FINGER_FORCE
@@ -298,9 +297,9 @@ def _go_home(cell: Cell) -> str:
     T = forward_kinematics(robot.q)
     # Without the lines, the joint motion below goes up as well, only less straight.
     with contextlib.suppress(UnreachableError, ArmStoppedError):
-        out = way_out(cell, T)
-        if out > 0.0:
-            T = backed(T, out)
+        before = withdrawn(cell, T)
+        if before is not T:
+            T = before
             _follow(cell, line(cell, robot.q, T, speed))
         high = max(_HIGH, height_over(cell, cell.gripper.palm_half_length))
         if T[2, 3] < high:
