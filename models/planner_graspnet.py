@@ -259,7 +259,7 @@ class GraspNetFanPlanner(FanPlanner):
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(overhead, tilted, seen.value)
+        return self.search_fan(overhead, tilted, seen.value, self.covered(frame.fixtures))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights
