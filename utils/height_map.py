@@ -149,13 +149,16 @@ def height_map_from_frame(
     seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
     if complete is not None:
         seen = complete(seen)
+    surface = seen.height
+    if len(filled.fixtures) < len(frame.fixtures):  # the back of a shelf is no object's shadow
+        surface = np.where(seen.hidden, table, surface)
     if not filled.fixtures:
-        label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
+        label = label_walls(label_pieces(surface, table, cell), grid, workspace, cell)
         centres = _column_centroids(seen.height - table, label, grid, table)
         return HeightMap(*seen.walled(), label, centres, origin, cell, table)
     fixed = _tops(filled.fixtures, grid, origin, cell)
     bare = _bare(seen.height, fixed)
-    label = label_pieces(np.where(bare, table, seen.height), table, cell)
+    label = label_pieces(np.where(bare, table, surface), table, cell)
     label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
     base = base_heights(label, fixed, table)
     on = np.append(base, (table, table))[label]  # the last two are of walls and of the table
