@@ -36,8 +36,8 @@ _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execu
 _LOOK_EVERY = 12  # references between two at which arm and hand are looked at
 _OFF_TABLE = 0.015  # m by which an object is lifted before it leaves a place below something
 _ARM_RADIUS = 0.065  # m of the links between elbow and flange
-# The forearm is thicker by the elbow, which comes near only what is as high: it met a board that was
-# 0.105 m off its line. The first points are those within 0.2 m of the elbow.
+# The forearm is thicker by the elbow, which comes near only what is as high: it met a board 0.105 m
+# off its line. The first points are those within 0.2 m of the elbow.
 _ELBOW_RADIUS, _BY_ELBOW = 0.12, 6  # m
 _HAND_RADIUS = 0.02  # m kept around the points on hand and object
 _LENGTH = 0.105  # m of the hand, from its flange to the fingertips
