@@ -36,9 +36,9 @@ _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execu
 _LOOK_EVERY = 12  # references between two at which arm and hand are looked at
 _OFF_TABLE = 0.015  # m by which an object is lifted before it leaves a place below something
 _ARM_RADIUS = 0.065  # m of the links between elbow and flange
-# The forearm is thicker by the elbow, which comes near only what is as high: it met a board 0.105 m
-# off its line. The first points are those within 0.2 m of the elbow.
-_ELBOW_RADIUS, _BY_ELBOW = 0.12, 6  # m
+# The forearm is thicker at its ends: off its line it met a board by 0.105 m near the elbow, and the
+# table by 0.13 m near the wrist. Of its 13 points the first 6 are within 0.2 m of the elbow.
+_ELBOW_RADIUS, _BY_ELBOW, _WRIST_RADIUS, _FOREARM = 0.12, 6, 0.14, 13  # m
 _HAND_RADIUS = 0.02  # m kept around the points on hand and object
 _LENGTH = 0.105  # m of the hand, from its flange to the fingertips
 _OUT = 0.09  # m before what hangs over the table, where an object in the hand is out from under it
@@ -266,8 +266,15 @@ def arm_is_clear(cell: Cell, q: np.ndarray) -> bool:
         return False  # where a curve between waypoints may leave the limits
     boxes = [table_box(), *bin_walls(), *(cell.scene.walls if cell.scene else ())]
     points = arm_points(q)
-    by_elbow = points[:, :_BY_ELBOW]
-    return _apart(points, boxes) > _ARM_RADIUS and _apart(by_elbow, hanging(cell)) > _ELBOW_RADIUS
+    if _apart(points, boxes) <= _ARM_RADIUS:
+        return False
+    if not hanging(cell):  # only postures for a hand below something bring the forearm near
+        return True
+    forearm = points[:, :_FOREARM]
+    return (
+        _apart(forearm[:, :_BY_ELBOW], boxes) > _ELBOW_RADIUS
+        and _apart(forearm, [table_box()]) > _WRIST_RADIUS
+    )
 
 
 def hand_is_clear(cell: Cell, q: np.ndarray, held: np.ndarray | None = None) -> bool:
