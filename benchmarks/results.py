@@ -135,7 +135,7 @@ PARTS = (
     Part("scenes", "scenes that ask for grasps from the side", 20, tuple(
         _evaluation(name, 15, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={scenarios} "
                     f"evaluate.object_sets={name}", noises="realsense", kept=3)
-        for name, scenarios in (("tall", "tall,wall"), ("flat", "wall,flat"))
+        for name, scenarios in (("tall", "tall,wall,shelf"), ("flat", "wall,flat"))
     )),
     Part("retrieve", "one object under a pile", 20, (
         _evaluation("retrieve", 25, "evaluate.policies=graspnet,oracle "

@@ -7,6 +7,7 @@ whatever `scene.count` says. `bin`: a pile between walls that stand around the w
 `tall`: things higher than the fingers are long, upright and close together. `wall`: things that
 lean against a wall. `flat`: things wider than the hand at the edge of a block. `retrieve`: a pile
 of RETRIEVE_COUNT objects, one of which, partly covered by others, is wanted, see `_covered`.
+`shelf`: tall things under a board, open to one side.
 `packed` and `pile` follow VGN (Breyer et al., "Volumetric Grasping Network", CoRL 2020).
 
 The objects come to rest in the simulator `scene.simulator`, whichever simulator the scene is for,
@@ -44,10 +45,12 @@ from utils.transforms import pose_matrix
 # Their places are part of the scenes' seeds.
 LAYOUTS = (
     "isolated", "packed", "pile", "dense", "bin", "household", "tall", "wall", "flat", "retrieve",
+    "shelf",
 )  # fmt: skip
 TARGET_LAYOUT = "retrieve"  # of whose objects one is wanted
 DENSE_COUNT, RETRIEVE_COUNT = 15, 8
 WALL_COUNT, FLAT_COUNT = 3, 2  # wide things, which need room beside each other
+SHELF_COUNT = 3
 # Of the object to retrieve: what others cover of it, seen from above, and what shows of it.
 LEAST_COVERED, LEAST_SHOWN, LEAST_AREA = 0.2, 0.2, 2e-4  # shares, m2
 
@@ -70,6 +73,12 @@ _SLOT_PLAY = 0.02  # m to either side of the places at which things lean
 _FLAT, _SPAN = 0.016, 0.085  # m, of the layout flat: greatest thickness, least second longest side
 _BLOCK = np.array([0.34, 0.16, 0.15])  # m, on which flat things lie; half a hand high and more
 _OVERHANG = (0.02, 0.06)  # m
+# m, of the layout shelf: its board's length, depth, thickness and lower side, and by how much its
+# front edge is beyond the middle of the workspace; the arm goes in level up to 0.15 m deep.
+_BOARD, _BOARD_HEIGHT, _FRONT = np.array([0.40, 0.26, 0.02]), 0.30, 0.07
+_SHELVED = (0.12, 0.25)  # m, longest sides of what stands under the board
+_SHELF_MIDDLE, _SHELF_REACH = np.array([0.0, -0.02]), np.array([0.12, 0.05])  # m, of the places
+_SHELF_GAP = 0.03  # m, least between neighbours: a finger with its room needs 0.02 m
 
 
 class SceneError(UserError):
@@ -203,6 +212,17 @@ def _block(config: Config) -> tuple[Box, ...]:
     return (Box(_BLOCK / 2, np.append(config.workspace.center, _BLOCK[2] / 2)),)
 
 
+def _shelf(config: Config) -> tuple[Box, ...]:
+    """A board over the workspace, and the back that holds it on the side of the bin."""
+    x, y = config.workspace.center
+    front = y + _FRONT
+    back = np.array([_BOARD[0], _BOARD[2], _BOARD_HEIGHT])
+    return (
+        Box(_BOARD / 2, np.array([x, front - _BOARD[1] / 2, _BOARD_HEIGHT + _BOARD[2] / 2])),
+        Box(back / 2, np.array([x, front - _BOARD[1] + back[1] / 2, back[2] / 2])),
+    )
+
+
 def _inside(position: np.ndarray, config: Config) -> bool:
     offset = abs(position[:2] - config.workspace.center)
     return bool(np.isfinite(position).all() and offset.max() <= config.workspace.size / 2
@@ -268,16 +288,39 @@ def _stand_close(
     table: LayoutTable, models: list[ObjectModel], rng, config: Config
 ) -> list[int] | None:
     """Each object on its longest side's end, near another one; None if one finds no place."""
+    middle, reach = np.array(config.workspace.center), np.full(2, _PACKED_REGION)
+    return _stand_in(table, models, rng, middle, reach, _PACKED_GAP, _TALL_GAP)
+
+
+def _stand_below(
+    table: LayoutTable, models: list[ObjectModel], rng, config: Config
+) -> list[int] | None:
+    """Each object on its longest side's end under the board; None if one finds no place."""
+    middle = np.array(config.workspace.center) + _SHELF_MIDDLE
+    return _stand_in(table, models, rng, middle, _SHELF_REACH, _SHELF_GAP)
+
+
+def _stand_in(
+    table: LayoutTable,
+    models: list[ObjectModel],
+    rng,
+    middle: np.ndarray,
+    reach: np.ndarray,
+    gap: float,
+    within: float | None = None,
+) -> list[int] | None:
+    """Each object on its longest side's end, its centre no farther than `reach` (2,) from `middle`
+    (2,); gap, within: as in `_put_free`. None if one finds no place."""
     bodies: list[int] = []
     for model in models:
         upright = Rotation.align_vectors([[0, 0, 1]], [np.eye(3)[np.argmax(model.extents)]])[0]
 
         def anywhere(model=model, upright=upright) -> tuple[np.ndarray, Rotation]:
             rotation = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) * upright
-            place = config.workspace.center + rng.uniform(-_PACKED_REGION, _PACKED_REGION, 2)
+            place = middle + rng.uniform(-reach, reach)
             return np.append(place, 0.001 - _lowest(model, rotation)), rotation
 
-        if not _put_free(table, model, bodies, anywhere, within=_TALL_GAP):
+        if not _put_free(table, model, bodies, anywhere, gap, within):
             return None
     return bodies
 
@@ -287,16 +330,17 @@ def _put_free(
     model: ObjectModel,
     bodies: list[int],
     draw: Callable[[], tuple[np.ndarray, Rotation]],
+    gap: float = _PACKED_GAP,
     within: float | None = None,
 ) -> bool:
-    """Put an object at the first pose that `draw` gives, of _TRIES, at which it touches none of the
+    """Put an object at the first pose that `draw` gives, of _TRIES, at which it is `gap` m from all
     `bodies`, and is nearer than `within` m to one of them; False where there is none or it does not
     stay. The object is appended to `bodies`."""
     for _ in range(_TRIES):
         position, rotation = draw()
         body = table.put(model, position, rotation.as_quat())
         near = within is None or not bodies or table.is_near(body, bodies, within)
-        if near and not table.is_near(body, bodies, _PACKED_GAP):
+        if near and not table.is_near(body, bodies, gap):
             stays = _stands(table, body, rotation, bodies)
             bodies.append(body)
             return stays
@@ -382,14 +426,16 @@ def _overhang(
 
 
 def _viewpoint(layout: str, config: Config) -> Viewpoint | None:
-    """Of the layout wall from over the objects, of flat from the side of the block's edge; the
-    configured camera serves the others."""
+    """Of the layout wall from over the objects, of flat and shelf from the side that is open, for
+    the shelf 61 degrees off the vertical; the configured camera serves the others."""
     x, y = config.workspace.center
     if layout == "wall":
         y += config.workspace.size / 2 - 0.07
         return Viewpoint((x, y, 0.8), (x, y, 0.0), (1.0, 0.0, 0.0))
     if layout == "flat":
         return Viewpoint((x, y + 0.61, 0.66), (x, y + 0.04, 0.12), (0.0, 0.0, 1.0))
+    if layout == "shelf":
+        return Viewpoint((x, y + 0.65, 0.49), (x, y - 0.05, 0.10), (0.0, 0.0, 1.0))
     return None
 
 
@@ -409,20 +455,24 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
 _ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
     "bin": _pile_up, "household": _pile_up, "tall": _stand_close, "wall": _lean, "flat": _overhang,
-    "retrieve": _pile_up,
+    "retrieve": _pile_up, "shelf": _stand_below,
 }  # fmt: skip
 _COUNTS = {
     "isolated": 1, "dense": DENSE_COUNT, "wall": WALL_COUNT, "flat": FLAT_COUNT,
-    "retrieve": RETRIEVE_COUNT,
+    "retrieve": RETRIEVE_COUNT, "shelf": SHELF_COUNT,
 }  # fmt: skip
-_WALLS = {"bin": _walls_around, "wall": _wall_beside, "flat": _block}
-_FIXED = ("wall", "flat")  # whose walls are fixtures of the cell
+_WALLS = {"bin": _walls_around, "wall": _wall_beside, "flat": _block, "shelf": _shelf}
+_FIXED = ("wall", "flat", "shelf")  # whose walls are fixtures of the cell
 # By an object's sides, the shortest first; and in words.
 _SUITED = {
     "tall": (lambda sides: sides[2] >= _TALL, f"{_TALL} m long"),
     "wall": (
         lambda sides: sides[2] >= _LEANER[0] and sides[1] <= _LEANER[1],
         f"{_LEANER[0]} m long and at most {_LEANER[1]} m wide",
+    ),
+    "shelf": (
+        lambda sides: _SHELVED[0] <= sides[2] <= _SHELVED[1],
+        f"{_SHELVED[0]} to {_SHELVED[1]} m long",
     ),
     "flat": (
         lambda sides: sides[0] <= _FLAT and sides[1] >= _SPAN,

@@ -9,7 +9,7 @@ grasps are planned.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -17,39 +17,40 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from envs.arm_paths import (
+    OVER_BIN,
+    all_plans,
+    clears,
+    farther_than,
+    first_plan,
+    height_over,
+    higher_than,
+    line,
+    raised,
+    scales,
+    standoff,
+    way_to_bin,
+    way_up,
+    withdrawn,
+)
 from envs.cell import Cell, require_arm
-from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT, bin_walls, distance_to_box, table_box
 from envs.panda_model import FINGER_FORCE
 from envs.robot import Robot
-from envs.robot_kinematics import (
-    HALF_TURN,
-    JOINT_LOWER,
-    JOINT_UPPER,
-    UnreachableError,
-    all_postures,
-    arm_points,
-    choose_posture,
-    forward_kinematics,
-    tip_position,
-)
+from envs.robot_kinematics import UnreachableError, forward_kinematics
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError, reaching_down
 from utils.config import Config
 from utils.errors import UserError
 from utils.result_records import loose
-from utils.transforms import Grasp, top_down_pose
+from utils.transforms import Grasp
 
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _LEAST_FRICTION = 0.4  # that a grip counts on
 _HOLD_MARGIN = 1.5  # times the force that this friction needs
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
-_SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
-_ARM_RADIUS = 0.065  # m of the links between elbow and flange
-LOOK_EVERY = 12  # references between two at which the arm's links are looked at
-_LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
+_HIGH = 0.2  # m over the table, from which the arm may go home on any way
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
-OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
 
 
 class InHandMotion:
@@ -150,9 +151,9 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     """
     settings = cell.config.execution
     start = cell.robot.q  # all is planned before anything moves
-    reach, down, target = _planned(cell, grasp)
-    corner = _farther_than(settings.pregrasp_height - _CORNER, target, down)
-    way = cell.robot.blended_moves(start, reach, down, corner, **speed_scales(cell))
+    reach, down, target = first_plan(cell, grasp)
+    corner = farther_than(standoff(cell, grasp) - _CORNER, target, down)
+    way = cell.robot.blended_moves(start, reach, down, corner, **scales(cell))
 
     cell.robot.command_gripper(cell.gripper.opening_before(grasp.width))
     above = len(way) - len(down)
@@ -165,99 +166,9 @@ def reaches(cell: Cell, grasp: Grasp) -> bool:
     """Whether the arm can go to a grasp as `open_loop` does, and lift what it grips, without
     touching what stands in the cell for good; nothing moves."""
     try:
-        return any(_is_clear(cell, plan, grasp) for plan in _plans(cell, grasp))
+        return any(clears(cell, plan, grasp) for plan in all_plans(cell, grasp))
     except UnreachableError:
         return False
-
-
-Plan = tuple[Trajectory, Trajectory, np.ndarray]
-
-
-def _planned(cell: Cell, grasp: Grasp) -> Plan:
-    """The first of the `_plans` on which the arm is clear of the cell; if none is, the first.
-    Raises UnreachableError."""
-    plans = list(_plans(cell, grasp))
-    if len(plans) == 1:
-        return plans[0]
-    return next((plan for plan in plans if _is_clear(cell, plan, grasp)), plans[0])
-
-
-def _plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
-    """For each posture at the pregrasp: the way there, from there straight to the grasp, and the
-    grasp's pose (4, 4), which may be flipped. Raises UnreachableError where there is none."""
-    pregrasp = _backed(grasp.pose, cell.config.execution.pregrasp_height)
-    failures, found = [], False
-    for q_pregrasp in all_postures(pregrasp, cell.home):
-        target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
-        try:
-            down = _descent(cell, q_pregrasp, target)
-        except UnreachableError as error:
-            failures.append(error)
-            continue
-        found = True
-        yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **speed_scales(cell)), down, target
-    if not found:
-        raise failures[0]
-
-
-def _is_clear(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
-    """Whether the arm, but for its hand, stays clear of table, bin, walls and its joints' limits on
-    a plan and while it lifts. The hand is the planners' matter."""
-    reach, down, target = plan
-    try:
-        lift = _line(cell, down.positions[-1], _raised(cell, target, grasp.position[2]))
-    except UnreachableError:
-        return False
-    way = np.concatenate([part.positions[::LOOK_EVERY] for part in (reach, down, lift)])
-    return arm_is_clear(cell, way)
-
-
-def arm_is_clear(cell: Cell, way: np.ndarray) -> bool:
-    """Whether joint positions (N, 7) keep within the limits, and the arm, but for its hand, clear
-    of table, bin and walls."""
-    margin = cell.config.safety.joint_margin
-    if (way < JOINT_LOWER + margin).any() or (way > JOINT_UPPER - margin).any():
-        return False  # where a curve between waypoints may leave the limits
-    points = arm_points(way)
-    boxes = [table_box(), *bin_walls(), *(cell.scene.walls if cell.scene else ())]
-    return all(distance_to_box(points, box).min() > _ARM_RADIUS for box in boxes)
-
-
-def _backed(T_WE: np.ndarray, distance: float) -> np.ndarray:
-    """The pose (4, 4), `distance` m back against the approach."""
-    back = T_WE.copy()
-    back[:3, 3] -= distance * T_WE[:3, 2]
-    return back
-
-
-def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
-    """From joint positions q (7,) straight to `target` (4, 4): quickly, and slowly at the end."""
-    settings = cell.config.execution
-    if settings.pregrasp_height <= _SLOW_HEIGHT:
-        return _line(cell, q, target, settings.approach_speed)
-    quick = _line(cell, q, _backed(target, _SLOW_HEIGHT))
-    slow = _line(cell, quick.positions[-1], target, settings.approach_speed)
-    # Both are parts of one line, so that no corner is cut. The second one has half of its speed
-    # when the first one ends, so that both together are no faster than the approach.
-    left = _distances(target, slow)
-    speeding = int(np.argmax(-np.diff(left) > settings.approach_speed * cell.dt / 2))
-    return cell.robot.blended_moves(q, quick, slow, speeding, **speed_scales(cell))
-
-
-def _distances(target: np.ndarray, trajectory: Trajectory) -> np.ndarray:
-    """(N,) metres that E is back from `target` (4, 4) at each reference, along the approach."""
-    tips = np.array([tip_position(q) for q in trajectory.positions.tolist()])
-    return (target[:3, 3] - tips) @ target[:3, 2]
-
-
-def _farther_than(distance: float, target: np.ndarray, trajectory: Trajectory) -> int:
-    """The number of references at which E is more than `distance` m back from the target."""
-    return int((_distances(target, trajectory) > distance).sum())
-
-
-def _higher_than(height: float, trajectory: Trajectory) -> int:
-    """The number of references at which E is more than `height` m above the table."""
-    return sum(tip_position(q)[2] > height for q in trajectory.positions.tolist())
 
 
 Approach = Callable[[Cell, Grasp], ApproachResult]
@@ -292,10 +203,10 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     cell.check_physics()
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
-        raised = _grip(cell, grasp, approach)
+        closed = _grip(cell, grasp, approach)
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
-        _carry_to_bin(cell, held, raised, motion)
+        _carry_to_bin(cell, held, closed, max(grasp.position[2], closed[2, 3]), motion)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -314,23 +225,14 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
 
 
 def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
-    """Approach and close: (4, 4) T_WE to which the arm lifts what it feels between the fingers.
+    """Approach and close: (4, 4) T_WE from which the arm lifts what it feels between the fingers.
     Raises GraspFailure."""
     result = approach(cell, grasp)
     close_fingers(cell, result.wait)
     cell.robot.hold()  # a closed loop sends nothing from here on
     if not cell.robot.grips():
         raise GraspFailure("missed")
-    closed = forward_kinematics(cell.robot.q) if result.pose is None else result.pose
-    # A learned policy plans no grasp: the height at which its hand has closed counts.
-    return _raised(cell, closed, max(grasp.position[2], closed[2, 3]))
-
-
-def _raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
-    """The pose (4, 4) at which an object is lifted high enough that the hand gripped at T_WE."""
-    lifted = T_WE.copy()
-    lifted[2, 3] = max(height, 0.0) + cell.config.execution.lift_height + _LIFT_MARGIN
-    return lifted
+    return forward_kinematics(cell.robot.q) if result.pose is None else result.pose
 
 
 def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
@@ -340,19 +242,18 @@ def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
 
 
 def _carry_to_bin(
-    cell: Cell, index: int | None, lifted: np.ndarray, motion: InHandMotion | None
+    cell: Cell, index: int | None, closed: np.ndarray, height: float, motion: InHandMotion | None
 ) -> None:
-    """Raise the hand to `lifted` (4, 4) and carry an object over the bin. Raises GraspFailure; with
-    execution.strict also where the object has moved in the hand. index: None where the hand only
-    believes that it holds one."""
+    """Lift an object, gripped `height` m over the table at T_WE `closed` (4, 4), and carry it over
+    the bin. Raises GraspFailure; with execution.strict also where the object has moved in the hand.
+    index: None where the hand only believes that it holds one."""
     settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
-    lift = _line(cell, start, lifted)
-    over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
-    over_bin[2] = max(over_bin[2], lifted[2, 3] - _LIFT_MARGIN)
-    posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
-    carry = robot.joint_move(lift.positions[-1], posture, **speed_scales(cell))
-    corner = _higher_than(lifted[2, 3] - _CORNER, lift)
-    way = robot.blended_moves(start, lift, carry, corner, **speed_scales(cell))
+    # A learned policy plans no grasp: the height at which its hand has closed counts.
+    top = raised(cell, closed, height)[2, 3]
+    lift = way_up(cell, start, closed, height)
+    carry = way_to_bin(cell, lift.positions[-1], top)
+    corner = higher_than(top - _CORNER, lift)
+    way = robot.blended_moves(start, lift, carry, corner, **scales(cell))
     grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
     for first in range(0, len(lift), every):
         follow(cell, way[first : min(first + every, len(lift))], grip.feel)
@@ -387,46 +288,35 @@ def close_fingers(cell: Cell, wait: Callable[[int], None]) -> None:
 
 
 def go_home(cell: Cell) -> str:
-    """Open, rise on a straight line if the hand is low, and return to the home posture. Returns a
-    remark for the outcome's detail where the arm cannot do so by itself, else an empty text."""
+    """Open, leave a place below something as the hand came, rise on a straight line if the hand is
+    low, and return to the home posture. Returns a remark for the outcome's detail where the arm
+    cannot do so by itself, else an empty text."""
     robot, speed = cell.robot, cell.config.execution.approach_speed
     robot.open_gripper()
     cell.step(round(_RELEASE_SECONDS / cell.dt))
     T = forward_kinematics(robot.q)
-    if T[2, 3] < 0.2:
-        up = T.copy()
-        up[2, 3] = 0.2
-        # Without the line, the joint motion below goes up as well, only less straight.
-        with contextlib.suppress(UnreachableError, ArmStoppedError):
-            follow(cell, _line(cell, robot.q, up, speed))
+    # Without the lines, the joint motion below goes up as well, only less straight.
+    with contextlib.suppress(UnreachableError, ArmStoppedError):
+        before = withdrawn(cell, T)
+        if before is not T:
+            T = before
+            follow(cell, line(cell, robot.q, T, speed))
+        high = max(_HIGH, height_over(cell, cell.gripper.palm_half_length))
+        if T[2, 3] < high:
+            up = T.copy()
+            up[2, 3] = high
+            follow(cell, line(cell, robot.q, up, speed))
     try:
         try:
-            follow(cell, robot.joint_move(robot.q, cell.home, **speed_scales(cell)))
+            follow(cell, robot.joint_move(robot.q, cell.home, **scales(cell)))
         except ArmStoppedError:  # the joint motion leaves the workspace; a straight line does not
-            follow(cell, _line(cell, robot.q, forward_kinematics(cell.home), speed))
-            follow(cell, robot.joint_move(robot.q, cell.home, **speed_scales(cell)))
+            follow(cell, line(cell, robot.q, forward_kinematics(cell.home), speed))
+            follow(cell, robot.joint_move(robot.q, cell.home, **scales(cell)))
     except (UnreachableError, ArmStoppedError):
         # An arm stretched to the edge of the workspace can bend its elbow only by leaving it.
         robot.place(cell.home)
         return "no way home within the workspace, it was put there by hand"
     return ""
-
-
-def _same_side(reached: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """`pose`, flipped if the arm has reached a flipped pose."""
-    return pose if reached[:3, 1] @ pose[:3, 1] > 0 else pose @ HALF_TURN
-
-
-def _line(cell: Cell, q: np.ndarray, pose: np.ndarray, speed: float = np.inf) -> Trajectory:
-    return cell.robot.straight_move(q, pose, speed, cell.home, **speed_scales(cell))
-
-
-def speed_scales(cell: Cell) -> dict[str, float]:
-    robot = cell.config.robot
-    return {
-        "velocity_scale": robot.velocity_scale,
-        "acceleration_scale": robot.acceleration_scale,
-    }
 
 
 def follow(

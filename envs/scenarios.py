@@ -283,6 +283,7 @@ SCENARIOS = {
     "tall": Scenario("tall"),
     "wall": Scenario("wall"),
     "flat": Scenario("flat"),
+    "shelf": Scenario("shelf"),
     "retrieve": Scenario("retrieve"),
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),

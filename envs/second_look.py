@@ -14,9 +14,10 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from envs.arm_paths import LOOK_EVERY, arm_is_clear, scales
 from envs.cell import ROBOT, Cell, Intrinsics, wrist_mount
 from envs.cell_layout import Box, distance_to_box
-from envs.execution import LOOK_EVERY, arm_is_clear, follow, go_home, speed_scales
+from envs.execution import follow, go_home
 from envs.robot_kinematics import (
     UnreachableError,
     arm_points,
@@ -72,7 +73,7 @@ class SecondLook:
             follow(cell, way, careful)
             cell.step(round(_STILL_SECONDS / cell.dt))
             frame = self._calibrated(wrist_frame(cell))
-            follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **speed_scales(cell)))
+            follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **scales(cell)))
         except ArmStoppedError:
             go_home(cell)
             return None
@@ -113,7 +114,7 @@ def way_to_look(cell: Cell, frame: RGBDFrame, least: float) -> Trajectory | None
         if shown <= least:
             return None
         for q in _postures(cell, T_WC):
-            way = cell.robot.joint_move(cell.home, q, **speed_scales(cell))
+            way = cell.robot.joint_move(cell.home, q, **scales(cell))
             if _is_clear(cell, way, things):
                 return way
     return None

@@ -18,7 +18,7 @@ from models.planner_antipodal import SearchPlanner, search_once
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_contacts import buried_share, exact_quality
 from utils.depth_correction import corrected
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import ConvexSolid, GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
     height_map_from_frame,
@@ -41,6 +41,8 @@ class FanSettings:
     """The directions of a fan, and what their grasps are worth; degrees unless said.
 
     rings: tilt from the vertical and number of directions around it, for each ring of the fan.
+    level: the last ring where something hangs over the table, so that the hand comes from the side
+    alone.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
     room. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
     than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
@@ -48,16 +50,19 @@ class FanSettings:
     """
 
     rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8), (85.0, 4))
+    level: tuple[float, int] = (85.0, 16)
     tilt_scale: float = 1.2
     returned: int = 40
     distinct_distance: float = 0.01
     distinct_turn: float = np.deg2rad(20)
     wrist: tuple[float, float] = (0.06, 0.13)
 
-    def directions(self) -> list[np.ndarray]:
-        """Approaches (3,), unit vectors in W, the vertical first."""
+    def directions(self, covered: bool = False) -> list[np.ndarray]:
+        """Approaches (3,), unit vectors in W, the vertical first. covered: whether something hangs
+        over the table."""
         fan = [np.array(DOWN)]
-        for tilt, count in self.rings:
+        rings = (*self.rings[:-1], self.level) if covered else self.rings
+        for tilt, count in rings:
             for turn in np.arange(count) * 2 * np.pi / count:
                 out = np.sin(np.deg2rad(tilt)) * np.array([np.cos(turn), np.sin(turn)])
                 fan.append(np.array([*out, -np.cos(np.deg2rad(tilt))]))
@@ -97,16 +102,20 @@ class FanPlanner(SearchPlanner):
 
     def search_fan(
         self,
+        overhead: HeightMap,
         maps: Callable[[np.ndarray], HeightMap],
         value: Value | None = None,
         judge: Judge | None = None,
+        covered: bool = False,
     ) -> list[Grasp]:
         """The grasps of all views, best first; may be empty.
 
-        maps: gives the height map in a frame T_WV (4, 4). judge: has the last word on what a view's
-        candidates are worth. Where nothing in any view meets the margins, relaxed ones serve.
+        overhead: the map from above, without what hangs over the table. maps: gives the height map
+        in a frame T_WV (4, 4). judge: has the last word on what a view's candidates are worth.
+        covered: whether something hangs over the table. Where nothing in any view meets the
+        margins, relaxed ones serve.
         """
-        views = list(self._views(maps))
+        views = list(self._views(overhead, maps, covered))
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
@@ -116,18 +125,20 @@ class FanPlanner(SearchPlanner):
                 return with_chances(best, self.calibration)
         return []
 
-    def _views(self, maps: Callable[[np.ndarray], HeightMap]) -> Iterator[HeightMap]:
+    def covered(self, solids: Sequence[ConvexSolid]) -> bool:
+        """Whether one of the solids, in W, hangs over the table."""
+        return any(solid.hangs(self.workspace.table_height) for solid in solids)
+
+    def _views(
+        self, overhead: HeightMap, maps: Callable[[np.ndarray], HeightMap], covered: bool = False
+    ) -> Iterator[HeightMap]:
         """The maps of the fan, the one from above first. Those of a hand that comes nearly level
         are left out where nothing is high enough for it."""
-        over_table = -np.inf
-        for approach in self.fan.directions():
-            if over_table < _LEVEL_FROM and approach[2] > -_LEVEL:
-                continue
-            heights = maps(tilted_view(approach, self.workspace))
-            if approach[2] == -1.0:
-                rises = heights.height[heights.label >= 0] - heights.table_height
-                over_table = rises.max(initial=-np.inf)
-            yield heights
+        rises = overhead.height[overhead.label >= 0] - overhead.table_height
+        level = rises.max(initial=-np.inf) >= _LEVEL_FROM
+        for approach in self.fan.directions(covered):
+            if level or approach[2] <= -_LEVEL:
+                yield maps(tilted_view(approach, self.workspace))
 
     def _search_view(
         self,
@@ -190,10 +201,10 @@ class HeuristicFanPlanner(FanPlanner):
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(seen)
+        return self.search_fan(overhead, seen, covered=self.covered(frame.fixtures))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
-        return height_map_from_frame(frame, self.workspace)
+        return height_map_from_frame(frame, self.workspace, below=True)
 
 
 class OracleFanPlanner(FanPlanner):
@@ -211,9 +222,11 @@ class OracleFanPlanner(FanPlanner):
         buried = buried_share(truth, overhead)
         wanted = None if frame.target is None else object_of_target(overhead, frame)
 
-        def exact(T_WV: np.ndarray) -> HeightMap:
-            heights = height_map_from_scene(truth, self.workspace, T_WV=T_WV)
+        def of_target(heights: HeightMap) -> HeightMap:
             return heights if frame.target is None else only_object(heights, wanted)
+
+        def exact(T_WV: np.ndarray) -> HeightMap:
+            return of_target(height_map_from_scene(truth, self.workspace, T_WV=T_WV))
 
         def by_contacts(heights: HeightMap, found: Candidates) -> Candidates:
             found = found.distinct(self.count, 0.004, np.deg2rad(8))
@@ -222,9 +235,10 @@ class OracleFanPlanner(FanPlanner):
             found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
             return found.best(len(found))
 
-        return self.search_fan(exact, judge=by_contacts)
+        covered = self.covered(truth.walls)
+        return self.search_fan(of_target(overhead), exact, None, by_contacts, covered)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
             raise ValueError("The oracle planner needs frame.truth; this frame holds none")
-        return height_map_from_scene(frame.truth, self.workspace)
+        return height_map_from_scene(frame.truth.uncovered(), self.workspace)

@@ -292,7 +292,7 @@ class GraspNetFanPlanner(FanPlanner):
         """The grasps of a frame, ranked by `judge`, which gets a view's map, its best candidates
         and what the critic sees of them (`models.grasp_critic.critic_inputs`)."""
         frame = corrected(frame, self.workspace.table_height)
-        seen = NetworkView(self.network, frame, self.workspace)
+        seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)
         filled, hiding = without_holes(seen.frame, self.workspace)
 
@@ -307,7 +307,8 @@ class GraspNetFanPlanner(FanPlanner):
             value = seen.value(heights, found)
             return judge(heights, found, critic_inputs(found, heights, value, towards))
 
-        return self.search_fan(tilted, seen.value, of_view)
+        covered = self.covered(frame.fixtures)
+        return self.search_fan(overhead, tilted, seen.value, of_view, covered)
 
     def by_critic(self, heights: HeightMap, found: Candidates, inputs: np.ndarray) -> Candidates:
         """Candidates ranked by the critic's chance."""
@@ -316,7 +317,7 @@ class GraspNetFanPlanner(FanPlanner):
         return replace(found, score=self.critic.chance(inputs) * (1 + rise)).best(len(found))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
-        return NetworkView(self.network, frame, self.workspace).heights
+        return NetworkView(self.network, frame, self.workspace, below=True).heights
 
 
 class NetworkView:
@@ -324,13 +325,19 @@ class NetworkView:
 
     The given frame is corrected by its table (`utils.depth_correction`). frame: the same, holes of
     its depth filled where colours tell what is there. heights: the map from above. crop: whether
-    only the part of the image is looked at in which something stands. Where the frame has a second
+    only the part of the image is looked at in which something stands. below: as in
+    `height_map_from_frame`. Where the frame has a second
     one, its network maps serve for what the first does not show. Raises UserError for an image that
     the network cannot take.
     """
 
     def __init__(
-        self, network: SavedGraspNet, frame: RGBDFrame, workspace: Workspace, crop: bool = False
+        self,
+        network: SavedGraspNet,
+        frame: RGBDFrame,
+        workspace: Workspace,
+        crop: bool = False,
+        below: bool = False,
     ):
         table = workspace.table_height
         self._first = _Prediction(network, frame, table, crop)
@@ -338,7 +345,7 @@ class NetworkView:
         if frame.second is not None:
             self._second = _Prediction(network, frame.second, table)
         self.frame = self._first.frame
-        self.heights = height_map_from_frame(self.frame, workspace)
+        self.heights = height_map_from_frame(self.frame, workspace, below=below)
         if network.model.centre_head is not None:
             offset = self._first.maps[3][0].numpy()
             scaling = self._first.scaling

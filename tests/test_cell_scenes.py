@@ -30,7 +30,9 @@ def primitives(config):
 def sets(config, primitives):
     """The set of objects of each layout."""
     tall, flat = (load_object_set(name, cache_dir=config.cache_folder) for name in ("tall", "flat"))
-    return {layout: primitives for layout in LAYOUTS} | {"tall": tall, "wall": tall, "flat": flat}
+    return {layout: primitives for layout in LAYOUTS} | {
+        "tall": tall, "wall": tall, "flat": flat, "shelf": tall,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -45,7 +47,7 @@ def test_scene_is_a_pure_function_of_its_seed(layout, sets, laid_out):
     first = make_scene(layout, sets[layout], 7, laid_out)
     other = make_scene(layout, sets[layout], 9, laid_out)  # other work in between
     again = make_scene(layout, sets[layout], 7, laid_out)
-    counts = {"isolated": 1, "wall": 3, "flat": 2, "retrieve": 8}
+    counts = {"isolated": 1, "wall": 3, "flat": 2, "retrieve": 8, "shelf": 3}
     assert len(first.placements) == counts.get(layout, laid_out.scene.count)
     assert first.target == again.target
     for a, b in zip(first.placements, again.placements):
@@ -187,13 +189,33 @@ def test_flat_things_lie_on_the_block_and_overhang_its_edge(sets, laid_out, seed
         assert placed.position[1] < edge
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_tall_things_stand_below_the_board_with_room_for_fingers(sets, laid_out, seed):
+    """The board's lower side is 0.3 m over the table; a finger with its room needs 2 cm."""
+    scene = make_scene("shelf", sets["tall"], seed, laid_out)
+    board, back = scene.walls
+    low, high = board.position - board.half_size, board.position + board.half_size
+    assert low[2] == pytest.approx(0.30) and board.solid().hangs(0.0)
+    assert not back.solid().hangs(0.0) and back.position[1] < low[1] + 0.02
+    for placed in scene.placements:
+        corners = corners_of(placed)
+        assert corners[:, 2].min() == pytest.approx(0.0, abs=2e-3) and corners[:, 2].max() < 0.27
+        assert (placed.position > low - (0, 0, 1))[:2].all() and (placed.position < high).all()
+        assert high[1] - placed.position[1] < 0.15  # the arm goes in no deeper
+    with make_layout_table(laid_out, [placed.model for placed in scene.placements]) as table:
+        bodies = [table.put(*vars(placed).values()) for placed in scene.placements]
+        for body in bodies:
+            assert not table.is_near(body, [one for one in bodies if one != body], 0.02)
+
+
 def test_planners_know_walls_that_stand_there_for_good_and_no_bin(sets, config):
-    for layout in ("wall", "flat"):
+    for layout, count in (("wall", 1), ("flat", 1), ("shelf", 2)):
         scene = make_scene(layout, sets[layout], 3, config)
-        (fixture,), (wall,) = scene.fixtures, scene.walls
-        corners = wall.position + np.array([wall.half_size, -wall.half_size])
-        np.testing.assert_allclose(fixture.vertices.max(axis=0), corners[0])
-        np.testing.assert_allclose(fixture.vertices.min(axis=0), corners[1])
+        assert len(scene.fixtures) == len(scene.walls) == count
+        for fixture, wall in zip(scene.fixtures, scene.walls):
+            corners = wall.position + np.array([wall.half_size, -wall.half_size])
+            np.testing.assert_allclose(fixture.vertices.max(axis=0), corners[0])
+            np.testing.assert_allclose(fixture.vertices.min(axis=0), corners[1])
     assert make_scene("bin", sets["bin"], 3, config).fixtures == ()
 
 

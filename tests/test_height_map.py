@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.planners import HeuristicPlanner
-from tests.helpers.box_frames import bin_walls, boxes_frame
+from tests.helpers.box_frames import bin_walls, boxes_frame, shelf_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     WALL_LABEL,
@@ -134,6 +134,30 @@ def test_a_known_board_that_covers_everything_is_no_object(things) -> None:
     assert set(np.unique(heights.label)) == {WALL_LABEL, *range(len(things))}
     for centre in heights.centres:
         np.testing.assert_allclose(centre, (0.5, 0.0, 0.055), atol=0.002)
+
+
+def test_what_stands_below_a_board_is_an_object_of_the_map_below_it_alone() -> None:
+    """A carton, 16 cm high, under the board of a shelf: from above there is only the board."""
+    frame, workspace = shelf_frame([((0.05, 0.06, 0.16), 0.0, (0.5, -0.02))]), Workspace()
+    above = height_map_from_frame(frame, workspace)
+    middle = above.index(np.array([0.5, -0.02]))
+    assert not (above.label >= 0).any() and above.height[middle] == pytest.approx(0.32)
+    below = height_map_from_frame(frame, workspace, below=True)
+    assert below.height[middle] == pytest.approx(0.16, abs=1e-3)
+    # The strip before its upper edge may be a piece of its own; behind it nothing is seen.
+    row, column = np.nonzero(below.label >= 0)
+    x, y = (below.origin + below.cell * np.column_stack([column, row])).T
+    assert 0.048 < np.ptp(x) < 0.056 and y.min() > -0.053 and y.max() < 0.014
+    centre = below.centres[below.label[middle]]
+    np.testing.assert_allclose(centre, [0.5, -0.025, 0.08], atol=0.006)
+    # A hand that comes level sees the carton's face, and the back beside it.
+    T_WV = tilted_view(np.array([0.0, -np.sin(1.48), -np.cos(1.48)]), workspace)
+    seen = tilted_height_map(below, *without_holes(frame, workspace), T_WV)
+    for place, is_object in (((0.5, 0.01, 0.08), True), ((0.58, -0.17, 0.2), False)):
+        x, y, z = transform_points(inverse_pose(T_WV), np.array(place))
+        at = seen.index(np.array([x, y]))
+        assert (seen.label[at] >= 0) == is_object
+        assert seen.height[at] == pytest.approx(z, abs=2e-3)
 
 
 def test_what_a_label_without_cells_rests_on_is_the_table() -> None:

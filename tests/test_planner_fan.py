@@ -19,7 +19,7 @@ from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
 from models.planners import make_planner
-from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame
+from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame, shelf_frame
 from utils.config import DEFAULTS, load_config
 from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
@@ -330,6 +330,47 @@ def test_no_grasp_takes_a_known_wall_with_what_leans_over_it():
     assert lowest[0] < 0.09 and lowest[1] > 0.1
 
 
+@pytest.mark.parametrize("name", ["heuristic", "graspnet", "oracle"])
+def test_from_above_there_is_no_grasp_below_a_board(name):
+    frame = shelf_frame([CARTON])
+    assert make_planner(name, GripperGeometry(), Workspace(), 0)(frame) == []
+    assert make_planner(f"{name}6d", GripperGeometry(), Workspace(), 0)(frame)
+
+
+CARTON = ((0.05, 0.06, 0.16), 0.0, (0.5, -0.02))
+
+
+@pytest.mark.parametrize("name", ["heuristic6d", "graspnet6d", "oracle6d"])
+def test_a_carton_below_a_board_is_gripped_from_the_open_side(name):
+    """Along its 5 cm, by a hand that meets neither the board, 0.3 m over the table, nor the back.
+    One that leans by 30 degrees takes it by the part that is nearest to the open side."""
+    grasps = make_planner(name, GripperGeometry(), Workspace(), 0)(shelf_frame([CARTON]))
+    behind = np.linspace(0.0, 0.2, 40)[:, None, None]  # of the fingertips, along the hand
+    beside = np.linspace(-0.1, 0.1, 21)[:, None]  # and across, the palm is 0.2 m long
+    level = []
+    for grasp in grasps:
+        assert grasp.tilt > np.deg2rad(29)
+        hand = grasp.position - behind * grasp.approach + beside * grasp.closing_direction
+        for middle, half in (((0.5, -0.06, 0.31), (0.2, 0.13, 0.01)),
+                             ((0.5, -0.18, 0.15), (0.2, 0.01, 0.15))):  # fmt: skip
+            assert not (np.abs(hand - middle) < half).all(axis=-1).any()
+        if grasp.approach[1] < -0.99:
+            level.append(grasp)
+    best = level[0]
+    assert abs(best.closing_direction[0]) > np.cos(np.deg2rad(5))
+    assert best.position[0] == pytest.approx(0.5, abs=0.003) and 0.04 < best.position[2] < 0.14
+    assert 0.05 < best.width <= 0.08
+
+
+def test_the_fan_has_more_level_directions_below_a_board():
+    fan = FanSettings()
+    counts = []
+    for covered in (False, True):
+        tilts = np.degrees(np.arccos(-np.array(fan.directions(covered))[:, 2])).round()
+        counts.append({tilt: int((tilts == tilt).sum()) for tilt in np.unique(tilts).tolist()})
+    assert counts == [{0: 1, 30: 8, 60: 8, 85: 4}, {0: 1, 30: 8, 60: 8, 85: 16}]
+
+
 def _exact_map(truth: SceneGeometry, T_WV: np.ndarray) -> HeightMap:
     return height_map_from_scene(truth, Workspace(), T_WV=T_WV)
 
@@ -338,5 +379,6 @@ def test_level_views_are_searched_where_something_is_high():
     for height, tilts in ((0.08, {0, 30, 60}), (0.12, {0, 30, 60, 85})):
         plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
         truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
-        views = plan._views(partial(_exact_map, truth))
+        overhead = height_map_from_scene(truth, Workspace())
+        views = plan._views(overhead, partial(_exact_map, truth))
         assert {round(np.degrees(np.arccos(view.T_WV[2, 2]))) for view in views} == tilts

@@ -13,6 +13,8 @@ from scipy.spatial import ConvexHull
 
 from utils.transforms import transform_points
 
+HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
+
 
 @dataclass(frozen=True)
 class ConvexSolid:
@@ -33,6 +35,10 @@ class ConvexSolid:
         return ConvexSolid(
             transform_points(T, self.vertices), normals, self.offsets + normals @ T[:3, 3]
         )
+
+    def hangs(self, table_height: float) -> bool:
+        """Whether the solid, in W, leaves room below it on a table, as a shelf's board does."""
+        return bool(self.vertices[:, 2].min() > table_height + HANGS_FROM)
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,11 @@ class SceneGeometry:
         )
         walls = tuple(wall.transformed(T) for wall in self.walls)
         return SceneGeometry(objects, self.table_height, walls)
+
+    def uncovered(self) -> SceneGeometry:
+        """The scene in W without walls that hang over the table."""
+        walls = tuple(wall for wall in self.walls if not wall.hangs(self.table_height))
+        return replace(self, walls=walls)
 
 
 @dataclass(frozen=True)

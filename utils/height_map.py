@@ -8,7 +8,7 @@ peaks of such a map, or of any image. This module knows no simulator and no netw
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -30,6 +30,7 @@ OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
+_HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
@@ -126,25 +127,34 @@ def height_map_from_frame(
     workspace: Workspace,
     cell: float = 0.002,
     margin: float = MARGIN,
+    below: bool = False,
 ) -> HeightMap:
-    """The height map of a depth image from above; uses nothing of the frame but depth, K and T_WC.
+    """The height map of a depth image from above; uses nothing of the frame but depth, K, T_WC and
+    fixtures.
 
     Unknown pixels count as the nearest surface beside them (`near_side`); the ceiling over those
     that are not `at_edges` is a little higher. Labels are the pieces between height
     discontinuities; their centres are volume centroids of the columns between the table and the
-    visible surface.
+    visible surface. below: whether fixtures that hang over the table are left out, so that what a
+    camera at the side sees below them is an object of the map; no hand can come down to it from
+    above.
     """
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
     filled, hiding = without_holes(frame, workspace)
+    if below:
+        filled, hiding = _uncovered(filled, hiding, table)
     seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
-    if not frame.fixtures:
-        label = label_walls(label_pieces(seen.height, table, cell), grid, workspace, cell)
+    surface = seen.height
+    if len(filled.fixtures) < len(frame.fixtures):  # the back of a shelf is no object's shadow
+        surface = np.where(seen.hidden, table, surface)
+    if not filled.fixtures:
+        label = label_walls(label_pieces(surface, table, cell), grid, workspace, cell)
         centres = _column_centroids(seen.height - table, label, grid, table)
         return HeightMap(*seen.walled(), label, centres, origin, cell, table)
-    fixed = _tops(frame.fixtures, grid, origin, cell)
+    fixed = _tops(filled.fixtures, grid, origin, cell)
     bare = _bare(seen.height, fixed)
-    label = label_pieces(np.where(bare, table, seen.height), table, cell)
+    label = label_pieces(np.where(bare, table, surface), table, cell)
     label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
     base = base_heights(label, fixed, table)
     on = np.append(base, (table, table))[label]  # the last two are of walls and of the table
@@ -152,6 +162,28 @@ def height_map_from_frame(
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
     return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
+
+
+def _uncovered(filled: RGBDFrame, hiding: np.ndarray, table: float) -> tuple[RGBDFrame, np.ndarray]:
+    """A frame `without_holes` and without what hangs over the table: its pixels are unknown."""
+    hanging = [solid for solid in filled.fixtures if solid.hangs(table)]
+    if not hanging:
+        return filled, hiding
+    hung = _hung(filled.points(), hanging)
+    standing = tuple(solid for solid in filled.fixtures if not solid.hangs(table))
+    depth = np.where(hung, 0, filled.depth).astype(np.float32)
+    return replace(filled, depth=depth, fixtures=standing), hiding & ~hung
+
+
+def _hung(points: np.ndarray, hanging: Sequence[ConvexSolid]) -> np.ndarray:
+    """(...) bool: points (..., 3) in W that belong to solids which hang over the table, or to what
+    lies on them. NaN belongs to none."""
+    found = np.zeros(points.shape[:-1], bool)
+    for solid in hanging:
+        low, high = solid.vertices.min(axis=0) - _HUNG, solid.vertices.max(axis=0) + _HUNG
+        inside = (points[..., :2] > low[:2]) & (points[..., :2] < high[:2])
+        found |= inside.all(axis=-1) & (points[..., 2] > low[2])
+    return found
 
 
 def base_heights(label: np.ndarray, fixed: np.ndarray, table: float) -> np.ndarray:
@@ -200,7 +232,8 @@ def tilted_height_map(
     """The map of the same scene in another frame, on a grid like that of the map from above.
 
     filled, hiding: the frame `without_holes`. Objects are those of the map from above: a surface
-    belongs to the object over its place on the table.
+    belongs to the object over its place on the table, unless a fixture that hangs over the table
+    is there. complete: as in `height_map_from_frame`.
     """
     shape, origin, cell = overhead.height.shape, overhead.origin, overhead.cell
     seen = seen_heights(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
@@ -211,6 +244,8 @@ def tilted_height_map(
     matter = points[..., 2] > overhead.table_height + _LABEL_FLOOR
     matter &= ((place >= 0) & (place <= (shape[1] - 1, shape[0] - 1))).all(axis=-1)
     label = np.where(matter, overhead.label[overhead.index(points[..., :2])], -1)
+    hanging = [solid for solid in filled.fixtures if solid.hangs(overhead.table_height)]
+    label = np.where(_hung(points, hanging), WALL_LABEL, label)
     # At the rim of an object its surface may lie beside its label.
     known = label != -1
     rim = cv2.dilate(known.astype(np.uint8), np.ones((2 * _RIM + 1, 2 * _RIM + 1))) > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from utils.geometry import ConvexSolid, SceneGeometry, SolidObject
@@ -17,13 +19,14 @@ def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
 
 
 def boxes_frame(
-    boxes: list[tuple[tuple[float, float, float], float, tuple[float, float]]],
+    boxes: list[tuple[tuple[float, float, float], float, tuple[float, ...]]],
     walls: int = 0,
     focal: float = 390.6,
     T_WC: np.ndarray = T_WC,
 ) -> RGBDFrame:
-    """The frame of boxes (size, yaw, (x, y)) standing on the table; depth by the slab formula. The
-    last `walls` of them are walls. focal: pixels. T_WC: the camera's pose, looking down."""
+    """The frame of boxes (size, yaw, (x, y)) standing on the table, or (x, y, z) hanging over it,
+    z being the lower side; depth by the slab formula. The last `walls` of them are walls. focal:
+    pixels. T_WC: (4, 4) of the camera."""
     v, u = np.mgrid[0:224, 0:224]
     rays = (
         np.stack([(u - 111.5) / focal, (v - 111.5) / focal, np.ones_like(u)], axis=-1)
@@ -32,9 +35,9 @@ def boxes_frame(
     eye = T_WC[:3, 3]
     depth = -eye[2] / rays[..., 2]
     objects = []
-    for size, yaw, (x, y) in boxes:
+    for size, yaw, (x, y, *lower) in boxes:
         half = np.array(size) / 2
-        T = yaw_pose(x, y, half[2], yaw)
+        T = yaw_pose(x, y, half[2] + sum(lower), yaw)
         local_eye, local_rays = (eye - T[:3, 3]) @ T[:3, :3], rays @ T[:3, :3]
         with np.errstate(divide="ignore"):
             slabs = np.sort([(s * half - local_eye) / local_rays for s in (-1, 1)], axis=0)
@@ -49,6 +52,15 @@ def boxes_frame(
     )
     seen_by = np.array([[focal, 0, 111.5], [0, focal, 111.5], [0, 0, 1.0]])
     return RGBDFrame(rgb, depth.astype(np.float32), seen_by, T_WC, truth=truth)
+
+
+def shelf_frame(things: list) -> RGBDFrame:
+    """Boxes under a board, its lower side 0.3 m over the table and its front edge at y = 0.07,
+    which a back holds at y = -0.18; seen from the open side, 61 degrees off the vertical."""
+    shelf = [((0.40, 0.26, 0.02), 0.0, (0.5, -0.06, 0.30)), ((0.40, 0.02, 0.30), 0.0, (0.5, -0.18))]
+    view = look_at((0.5, 0.65, 0.49), (0.5, -0.05, 0.10), (0.0, 0.0, 1.0))
+    frame = boxes_frame([*things, *shelf], walls=2, T_WC=view)
+    return replace(frame, fixtures=frame.truth.walls)
 
 
 def bin_walls(half: float = 0.15, height: float = 0.10, thick: float = 0.01) -> list:
