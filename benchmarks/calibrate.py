@@ -1,7 +1,7 @@
 """Chances of success from scores: python -m benchmarks.calibrate RUN... [--output FILE.json]
 
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
-(`utils.calibration`) and prints the expected calibration error before and after, in each scenario
+in the last run that has any (`utils.calibration`) and prints the expected calibration error before and after, in each scenario
 and with each depth noise. With --output the fits are written: into checkpoints/calibration.json,
 they are what the planners state from then on. configs/calibration.yaml plays all planners on
 training objects:
@@ -33,10 +33,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", type=Path, nargs="+", help="run folders of evaluate.py")
     parser.add_argument("--output", type=Path, help="JSON file for the fits")
     options = parser.parse_args(argv)
-    rounds = [record for run in options.runs for record in rounds_of(run, options.output)]
+    by_planner: dict[str, list[RoundRecord]] = {}
+    for run in options.runs:
+        played = rounds_of(run, options.output)
+        names = {record.policy for record in played}
+        for name in sorted(names & set(PLANNERS), key=list(PLANNERS).index):
+            by_planner[name] = [record for record in played if record.policy == name]
     lines, found = [], {}
-    for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
-        own = [record for record in rounds if record.policy == name]
+    for name, own in by_planner.items():
         scores, _, successes = grasps_of(own)
         if len(successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
