@@ -1,10 +1,10 @@
 """Chances of success from scores: python -m benchmarks.calibrate RUN... [--output FILE.json]
 
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
-in the last run that has any (`utils.calibration`) and prints the expected calibration error before and after, in each scenario
+(`utils.calibration`) and prints the expected calibration error before and after, in each scenario
 and with each depth noise. With --output the fits are written: into checkpoints/calibration.json,
-they are what the planners state from then on. configs/calibration.yaml plays all planners on
-training objects:
+they are what the planners state from then on; planners that the runs do not have keep theirs.
+configs/calibration.yaml plays all planners on training objects:
 
     python evaluate.py --config configs/calibration.yaml
     python -m benchmarks.calibrate runs/evaluate/<time>-calibration --output FILE.json
@@ -13,9 +13,11 @@ training objects:
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,14 +35,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", type=Path, nargs="+", help="run folders of evaluate.py")
     parser.add_argument("--output", type=Path, help="JSON file for the fits")
     options = parser.parse_args(argv)
-    by_planner: dict[str, list[RoundRecord]] = {}
-    for run in options.runs:
-        played = rounds_of(run, options.output)
-        names = {record.policy for record in played}
-        for name in sorted(names & set(PLANNERS), key=list(PLANNERS).index):
-            by_planner[name] = [record for record in played if record.policy == name]
+    rounds = [record for run in options.runs for record in rounds_of(run, options.output)]
+    commit = git_state().commit
     lines, found = [], {}
-    for name, own in by_planner.items():
+    for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
+        own = [record for record in rounds if record.policy == name]
         scores, _, successes = grasps_of(own)
         if len(successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
@@ -49,6 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             **asdict(fitted),
             "grasps": len(successes),
             "successes": int(successes.sum()),
+            "runs": [run.name for run in options.runs],
+            "commit": commit,
         }
         for kind in [None, *dict.fromkeys((one.scenario, one.depth_noise) for one in own)]:
             some = [one for one in own if kind in (None, (one.scenario, one.depth_noise))]
@@ -57,10 +58,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     header = ["planner", "scenario", "depth", "grasps", "success", "error before", "after"]
     print(aligned(header, lines, range(3, 7)))
     if options.output is not None:
-        content = {"runs": [run.name for run in options.runs], "commit": git_state().commit}
-        write_json_atomic(options.output, {**content, "planners": found})
+        write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})
         print(f"wrote {options.output}")
     return 0
+
+
+def fits_of(path: Path) -> dict[str, Any]:
+    """The fits of a file by planner; none where there is no file. Raises UserError for another
+    file."""
+    if not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["planners"])
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"--output {path}: exists and holds no fits; give another name") from None
 
 
 def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:

@@ -218,10 +218,15 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
         )
         append_round(tmp_path / split / "rounds.jsonl", nothing)
     file = tmp_path / "fits.json"
+    file.write_text(json.dumps({"planners": {"oracle": {"slope": 1.5, "offset": 2.5}}}))
     assert main([str(tmp_path / "train"), "--output", str(file)]) == 0
     assert "heuristic  pile" in capsys.readouterr().out
     content = json.loads(file.read_text())
-    assert content["runs"] == ["train"] and content["planners"]["heuristic"]["successes"] == 3
+    fits = content["planners"]
+    assert fits["heuristic"]["runs"] == ["train"] and fits["heuristic"]["successes"] == 3
+    assert fits["oracle"] == {"slope": 1.5, "offset": 2.5}  # the runs have no such planner
+    with pytest.raises(UserError, match="train.*config.yaml: exists and holds no fits"):
+        main([str(tmp_path / "train"), "--output", str(tmp_path / "train" / "config.yaml")])
     with pytest.raises(UserError, match="split is test.*training objects alone"):
         main([str(tmp_path / "test"), "--output", str(file)])
     assert main([str(tmp_path / "test")]) == 0
