@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import torch
 
-from models.grasp_critic import INPUTS, GraspCritic, critic_inputs, shipped_critic
+from models.grasp_critic import GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
 from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
@@ -311,10 +311,9 @@ class GraspNetFanPlanner(FanPlanner):
         return self.search_fan(overhead, tilted, seen.value, of_view, covered)
 
     def by_critic(self, heights: HeightMap, found: Candidates, inputs: np.ndarray) -> Candidates:
-        """Candidates ranked by the critic's chance."""
-        # The top of a pile first: what lies below may be held down.
-        rise = np.clip(inputs[:, INPUTS.index("tip_rise")], 0, 0.15)
-        return replace(found, score=self.critic.chance(inputs) * (1 + rise)).best(len(found))
+        """Candidates ranked by the critic's chance, and half as strongly by the search's score."""
+        score = self.critic.chance(inputs) * np.sqrt(found.score)
+        return replace(found, score=score).best(len(found))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights
