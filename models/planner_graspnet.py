@@ -413,7 +413,10 @@ def quality_between(
 
     It is the quality at a line's middle, times the quality of the line's angle relative to the best
     angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`).
+    It is 0 for lines that the camera cannot see, whose pixels are NaN.
     """
+    ahead = np.isfinite(start + end).all(axis=1)
+    start, end = (np.where(ahead[:, None], pixels, 0.0) for pixels in (start, end))
     quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
     u, v = np.rint((start + end) / 2).astype(int).T
     u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
@@ -423,4 +426,4 @@ def quality_between(
     place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
     below, part = np.floor(place).astype(int), place - np.floor(place)
     at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
-    return quality[v, u] * at / share.max(axis=0)
+    return np.where(ahead, quality[v, u] * at / share.max(axis=0), 0.0)

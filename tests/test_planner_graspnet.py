@@ -95,6 +95,14 @@ def test_quality_between_two_pixels_is_that_of_their_angle() -> None:
         assert found == pytest.approx([expected], abs=1e-3)
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_the_camera_cannot_see_has_no_quality() -> None:
+    """Pixels of points behind the camera are NaN (`project`)."""
+    maps = (torch.ones(1, 1, 40, 60), torch.zeros(1, 18, 40, 60), torch.zeros(1, 1, 40, 60))
+    start, end = np.array([[25.0, 20.0], [np.nan, np.nan]]), np.array([[35.0, 20.0], [30.0, 9.0]])
+    assert quality_between(maps, start, end) == pytest.approx([1.0, 0.0])
+
+
 class FixedCentres(FixedMaps):
     """A network with one quality everywhere, and a centre head that returns `offset` (2, H, W)."""
 
