@@ -54,7 +54,7 @@ def first_plan(cell: Cell, grasp: Grasp) -> Plan:
     """The first of `all_plans` on which the arm is clear of the cell; if none is, the first.
     Raises UnreachableError, also where something hangs over the table and none is clear of it."""
     plans = list(all_plans(cell, grasp))
-    if len(plans) == 1:
+    if len(plans) == 1 and not hanging(cell):
         return plans[0]
     clear = next((plan for plan in plans if clears(cell, plan, grasp)), None)
     if clear is None and hanging(cell):

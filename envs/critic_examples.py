@@ -1,9 +1,9 @@
 """Examples for the critic: what `graspnet6d` measures of its candidates, and whether it is true.
 
 Scenes of training objects are seen by a camera from above or from a side, with one of the depth
-noises. A candidate is sound where the exact contacts hold (`models.planner_contacts`) and the open
-hand meets nothing on the exact height map. No grasp is executed. The examples of a scene are a pure
-function of the config and its number.
+noises. A candidate is sound where exact contacts hold, at its pose or some of the perturbed ones
+(`models.planner_contacts`), and the open hand has room on the exact height map. No grasp is
+executed. The examples of a scene are a pure function of the config and its number.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def examples_of(config: Config, number: int) -> tuple[np.ndarray, np.ndarray, np
     cell, planner = _cell_of(config), _planner_of(config, bool(rng.random() < 0.5))
     scene = draw_scene(config, _sets_of(config), rng)
     inputs, sound, scores = [np.empty((0, len(INPUTS)), np.float32)], [], []
-    for number in range(FRAMES_PER_SCENE):
+    for frame_number in range(FRAMES_PER_SCENE):
         total = len(scene.placements)
-        count = total if number == 0 else int(rng.integers(1, total + 1))
+        count = total if frame_number == 0 else int(rng.integers(1, total + 1))
         some = np.sort(rng.choice(total, count, replace=False))
         cell.load(replace(scene, placements=tuple(scene.placements[i] for i in some)))
         frame = draw_frame(config, cell, rng)

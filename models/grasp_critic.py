@@ -3,8 +3,9 @@
 From one side the far contact of a grasp is a guess, and the search picks the grasps whose guesses
 look best. The critic has seen on training scenes which of them were true: its inputs are what the
 search measures (`models.planner_antipodal.measure`), how the closing line lies to the vertical and
-to the camera, and the grasp network's value; its output is the chance that the exact contacts hold
-(`models.planner_contacts.exact_quality`) and the open hand meets nothing. `benchmarks.train_critic`
+to the camera, and the grasp network's value; its output is the chance that exact contacts hold,
+there or a few millimetres beside (`models.planner_contacts.exact_quality`), and the open hand has
+room. `benchmarks.train_critic`
 trains it. This module knows neither images nor scenes.
 """
 
@@ -85,8 +86,9 @@ def critic_inputs(
 
 def load_critic(path: Path | str) -> GraspCritic:
     """The critic of a file, in evaluation mode. Raises UserError, naming the file, where it is
-    missing, damaged or of other inputs."""
-    return build_model(GraspCritic, load_checkpoint(path, KIND), path)
+    missing, damaged or of another architecture."""
+    expected = GraspCritic().model_args
+    return build_model(GraspCritic, load_checkpoint(path, KIND, model_args=expected), path)
 
 
 @functools.cache

@@ -134,6 +134,10 @@ def test_a_critic_is_saved_and_loaded(tmp_path) -> None:
     save_checkpoint(path, kind="critic", model_args=critic.model_args, model=critic)
     inputs = made_up(5, 1).inputs
     np.testing.assert_array_equal(load_critic(path).chance(inputs), critic.chance(inputs))
+    narrow = GraspCritic(inputs=20)
+    save_checkpoint(path, kind="critic", model_args=narrow.model_args, model=narrow)
+    with pytest.raises(UserError, match=r"critic\.pt: a checkpoint of another architecture"):
+        load_critic(path)
     save_checkpoint(path, kind="graspnet", model_args=critic.model_args, model=critic)
     with pytest.raises(UserError, match=r"critic\.pt: a checkpoint of kind 'graspnet'"):
         load_critic(path)

@@ -171,8 +171,11 @@ def _uncovered(filled: RGBDFrame, hiding: np.ndarray, table: float) -> tuple[RGB
         return filled, hiding
     hung = _hung(filled.points(), hanging)
     standing = tuple(solid for solid in filled.fixtures if not solid.hangs(table))
-    depth = np.where(hung, 0, filled.depth).astype(np.float32)
-    return replace(filled, depth=depth, fixtures=standing), hiding & ~hung
+    depth, second = np.where(hung, 0, filled.depth).astype(np.float32), filled.second
+    if second is not None:
+        board = _hung(second.points(), hanging)
+        second = replace(second, depth=np.where(board, 0, second.depth).astype(np.float32))
+    return replace(filled, depth=depth, fixtures=standing, second=second), hiding & ~hung
 
 
 def _hung(points: np.ndarray, hanging: Sequence[ConvexSolid]) -> np.ndarray:
