@@ -153,6 +153,27 @@ def test_the_shipped_critic_prefers_level_lines_to_sloping_ones() -> None:
     assert level > 2 * sloping
 
 
+def test_the_ranking_follows_the_critic() -> None:
+    """A critic that likes level approaches and one that likes leaning ones rank accordingly; the
+    search alone prefers the straight one."""
+
+    class Fixed(GraspCritic):
+        leaning = 0.0
+
+        def chance(self, inputs: np.ndarray) -> np.ndarray:
+            leans = column(inputs, "tilt") > 0.1
+            return np.where(leans, self.leaning, 1 - self.leaning)
+
+    first = []
+    for leaning in (0.0001, 0.9999):
+        critic = Fixed()
+        critic.leaning = leaning
+        planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), critic=critic)
+        first.append(planner(BOX)[0].tilt)
+    assert first[0] == pytest.approx(0, abs=1e-6)
+    assert first[1] > np.deg2rad(25)
+
+
 @pytest.mark.slow
 def test_examples_of_a_scene_are_a_function_of_its_number() -> None:
     config = load_config(None, ["data.object_sets=primitives"])
