@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from envs.arm_paths import hanging, height_over, way_out, withdrawn
+from envs import arm_paths
+from envs.arm_paths import first_plan, hanging, height_over, way_out, withdrawn
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Box, Placement, Scene
 from envs.execution import execute_grasp, reaches
 from envs.object_bodies import native_object
 from envs.object_primitives import NativeShape
-from envs.robot_kinematics import forward_kinematics
+from envs.robot_kinematics import UnreachableError, forward_kinematics
 from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.planners import make_planner
@@ -36,6 +37,13 @@ def shelved(request):
     with make_cell(load_config(None, [f"simulator={request.param}", "sim.renderer=tiny"])) as cell:
         cell.load(Scene("shelf", 0, (standing,), SHELF, True))
         yield cell
+
+
+def test_an_only_way_that_is_blocked_is_none(shelved, monkeypatch):
+    monkeypatch.setattr(arm_paths, "all_plans", lambda cell, grasp: iter(["the only way"]))
+    monkeypatch.setattr(arm_paths, "clears", lambda cell, plan, grasp: False)
+    with pytest.raises(UnreachableError, match="hangs over the table"):
+        first_plan(shelved, GRASP)
 
 
 def test_the_way_out_ends_before_the_board(shelved):

@@ -236,3 +236,13 @@ def test_an_object_that_the_camera_did_not_measure_is_a_wall() -> None:
         for side in (-1, 1):
             finger = grasp.position + side * (grasp.width / 2 + 0.007) * grasp.closing_direction
             assert not (abs(finger[0] - 0.56) < 0.04 and abs(finger[1]) < 0.07)
+
+
+def test_a_second_frame_does_not_put_a_board_back() -> None:
+    """A carton 12 cm high under a board; a second camera from 60 degrees sees the board, too."""
+    carton = [((0.05, 0.05, 0.12), 0.0, (0.5, 0.0))]
+    frame = shelf_frame(carton)
+    alone = height_map_from_frame(frame, Workspace(), below=True)
+    both = height_map_from_frame(replace(frame, second=frame), Workspace(), below=True)
+    for heights in (alone, both):
+        assert heights.height[heights.label >= 0].max() < 0.13
