@@ -1,40 +1,51 @@
-"""Examples for the critic: what `graspnet6d` measures of its candidates, and whether it is true.
+"""Examples for the critic: what the planners see of their candidates, and what becomes of them.
 
 Scenes of training objects are seen by a camera from above or from a side, with one of the depth
-noises. A candidate is sound where exact contacts hold, at its pose or some of the perturbed ones
-(`models.planner_contacts`), and the open hand has room on the exact height map. No grasp is
-executed. The examples of a scene are a pure function of the config and its number.
+noises. A floating hand executes some of the candidates, good and bad (`envs.floating_execution`).
+The examples of a scene are a pure function of the config and its number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from envs.cell import Cell, camera_intrinsics
+from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
+from envs.floating_execution import attempt, clears_table
 from envs.objects import ObjectSet, load_object_set
 from envs.simulators import make_cell
-from models.grasp_critic import INPUTS, GraspCritic
-from models.planner_antipodal import measure
+from models.grasp_critic import CriticInputs, GraspCritic, nothing
 from models.planner_candidates import Candidates
-from models.planner_contacts import exact_quality
-from models.planner_graspnet import GraspNetFanPlanner
+from models.planner_graspnet import (
+    GraspNetDirectPlanner,
+    GraspNetFanPlanner,
+    GraspNetPlanner,
+    Judged,
+)
 from utils.config import Config, with_settings
 from utils.depth import make_depth_noise
 from utils.depth import measure as measured
-from utils.geometry import SceneGeometry, Workspace
-from utils.height_map import HeightMap, height_map_from_scene
-from utils.transforms import RGBDFrame, inverse_pose, look_at
+from utils.geometry import Workspace
+from utils.height_map import HeightMap
+from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 
-SOUND = 0.05  # exact quality from which contacts hold
+# Whose candidates are executed, and how many of each plan's.
+PLANNERS = {
+    "graspnet6d": (GraspNetFanPlanner, 20),
+    "graspnet": (GraspNetPlanner, 7),
+    "graspnet_direct": (GraspNetDirectPlanner, 7),
+}
+_TRIED = [count for _, count in PLANNERS.values()]
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
-    "isolated": 0.10, "packed": 0.30, "pile": 0.35, "bin": 0.05, "tall": 0.10, "wall": 0.05,
-    "flat": 0.05,
+    "isolated": 0.05, "packed": 0.25, "pile": 0.35, "bin": 0.05, "tall": 0.10, "wall": 0.10,
+    "flat": 0.10,
 }  # fmt: skip
 _OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "flat": ("flat",)}
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
@@ -42,40 +53,93 @@ _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the ot
 _FIRST_SEED = 3_000_000_000  # no evaluation and no other training uses these seeds
 
 
-def examples_of(config: Config, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of one scene: inputs (N, K) of the critic, whether each candidate is sound (N,) bool, and the
-    scores (N,) by which the search ranked it. In a worker process."""
+class Examples(NamedTuple):
+    """N executed candidates: what the critic sees of them, which succeeded (N,) bool, the scores
+    (N,) by which the search ranked them, the numbers (N,) of their scenes and of their plans, each
+    of one planner for one frame."""
+
+    inputs: CriticInputs
+    success: np.ndarray
+    score: np.ndarray
+    scene: np.ndarray
+    plan: np.ndarray
+
+    def where(self, mask: np.ndarray) -> Examples:
+        return Examples(self.inputs.take(mask), *(column[mask] for column in self[1:]))
+
+    @staticmethod
+    def joined(parts: Sequence[Examples]) -> Examples:
+        inputs = CriticInputs.joined([part.inputs for part in parts])
+        return Examples(inputs, *(np.concatenate(column) for column in list(zip(*parts))[1:]))
+
+
+_NONE = Examples(nothing(), np.empty(0, bool), np.empty(0), *np.empty((2, 0), int))
+
+
+def planner_of(plan: np.ndarray) -> np.ndarray:
+    """(N,) numbers in PLANNERS of the planners that made plans (N,)."""
+    return plan % len(PLANNERS)
+
+
+def examples_of(config: Config, number: int) -> Examples:
+    """Executed candidates of one scene, in a worker process."""
     rng = np.random.default_rng([config.seed, _FIRST_SEED + number])
-    cell, planner = _cell_of(config), _planner_of(config, bool(rng.random() < 0.5))
+    cell, planners = _cell_of(config), _planners_of(config, bool(rng.random() < 0.5))
     scene = draw_scene(config, _sets_of(config), rng)
-    inputs, sound, scores = [np.empty((0, len(INPUTS)), np.float32)], [], []
+    found = [_NONE]
     for frame_number in range(FRAMES_PER_SCENE):
         total = len(scene.placements)
         count = total if frame_number == 0 else int(rng.integers(1, total + 1))
         some = np.sort(rng.choice(total, count, replace=False))
-        cell.load(replace(scene, placements=tuple(scene.placements[i] for i in some)))
+        part = replace(scene, placements=tuple(scene.placements[i] for i in some))
+        part = at_rest(cell, part)
         frame = draw_frame(config, cell, rng)
-        truth = frame.truth
-        assert truth is not None
-
-        def judge(heights: HeightMap, found: Candidates, facts: np.ndarray) -> Candidates:
-            inputs.append(facts)
-            sound.append(is_sound(found, heights.T_WV, truth, planner))  # noqa: B023 - used at once
-            scores.append(found.score)
-            return found
-
-        planner.judged_by(frame.without_truth(), judge)
-    return np.concatenate(inputs), np.concatenate([[], *sound]) > 0, np.concatenate([[], *scores])
+        for which, planner in enumerate(planners):
+            inputs, scores, grasps = judged_by(planner, frame)
+            tried = rng.permutation(len(grasps))[: _TRIED[which]]
+            success = np.array([execute(cell, part, grasps[i]) for i in tried], bool)
+            plan = (number * FRAMES_PER_SCENE + frame_number) * len(PLANNERS) + which
+            numbers = np.full(len(tried), number), np.full(len(tried), plan)
+            found.append(Examples(inputs.take(tried), success, scores[tried], *numbers))
+    return Examples.joined(found)
 
 
-def is_sound(
-    found: Candidates, T_WV: np.ndarray, truth: SceneGeometry, planner: GraspNetFanPlanner
-) -> np.ndarray:
-    """(N,) bool: the exact contacts of candidates of a view hold, and the open hand is free."""
-    scene = truth.transformed(inverse_pose(T_WV))
-    exact = height_map_from_scene(truth, planner.workspace, 0.002, T_WV=T_WV)
-    free = measure(found, exact, planner.gripper, planner.settings).score > 0
-    return free & (exact_quality(found, scene, planner.gripper) > SOUND)
+def judged_by(planner: Judged, frame: RGBDFrame) -> tuple[CriticInputs, np.ndarray, list[Grasp]]:
+    """What a planner asks its critic about a frame: inputs of N candidates, the scores (N,) by
+    which the search ranked them, and the grasps."""
+    inputs, scores, grasps = [nothing()], [np.empty(0)], []
+
+    def judge(heights: HeightMap, found: Candidates, seen: CriticInputs) -> np.ndarray:
+        inputs.append(seen)
+        scores.append(found.score)
+        for grasp in found.grasps(planner.gripper):
+            pose = heights.T_WV @ grasp.pose
+            grasps.append(Grasp.from_pose(pose, grasp.width, grasp.quality))
+        return np.ones(len(found))
+
+    planner.judge = judge
+    planner(frame)
+    return CriticInputs.joined(inputs), np.concatenate(scores), grasps
+
+
+def at_rest(cell: Cell, scene: Scene) -> Scene:
+    """The scene as its objects come to rest, which lean on each other, and which others may have
+    been taken from; the cell has it."""
+    cell.load(scene)
+    placements = []
+    for index, placed in enumerate(scene.placements):
+        position, quaternion = position_quaternion(cell.object_pose(index))
+        placements.append(replace(placed, position=position, quaternion=quaternion))
+    return replace(scene, placements=tuple(placements))
+
+
+def execute(cell: Cell, scene: Scene, grasp: Grasp) -> bool:
+    """Whether a grasp of the freshly loaded scene succeeds; not, where the simulation blows up."""
+    cell.load(scene)
+    try:
+        return clears_table(cell, grasp) and attempt(cell, grasp).success
+    except PhysicsError:  # the next one loads its scene into a rebuilt cell
+        return False
 
 
 @kept
@@ -84,13 +148,10 @@ def _cell_of(config: Config) -> Cell:
 
 
 @kept
-def _planner_of(config: Config, opens_fully: bool) -> GraspNetFanPlanner:
+def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
     gripper = replace(config.gripper.geometry, opens_fully=opens_fully)
-    return GraspNetFanPlanner(
-        gripper,
-        Workspace(tuple(config.workspace.center), config.workspace.size),
-        critic=GraspCritic(),
-    )
+    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    return [kind(gripper, workspace, critic=GraspCritic()) for kind, _ in PLANNERS.values()]
 
 
 @kept
@@ -119,7 +180,7 @@ def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Genera
 
 
 def draw_frame(config: Config, cell: Cell, rng: np.random.Generator) -> RGBDFrame:
-    """The scene as a random camera measures it, with its truth."""
+    """The scene as a random camera measures it."""
     most = (0, 15) if rng.random() < _FROM_ABOVE else (15, 65)
     tilt, heading = np.radians(rng.uniform(*most)), rng.uniform(0, 2 * np.pi)
     distance = rng.uniform(0.55, 0.85)
@@ -133,7 +194,7 @@ def draw_frame(config: Config, cell: Cell, rng: np.random.Generator) -> RGBDFram
         camera_intrinsics(config.camera),
         width=width, height=height, fov_deg=float(spans * rng.uniform(0.95, 1.1)),
     )  # fmt: skip
-    frame = cell.look(intrinsics, look_at(target + distance * away, target, up), with_truth=True)
+    frame = cell.look(intrinsics, look_at(target + distance * away, target, up))
     name = str(rng.choice(list(_NOISES), p=list(_NOISES.values())))
     noise = make_depth_noise(name, float(frame.K[0, 0]))
     if noise is None:

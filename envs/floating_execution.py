@@ -7,6 +7,7 @@ module does not know how grasps are planned.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -44,8 +45,22 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
     PhysicsError when the simulation blows up.
     """
-    hand = floating_hand(cell)
+    start = cell.seconds
+    outcome = attempt(cell, grasp)
+    if outcome.success and outcome.object_index is not None:
+        _remove(cell, outcome.object_index)
+    park(floating_hand(cell), cell.config.workspace)
+    _let_rest(cell)
     cell.check_physics()
+    cell.retire_lost_objects()
+    return replace(outcome, sim_seconds=cell.seconds - start)
+
+
+def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
+    """As `execute_floating`, up to the judgement: afterwards the hand is where it is, with what it
+    holds."""
+    cell.check_physics()
+    hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
     reason, met, detail = "success", "", ""
     try:
@@ -62,12 +77,6 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     stopped_at = None
     if reason == "collision" and hand.palm_touches():
         stopped_at = hand.tip_pose()[:3, 3].copy()
-    if reason == "success":
-        _remove(cell, held)
-    park(hand, cell.config.workspace)
-    _let_rest(cell)
-    cell.check_physics()
-    cell.retire_lost_objects()
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
 
 

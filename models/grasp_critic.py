@@ -1,23 +1,26 @@
-"""How likely the contacts of a grasp are what they seem: a small network on measured quantities.
+"""How likely a grasp that was found on a height map is sound: a small network on what lies around it.
 
 From one side the far contact of a grasp is a guess, and the search picks the grasps whose guesses
-look best. The critic has seen on training scenes which of them were true: its inputs are what the
-search measures (`models.planner_antipodal.measure`), how the closing line lies to the vertical and
-to the camera, and the grasp network's value; its output is the chance that exact contacts hold,
-there or a few millimetres beside (`models.planner_contacts.exact_quality`), and the open hand has
-room. `benchmarks.train_critic`
-trains it. This module knows neither images nor scenes.
+look best. The critic has seen on training scenes which of them were true. It looks at the heights
+around the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN looks at a
+depth image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
+(`models.planner_antipodal.measure`), how the closing line lies to the vertical and to the camera,
+and the grasp network's value. Its output is the chance that the exact contacts hold at the grasp's
+pose and a few millimetres beside (`models.planner_contacts.pose_qualities`), and that the open hand
+has room. `benchmarks.train_critic` trains it. This module knows neither images nor scenes.
 """
 
 from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
+from models.planner_antipodal import cells_around
 from models.planner_candidates import FACTS, Candidates
 from utils.checkpoint import build_model, load_checkpoint
 from utils.height_map import HeightMap
@@ -31,42 +34,85 @@ VIEW_INPUTS = (
 INPUTS = (*VIEW_INPUTS, *FACTS)
 _LEAST = 1e-6  # of scores and values, in their logarithms
 
+_STEP = 0.004  # m between the cells of a patch
+_ALONG, _ACROSS = 48, 24  # cells: the whole palm along the closing line, the fingers' surroundings
+_MOST = 0.1  # m over and under the fingertips, beyond which a height tells no more
+_LAYERS = 3  # of a patch: heights, ceilings, and where the grasp's own object is
+_UNIT = 0.001  # m of a patch's heights, which are whole numbers
 
-class GraspCritic(nn.Module):
-    """Inputs (N, len(INPUTS)) as `critic_inputs` has them to logits (N,) of the chance.
 
-    mean, scale: of the training inputs, part of the weights.
+class CriticInputs(NamedTuple):
+    """What the critic sees of N candidates.
+
+    facts: (N, len(INPUTS)) float32, metres and radians. patches: (N, 3, V, U) int8, the map's
+    heights and ceilings over the fingertips in millimetres, and 1 where the map has the candidate's
+    object; U runs along the closing line, V across it.
     """
 
-    def __init__(self, inputs: int = len(INPUTS), width: int = 64):
-        super().__init__()
-        self.model_args = {"inputs": inputs, "width": width}
-        self.register_buffer("mean", torch.zeros(inputs))
-        self.register_buffer("scale", torch.ones(inputs))
-        self.layers = nn.Sequential(
-            nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
-            nn.Linear(width, 1),
-        )  # fmt: skip
+    facts: np.ndarray
+    patches: np.ndarray
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        # Outside of what training has seen, an input says no more than at its border.
-        return self.layers(((x - self.mean) / self.scale).clamp(-5, 5))[:, 0]
+    def take(self, index: np.ndarray) -> CriticInputs:
+        return CriticInputs(self.facts[index], self.patches[index])
+
+    @staticmethod
+    def joined(parts: list[CriticInputs]) -> CriticInputs:
+        return CriticInputs(*(np.concatenate(column) for column in zip(*[nothing(), *parts])))
+
+
+def nothing() -> CriticInputs:
+    """The inputs of no candidate."""
+    patches = np.empty((0, _LAYERS, _ACROSS, _ALONG), np.int8)
+    return CriticInputs(np.empty((0, len(INPUTS)), np.float32), patches)
+
+
+class GraspCritic(nn.Module):
+    """Facts (N, len(INPUTS)) and patches (N, 3, V, U) of `CriticInputs`, as float32 and int8, to
+    logits (N,) of the chance.
+
+    mean, scale: of the training facts, part of the weights.
+    """
+
+    def __init__(self, inputs: tuple[str, ...] = INPUTS, channels: tuple[int, ...] = (24, 48, 64)):
+        super().__init__()
+        self.model_args = {"inputs": list(inputs), "channels": list(channels)}
+        self.register_buffer("mean", torch.zeros(len(inputs)))
+        self.register_buffer("scale", torch.ones(len(inputs)))
+        first, second, third = channels
+        self.patch = nn.Sequential(
+            nn.Conv2d(_LAYERS, first, 5, stride=2, padding=2), nn.ReLU(),
+            nn.Conv2d(first, second, 3, stride=2, padding=1), nn.ReLU(),
+            nn.Conv2d(second, third, 3, stride=2, padding=1), nn.ReLU(),
+            nn.Flatten(), nn.Linear(third * _ACROSS * _ALONG // 64, 64), nn.ReLU(),
+        )  # fmt: skip
+        self.fact = nn.Sequential(nn.Linear(len(inputs), 64), nn.ReLU())
+        self.layers = nn.Sequential(nn.Linear(128, 64), nn.ReLU(), nn.Linear(64, 1))
+
+    def forward(self, facts: torch.Tensor, patches: torch.Tensor) -> torch.Tensor:
+        # Outside of what training has seen, a fact says no more than at its border.
+        facts = ((facts - self.mean) / self.scale).clamp(-5, 5)
+        heights = patches[:, :2].float() * (_UNIT / 0.03)
+        # What may be hidden is told by how far the ceiling lies over the surface.
+        seen = torch.cat(
+            [heights[:, :1], heights[:, 1:] - heights[:, :1], patches[:, 2:].float()], dim=1
+        )
+        return self.layers(torch.cat([self.patch(seen), self.fact(facts)], dim=1))[:, 0]
 
     @torch.inference_mode()
-    def chance(self, inputs: np.ndarray) -> np.ndarray:
-        """(N,) chances in 0..1 of inputs (N, len(INPUTS))."""
-        return self(torch.from_numpy(inputs)).sigmoid().numpy().astype(float)
+    def chance(self, inputs: CriticInputs) -> np.ndarray:
+        """(N,) chances in 0..1."""
+        return self(*map(torch.from_numpy, inputs)).sigmoid().numpy().astype(float)
 
 
 def critic_inputs(
     found: Candidates, heights: HeightMap, value: np.ndarray, towards: np.ndarray
-) -> np.ndarray:
-    """(N, len(INPUTS)) float32 for measured candidates on a height map.
+) -> CriticInputs:
+    """What the critic sees of measured candidates on a height map.
 
     value: (N,) of the grasp network. towards: (3,) unit vector in W from the scene to the camera.
     """
     R, count = heights.T_WV[:3, :3], len(found)
-    along, _ = found.axes()
+    along, across = found.axes()
     closing, approach = along @ R[:, :2].T, -R[:, 2]
     tip = np.column_stack([found.xy, found.tip])
     view = (
@@ -81,7 +127,16 @@ def critic_inputs(
         found.width,
         np.abs(found.turn),
     )
-    return np.column_stack([*view, found.facts]).astype(np.float32)
+    facts = np.column_stack([*view, found.facts]).astype(np.float32)
+    u, v = (_STEP * (np.arange(cells) - (cells - 1) / 2) for cells in (_ALONG, _ACROSS))
+    where = cells_around(found.xy, along, across, u, v, heights)
+    tips = found.tip[:, None, None]
+    layers = [
+        np.rint(np.clip(surface.take(where) - tips, -_MOST, _MOST) / _UNIT)
+        for surface in (heights.height, heights.ceiling)
+    ]
+    layers.append(heights.label.take(where) == found.label[:, None, None])
+    return CriticInputs(facts, np.stack(layers, axis=1).astype(np.int8))
 
 
 def load_critic(path: Path | str) -> GraspCritic:

@@ -282,7 +282,7 @@ def measure(
     most = np.ceil(reach / heights.cell)
     u = np.arange(-most, most + 1) * heights.cell
     v = np.linspace(-1, 1, 9) * gripper.finger_half_width
-    where = _cells(candidates.xy, along, across, u, v, heights)  # (N, V, U)
+    where = cells_around(candidates.xy, along, across, u, v, heights)  # (N, V, U)
     height = heights.height.take(where)
     highest = height.max(axis=1)  # across the pads
 
@@ -370,7 +370,7 @@ def measure(
     return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score, facts)
 
 
-def _cells(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
+def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
     """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
     xy, along, across = (part.T[..., None, None] for part in (xy, along, across))
     row, col = heights.index(np.moveaxis(xy + u * along + v[:, None] * across, 0, -1))
@@ -426,5 +426,5 @@ def _palm_gap(
     scene = heights.highest_around("ceiling", radius, cv2.MORPH_ELLIPSE)
     ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
     u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
-    nearby = scene.take(_cells(xy, along, across, u, v, heights)).max(axis=2)
+    nearby = scene.take(cells_around(xy, along, across, u, v, heights)).max(axis=2)
     return (gripper.palm_underside(v) - nearby).min(axis=1)

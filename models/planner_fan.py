@@ -57,6 +57,10 @@ class FanSettings:
     distinct_turn: float = np.deg2rad(20)
     wrist: tuple[float, float] = (0.06, 0.13)
 
+    def preference(self, tilt: np.ndarray) -> np.ndarray:
+        """(...) factors on the scores of grasps whose approaches are tilted, in radians."""
+        return np.exp(-((np.minimum(tilt, _TILTED) / self.tilt_scale) ** 2))
+
     def directions(self, covered: bool = False) -> list[np.ndarray]:
         """Approaches (3,), unit vectors in W, the vertical first. covered: whether something hangs
         over the table."""
@@ -157,7 +161,7 @@ class FanPlanner(SearchPlanner):
         found = found.distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
-        factor = np.exp(-((min(tilt, _TILTED) / self.fan.tilt_scale) ** 2))
+        factor = float(self.fan.preference(tilt))
         return [
             Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
             for grasp in found.grasps(self.gripper)

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import torch
 
-from models.grasp_critic import GraspCritic, critic_inputs, shipped_critic
+from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
 from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
@@ -175,8 +175,13 @@ PEAKS = PeakSettings(threshold=0.02, count=80, radius=3)
 DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of the labels
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 CROP_MARGIN = 0.04  # m around what stands on the table
-JUDGED = 12  # candidates of a view that the critic judges
+# Candidates that the critic judges: of a planar search, and of each view of a fan; no two of them
+# are both closer and less turned than this, m and rad.
+PLANAR_JUDGED, VIEW_JUDGED = 40, 12
+JUDGED_DISTANCE, JUDGED_TURN = 0.01, np.deg2rad(20)
 LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
+
+Judge = Callable[[HeightMap, Candidates, CriticInputs], np.ndarray]
 
 
 def loaded(checkpoint: Path) -> SavedGraspNet:
@@ -190,11 +195,35 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
     return saved._replace(model=for_inference(saved.model))
 
 
-class GraspNetPlanner(SearchPlanner):
+class Judged:
+    """What the planners share whose candidates a critic judges last (`models.grasp_critic`).
+
+    judge: from a map, candidates and what the critic sees of them to their chances (N,).
+    """
+
+    def __init__(self, critic: GraspCritic | None):
+        self.critic = critic or shipped_critic()
+        self.judge: Judge = self.chance
+
+    def chance(self, heights: HeightMap, found: Candidates, inputs: CriticInputs) -> np.ndarray:
+        return self.critic.chance(inputs)
+
+    def judged(
+        self, heights: HeightMap, found: Candidates, seen: NetworkView, count: int
+    ) -> Candidates:
+        """The best of the candidates, no two alike, ranked by their chances, and half as strongly
+        by the search's score."""
+        found = found.distinct(count, JUDGED_DISTANCE, JUDGED_TURN)
+        inputs = critic_inputs(found, heights, seen.value(heights, found), seen.towards)
+        chance = self.judge(heights, found, inputs)
+        return replace(found, score=chance * np.sqrt(found.score)).best(len(found))
+
+
+class GraspNetPlanner(Judged, SearchPlanner):
     """Antipodal search ranked by a network, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. Raises UserError if the file cannot
-    be loaded.
+    checkpoint: file of the network, unless `network` is given. critic: the shipped one by default.
+    Raises UserError if a file cannot be loaded.
     """
 
     def __init__(
@@ -205,15 +234,18 @@ class GraspNetPlanner(SearchPlanner):
         checkpoint: Path = SHIPPED,
         network: SavedGraspNet | None = None,
         settings: SearchSettings = SETTINGS,
+        critic: GraspCritic | None = None,
     ):
-        super().__init__(gripper, workspace, seed, settings)
+        Judged.__init__(self, critic)
+        SearchPlanner.__init__(self, gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace)
         heights = only_target(seen.heights, frame)
-        return self.grasps(self.search(heights, partial(seen.value, heights)))
+        found = self.search(heights, partial(seen.value, heights))
+        return self.grasps(self.judged(heights, found, seen, PLANAR_JUDGED))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace).heights
@@ -240,8 +272,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
             found = found.best(settings.finalists)
             if len(found):
                 found = turn_onto_faces(found, heights, self.gripper, settings)
-                found = replace(found, score=found.score * value(found))
-                return self.grasps(found.best(len(found)))
+                found = replace(found, score=found.score * value(found)).best(len(found))
+                return self.grasps(self.judged(heights, found, seen, PLANAR_JUDGED))
         return []
 
     def _at_peaks(self, points: np.ndarray, heights: HeightMap) -> Candidates:
@@ -266,9 +298,9 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         )
 
 
-class GraspNetFanPlanner(FanPlanner):
+class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on what was measured of them (`models.grasp_critic`)."""
+    the last word on each view's."""
 
     def __init__(
         self,
@@ -279,18 +311,11 @@ class GraspNetFanPlanner(FanPlanner):
         network: SavedGraspNet | None = None,
         critic: GraspCritic | None = None,
     ):
-        super().__init__(gripper, workspace, seed)
+        Judged.__init__(self, critic)
+        FanPlanner.__init__(self, gripper, workspace, seed)
         self.network = network or loaded(checkpoint)
-        self.critic = critic or shipped_critic()
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        return self.judged_by(frame, self.by_critic)
-
-    def judged_by(
-        self, frame: RGBDFrame, judge: Callable[[HeightMap, Candidates, np.ndarray], Candidates]
-    ) -> list[Grasp]:
-        """The grasps of a frame, ranked by `judge`, which gets a view's map, its best candidates
-        and what the critic sees of them (`models.grasp_critic.critic_inputs`)."""
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)
@@ -299,21 +324,11 @@ class GraspNetFanPlanner(FanPlanner):
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        towards = frame.T_WC[:3, 3] - [*self.workspace.centre, self.workspace.table_height]
-        towards = towards / np.linalg.norm(towards)
-
         def of_view(heights: HeightMap, found: Candidates) -> Candidates:
-            found = found.distinct(JUDGED, self.fan.distinct_distance, self.fan.distinct_turn)
-            value = seen.value(heights, found)
-            return judge(heights, found, critic_inputs(found, heights, value, towards))
+            return self.judged(heights, found, seen, VIEW_JUDGED)
 
         covered = self.covered(frame.fixtures)
         return self.search_fan(overhead, tilted, seen.value, of_view, covered)
-
-    def by_critic(self, heights: HeightMap, found: Candidates, inputs: np.ndarray) -> Candidates:
-        """Candidates ranked by the critic's chance, and half as strongly by the search's score."""
-        score = self.critic.chance(inputs) * np.sqrt(found.score)
-        return replace(found, score=score).best(len(found))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights
@@ -326,7 +341,8 @@ class NetworkView:
     its depth filled where colours tell what is there. heights: the map from above. crop: whether
     only the part of the image is looked at in which something stands. below: as in
     `height_map_from_frame`. Where the frame has a second
-    one, its network maps serve for what the first does not show. Raises UserError for an image that
+    one, its network maps serve for what the first does not show. towards: (3,) unit vector in W
+    from the middle of the workspace to the camera. Raises UserError for an image that
     the network cannot take.
     """
 
@@ -344,6 +360,8 @@ class NetworkView:
         if frame.second is not None:
             self._second = _Prediction(network, frame.second, table)
         self.frame = self._first.frame
+        towards = frame.T_WC[:3, 3] - [*workspace.centre, table]
+        self.towards = towards / np.linalg.norm(towards)
         self.heights = height_map_from_frame(self.frame, workspace, below=below)
         if network.model.centre_head is not None:
             offset = self._first.maps[3][0].numpy()
