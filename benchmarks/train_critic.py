@@ -1,11 +1,12 @@
-"""Train the critic of graspnet6d: python -m benchmarks.train_critic --output FILE.pt [key=value]
+"""Train the planners' critic: python -m benchmarks.train_critic --output FILE.pt [key=value]
 
-Draws scenes of training objects, lets the fan's search find its candidates, and fits the critic
-(`models.grasp_critic`) to which of them are sound (`envs.critic_examples`). Every tenth scene is
-held out; on these it prints how often the candidate that is ranked first is sound, by the search
-alone and by the critic, and how far the stated chances are from frequencies. Written to
-checkpoints/critic.pt, the critic is what graspnet6d ranks by from then on; its chances of success
-are then fitted again (`benchmarks.calibrate`).
+Draws scenes of training objects, has a floating hand execute candidates of graspnet6d, graspnet and
+graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
+them succeed. Every tenth scene is held out; on these it prints how often the candidate that is
+ranked first succeeds, of those that were executed, by the search alone and by the critic, and how
+far the stated chances are from frequencies. Written to checkpoints/critic.pt, the critic is what
+the planners rank by from then on; their chances of success are then fitted again
+(`benchmarks.calibrate`).
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 def main(argv: Sequence[str] | None = None) -> int:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--output", type=Path, required=True, help="file for the weights")
-        parser.add_argument("--scenes", type=int, default=800, help="how many, ten or more")
+        parser.add_argument("--scenes", type=int, default=1000, help="how many, ten or more")
 
-    config, chosen = parse_args(argv, "Train the critic of graspnet6d.", options)
+    config, chosen = parse_args(argv, "Train the planners' critic.", options)
     check_writable("--output", chosen.output)
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
@@ -49,8 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     critic = fit(examples.where(~held_out), config.seed)
     scores = judged(critic, examples.where(held_out))
     print(
-        f"{len(examples.sound)} candidates of {chosen.scenes} scenes, "
-        f"{100 * examples.sound.mean():.0f} % of them sound"
+        f"{len(examples.success)} grasps of {chosen.scenes} scenes, "
+        f"{100 * examples.success.mean():.0f} % of them succeeded"
     )
     print(", ".join(f"{name} {value:.3g}" for name, value in scores.items()))
     save_checkpoint(
@@ -77,17 +78,17 @@ def fit(examples: Examples, seed: int, epochs: int = EPOCHS) -> GraspCritic:
     rng = np.random.default_rng(seed)
     critic = GraspCritic()
     facts, patches = map(torch.from_numpy, examples.inputs)
-    sound = torch.from_numpy(examples.sound.astype(np.float32))
+    success = torch.from_numpy(examples.success.astype(np.float32))
     critic.mean.copy_(facts.mean(dim=0))
     critic.scale.copy_(facts.std(dim=0).clamp_min(1e-3))
     optimizer = torch.optim.AdamW(critic.parameters(), lr=RATE, weight_decay=DECAY)
-    steps = epochs * -(-len(sound) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=max(steps, 2))
+    steps = epochs * -(-len(success) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
     for _ in tqdm(range(epochs), unit="epoch"):
-        order = torch.from_numpy(rng.permutation(len(sound)))
+        order = torch.from_numpy(rng.permutation(len(success)))
         for batch in order.split(BATCH):
             logits = critic(*mirrored(facts[batch], patches[batch], rng))
-            loss = functional.binary_cross_entropy_with_logits(logits, sound[batch])
+            loss = functional.binary_cross_entropy_with_logits(logits, success[batch])
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -109,15 +110,11 @@ def mirrored(
 
 
 def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
-    """For each planner, how sound the first candidate of a plan is in the mean, and the half width
-    of its 95 % interval, as the search ranks alone and with the critic; then the calibration error
+    """For each planner, how many of its plans' first candidates succeed, ranked by the search alone
+    and by the critic, and the half width of that share's 95 % interval; then the calibration error
     of the critic's chances."""
-    chance = np.concatenate([
-        critic.chance(examples.inputs.take(some))
-        for some in np.array_split(np.arange(len(examples.sound)), len(examples.sound) // 4096 + 1)
-    ])  # fmt: skip
-    tilt = examples.inputs.facts[:, INPUTS.index("tilt")]
-    preference = FanSettings().preference(tilt)
+    chance = critic.chance(examples.inputs)
+    preference = FanSettings().preference(examples.inputs.facts[:, INPUTS.index("tilt")])
     scores = {}
     for number, name in enumerate(PLANNERS):
         own = planner_of(examples.plan) == number
@@ -125,18 +122,18 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
             ("search", examples.score * preference),
             ("critic", chance * np.sqrt(examples.score) * preference),
         ):
-            first = first_sound(examples.where(own), score[own])
+            first = first_of_plans(examples.where(own), score[own])
             scores[f"{name} by {kind}"] = float(first.mean())
             scores[f"{name} by {kind} +-"] = 1.96 * float(first.std() / np.sqrt(len(first)))
-    scores["calibration error"] = calibration_error(chance, examples.sound)
+    scores["calibration error"] = calibration_error(chance, examples.success)
     return scores
 
 
-def first_sound(examples: Examples, score: np.ndarray) -> np.ndarray:
-    """For each plan, how sound the candidate of the highest score (N,) is."""
+def first_of_plans(examples: Examples, score: np.ndarray) -> np.ndarray:
+    """For each plan, whether the candidate of the highest score (N,) succeeded."""
     order = np.lexsort((-score, examples.plan))
     _, first = np.unique(examples.plan[order], return_index=True)
-    return examples.sound[order][first]
+    return examples.success[order][first]
 
 
 if __name__ == "__main__":

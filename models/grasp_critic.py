@@ -1,18 +1,18 @@
-"""How likely a grasp that was found on a height map is sound: a small network on what lies around it.
+"""How likely a grasp that was found on a height map succeeds: a small network on its surroundings.
 
 From one side the far contact of a grasp is a guess, and the search picks the grasps whose guesses
-look best. The critic has seen on training scenes which of them were true. It looks at the heights
-around the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN looks at a
-depth image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
+look best. The critic has seen on training scenes which of them held. It looks at the heights around
+the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN looks at a depth
+image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
 (`models.planner_antipodal.measure`), how the closing line lies to the vertical and to the camera,
-and the grasp network's value. Its output is the chance that the exact contacts hold at the grasp's
-pose and a few millimetres beside (`models.planner_contacts.pose_qualities`), and that the open hand
-has room. `benchmarks.train_critic` trains it. This module knows neither images nor scenes.
+and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This module
+knows neither images nor scenes.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,6 +38,7 @@ _STEP = 0.004  # m between the cells of a patch
 _ALONG, _ACROSS = 48, 24  # cells: the whole palm along the closing line, the fingers' surroundings
 _MOST = 0.1  # m over and under the fingertips, beyond which a height tells no more
 _LAYERS = 3  # of a patch: heights, ceilings, and where the grasp's own object is
+_AT_ONCE = 4096  # candidates
 _UNIT = 0.001  # m of a patch's heights, which are whole numbers
 
 
@@ -73,7 +74,7 @@ class GraspCritic(nn.Module):
     mean, scale: of the training facts, part of the weights.
     """
 
-    def __init__(self, inputs: tuple[str, ...] = INPUTS, channels: tuple[int, ...] = (24, 48, 64)):
+    def __init__(self, inputs: Sequence[str] = INPUTS, channels: Sequence[int] = (24, 48, 64)):
         super().__init__()
         self.model_args = {"inputs": list(inputs), "channels": list(channels)}
         self.register_buffer("mean", torch.zeros(len(inputs)))
@@ -101,7 +102,9 @@ class GraspCritic(nn.Module):
     @torch.inference_mode()
     def chance(self, inputs: CriticInputs) -> np.ndarray:
         """(N,) chances in 0..1."""
-        return self(*map(torch.from_numpy, inputs)).sigmoid().numpy().astype(float)
+        facts, patches = (torch.from_numpy(part).split(_AT_ONCE) for part in inputs)
+        parts = [self(*some) for some in zip(facts, patches)]
+        return torch.cat(parts).sigmoid().numpy().astype(float)
 
 
 def critic_inputs(
