@@ -28,14 +28,13 @@ class ClearingSettings:
     promising: least chance of success with which the target, or what is in its way, is grasped
     while there is an alternative. share: the same for planners that state no chances, or none under
     `promising`, as a share of the best score in the whole scene: scores are compared with each
-    other alone. near:
-    a surface at this distance from the target, seen from above, counts exp(-1) of one right beside
-    it. over: height over the target at which it counts in full. beside: what a surface counts that
-    is not over the target. in_the_way: cm2 of such surface from which an object is in the way.
-    covering: cm2 of surface over the target and half as near, from which an object may rest on it,
-    so that it goes first even where the target's grasps look promising. points: of each object that
-    are looked at. enough: objects with promising grasps after which the search for others ends; one
-    more than is needed, for the case that a grasp fails.
+    other alone. near: a surface at this distance from the target, seen from above, counts exp(-1)
+    of one right beside it. over: height over the target at which it counts in full. beside: what a
+    surface counts that is not over the target. in_the_way: cm2 of such surface from which an object
+    is in the way. covering: cm2 of surface over the target and half as near, from which an object
+    may rest on it, so that it goes first even where the target's grasps look promising. points: of
+    each object that are looked at. enough: objects with promising grasps after which the search for
+    others ends; one more than is needed, for the case that a grasp fails.
     """
 
     promising: float = 0.9
