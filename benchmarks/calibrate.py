@@ -4,10 +4,12 @@ Reads run folders of evaluate.py, fits each planner's chance of success to its e
 (`utils.calibration`) and prints the expected calibration error before and after, in each scenario
 and with each depth noise. With --output the fits are written: into checkpoints/calibration.json,
 they are what the planners state from then on; planners that the runs do not have keep theirs.
-configs/calibration.yaml plays all planners on training objects:
+`make calibration` plays all planners on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
-    python -m benchmarks.calibrate runs/evaluate/<time>-calibration --output FILE.json
+    python evaluate.py --config configs/calibration_large.yaml
+    python -m benchmarks.calibrate runs/evaluate/<time>-calibration \\
+        runs/evaluate/<time>-calibration-large --output checkpoints/calibration.json
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -53,10 +54,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     with make_cell(config) as cell:
         for seed in range(config.seed, config.seed + chosen.scenes):
             cell.load(make_scene(chosen.layout, objects, seed, config))
-            frame = cell.frame(needs_truth(planner))
-            if not needs_truth(planner):
-                least = config.evaluate.second_look * CM3
-                frame = SecondLook(cell, least, calibrated=lambda second: second)(frame)
+            least = 0.0 if needs_truth(planner) else config.evaluate.second_look * CM3
+            look_again = SecondLook(cell, least, calibrated=lambda second: second)
+            frame = look_again(partial(cell.frame, needs_truth(planner)))
             if not pictures:
                 path = chosen.output.with_stem(f"{chosen.output.stem}_views")
                 iio.imwrite(path, views(planner, frame.without_truth()))

@@ -119,13 +119,16 @@ def run_round(
     missed: list[Grasp] = []  # in the round
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
     plan_seconds, ended = 0.0, "cleared"
+
+    def see() -> RGBDFrame:
+        mount = cell.config.camera.mount
+        return calibrated(cell, calibration, mount, cell.frame(privileged))
+
     try:
         with planner_errors(policy):
             reset_planner(plan, scene.seed)
         while cell.remaining and len(failed) < max_failures:
-            mount = cell.config.camera.mount
-            frame = calibrated(cell, calibration, mount, cell.frame(privileged))
-            frame = look_again(frame)
+            frame = look_again(see)
             if wanted is not None:
                 assert frame.segmentation is not None  # a cell's frames have it
                 frame = replace(frame, target=frame.segmentation == wanted)
@@ -140,7 +143,7 @@ def run_round(
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
             worth = [grasp for grasp in grasps if grasp.quality >= abstain]
             if not worth:
-                detail = _abstained(grasps, abstain)
+                detail = _details(look_again.remark, _abstained(grasps, abstain))
                 spent = look_again.sim_seconds
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
@@ -174,7 +177,7 @@ def run_round(
                     plan_seconds,
                     outcome.sim_seconds + look_again.sim_seconds,
                     grasp_to_image(grasp, frame.K, frame.T_WC),
-                    detail=outcome.detail,
+                    detail=_details(look_again.remark, outcome.detail),
                     held=_name_of(scene, held),
                     turned=None if outcome.motion is None else outcome.motion.turned,
                     slid=None if outcome.motion is None else outcome.motion.slid,
@@ -196,7 +199,8 @@ def run_round(
                     ended = "picks"
                     break
     except PlannerError as error:
-        attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, 0.0, detail=str(error)))
+        detail, spent = _details(look_again.remark, str(error)), look_again.sim_seconds
+        attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, spent, detail=detail))
         ended = PLANNER_ERROR
     except PhysicsError:
         attempts.append(AttemptRecord(False, "physics", plan_seconds, 0.0))
@@ -275,6 +279,11 @@ def _turn_ms(approach: Approach) -> dict[str, float]:
         "turn_ms": 1000 * float(np.percentile(turns, 95)),
         "turn_ms_mean": 1000 * float(np.mean(turns)),
     }
+
+
+def _details(*sentences: str) -> str:
+    """Those that are not empty, in one."""
+    return "; ".join(filter(None, sentences))
 
 
 def _abstained(grasps: Sequence[Grasp], least: float) -> str:

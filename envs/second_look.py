@@ -26,7 +26,7 @@ from envs.robot_kinematics import (
 )
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError
-from utils.depth import NoiseStream, seeded_noise
+from utils.depth import NoiseStream, seeded_noise, surfaces_in_holes, table_in_holes
 from utils.depth_correction import corrected
 from utils.geometry import Workspace
 from utils.height_map import HeightMap, height_map_from_frame
@@ -46,37 +46,45 @@ class SecondLook:
     least: m3 of open space that the second frame has to show past what is known; 0: none is taken.
     calibrated: gives a frame that was just taken with the wrist camera the pose that the program
     assumes. plan_seconds, sim_seconds: wall-clock time of the last choice of a view, and simulated
-    time of the last motion there and back.
+    time of the last motion there and back. remark: what ended the last look before its time, and
+    how the arm came home if it could not by itself; empty where nothing did.
     """
 
     def __init__(self, cell: Cell, least: float, calibrated: Callable[[RGBDFrame], RGBDFrame]):
         self._cell, self._least, self._calibrated = cell, least, calibrated
         self.plan_seconds = self.sim_seconds = 0.0
+        self.remark = ""
 
-    def __call__(self, frame: RGBDFrame) -> RGBDFrame:
-        """The frame, with a second one where that is worth it. The arm begins and ends at home."""
+    def __call__(self, see: Callable[[], RGBDFrame]) -> RGBDFrame:
+        """The frame that `see` takes, with a second one where that is worth it. The arm begins and
+        ends at home. Where it was stopped, which may have moved something, `see` takes the frame
+        again."""
+        frame = see()
         if self._least == 0.0:
             return frame
         start, began = time.perf_counter(), self._cell.seconds
         way = way_to_look(self._cell, frame, self._least)
         self.plan_seconds = time.perf_counter() - start
+        self.remark = ""
         if way is not None:
-            frame = replace(frame, second=self._taken(way))
+            try:
+                frame = replace(frame, second=self._taken(way))
+            except ArmStoppedError as stop:
+                ended = f"the second look was stopped: {stop}"
+                self.remark = "; ".join(filter(None, [ended, go_home(self._cell)]))
+                frame = see()
         self.sim_seconds = self._cell.seconds - began
         return frame
 
-    def _taken(self, way: Trajectory) -> RGBDFrame | None:
-        """The frame from the end of a way from home; None where something is in the arm's way."""
+    def _taken(self, way: Trajectory) -> RGBDFrame:
+        """The frame from the end of a way from home, to which the arm returns. Raises
+        ArmStoppedError where something is in its way."""
         cell = self._cell
         careful = partial(cell.robot.stop_on_contact, cell.config.execution.contact_stop)
-        try:
-            follow(cell, way, careful)
-            cell.step(round(_STILL_SECONDS / cell.dt))
-            frame = self._calibrated(wrist_frame(cell))
-            follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **scales(cell)))
-        except ArmStoppedError:
-            go_home(cell)
-            return None
+        follow(cell, way, careful)
+        cell.step(round(_STILL_SECONDS / cell.dt))
+        frame = self._calibrated(wrist_frame(cell))
+        follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **scales(cell)))
         return frame
 
 
@@ -102,14 +110,14 @@ def way_to_look(cell: Cell, frame: RGBDFrame, least: float) -> Trajectory | None
     where no pose that the arm can take shows more than `least` m3 of it."""
     camera, area = cell.config.camera, cell.config.workspace
     workspace = Workspace(tuple(area.center), area.size)
-    heights = height_map_from_frame(corrected(frame, workspace.table_height), workspace)
+    heights = known_heights(frame, workspace)
     space = OpenSpace(heights, workspace)
     if space.volume <= least:
         return None
     shape = camera.height, camera.width
     K = Intrinsics(camera.width, camera.height, camera.wrist_fov_deg).K
     views = [(space.shown(K, shape, T_WC), T_WC) for T_WC in dome(workspace)]
-    things = _box_around(heights)
+    things = box_around(heights)
     for shown, T_WC in sorted(views, key=lambda view: -view[0]):
         if shown <= least:
             return None
@@ -118,6 +126,15 @@ def way_to_look(cell: Cell, frame: RGBDFrame, least: float) -> Trajectory | None
             if _is_clear(cell, way, things):
                 return way
     return None
+
+
+def known_heights(frame: RGBDFrame, workspace: Workspace) -> HeightMap:
+    """The map from above of a frame in whose holes colours tell table and objects apart: without
+    them, the shadow that a depth camera leaves beside each object would count as the object. A
+    hole too wide for that stays an obstacle, because a black object may fill it."""
+    frame = corrected(frame, workspace.table_height)
+    frame = surfaces_in_holes(table_in_holes(frame, workspace.table_height))
+    return height_map_from_frame(frame, workspace)
 
 
 def _postures(cell: Cell, T_WC: np.ndarray) -> Iterator[np.ndarray]:
@@ -134,7 +151,7 @@ def _postures(cell: Cell, T_WC: np.ndarray) -> Iterator[np.ndarray]:
     yield from sorted(found, key=lambda q: float(abs(q - cell.home).max()))
 
 
-def _is_clear(cell: Cell, way: Trajectory, things: Box) -> bool:
+def _is_clear(cell: Cell, way: Trajectory, things: Box | None) -> bool:
     """Whether E stays in the workspace's box, and the arm clear of the cell and of `things`."""
     safety = cell.config.safety
     tips = np.array([tip_position(q) for q in way.positions.tolist()])
@@ -143,17 +160,20 @@ def _is_clear(cell: Cell, way: Trajectory, things: Box) -> bool:
     some = np.append(np.arange(0, len(way), LOOK_EVERY), len(way) - 1)
     q = way.positions[some]
     points = np.concatenate([arm_points(q), tips[some, None]], axis=1)
-    return bool(distance_to_box(points, things).min() > _HAND_RADIUS) and arm_is_clear(cell, q)
+    if things is not None and distance_to_box(points, things).min() <= _HAND_RADIUS:
+        return False
+    return arm_is_clear(cell, q)
 
 
-def _box_around(heights: HeightMap) -> Box:
-    """Of all that stands, or may stand, on the table."""
+def box_around(heights: HeightMap) -> Box | None:
+    """Of all that stands, or may stand, on the table; None where nothing does."""
     stands = heights.ceiling > heights.table_height + _STANDS
     if not stands.any():
-        return Box(np.zeros(3), np.array([*heights.origin, heights.table_height]))
+        return None
     row, column = np.nonzero(stands)
-    first = heights.origin + heights.cell * np.array([column.min(), row.min()])
-    last = heights.origin + heights.cell * np.array([column.max(), row.max()])
+    # From the outer edges of the cells, not from their middles.
+    first = heights.origin + heights.cell * (np.array([column.min(), row.min()]) - 0.5)
+    last = heights.origin + heights.cell * (np.array([column.max(), row.max()]) + 0.5)
     low = np.array([*first, heights.table_height])
     high = np.array([*last, float(heights.ceiling[stands].max())])
     return Box((high - low) / 2, (high + low) / 2)

@@ -55,7 +55,7 @@ class Candidates:
             np.full(len(tip), -1),
             np.zeros((len(tip), len(FACTS))),
         )
-        return Candidates(xy, angle, tip, width, width, turn, label, score, facts)
+        return Candidates(xy, angle, tip, width, width.copy(), turn, label, score, facts)
 
     @staticmethod
     def joined(parts: Sequence[Candidates]) -> Candidates:

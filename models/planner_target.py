@@ -26,15 +26,15 @@ class ClearingSettings:
     """When to take the target, and what is in its way; metres unless said.
 
     promising: least chance of success with which the target, or what is in its way, is grasped
-    while there is an alternative. share: the same for planners whose qualities are scores, as a
-    share of the best score in the whole scene: scores are compared with each other alone. near:
-    a surface at this distance from the target, seen from above, counts exp(-1) of one right beside
-    it. over: height over the target at which it counts in full. beside: what a surface counts that
-    is not over the target. in_the_way: cm2 of such surface from which an object is in the way.
-    covering: cm2 of surface over the target and half as near, from which an object may rest on it,
-    so that it goes first even where the target's grasps look promising. points: of each object that
-    are looked at. enough: objects with promising grasps after which the search for others ends; one
-    more than is needed, for the case that a grasp fails.
+    while there is an alternative. share: the same for planners that state no chances, or none under
+    `promising`, as a share of the best score in the whole scene: scores are compared with each
+    other alone. near: a surface at this distance from the target, seen from above, counts exp(-1)
+    of one right beside it. over: height over the target at which it counts in full. beside: what a
+    surface counts that is not over the target. in_the_way: cm2 of such surface from which an object
+    is in the way. covering: cm2 of surface over the target and half as near, from which an object
+    may rest on it, so that it goes first even where the target's grasps look promising. points: of
+    each object that are looked at. enough: objects with promising grasps after which the search for
+    others ends; one more than is needed, for the case that a grasp fails.
     """
 
     promising: float = 0.9
@@ -84,11 +84,20 @@ class TargetPlanner:
 
     def _objects(self, frame: RGBDFrame) -> _Objects:
         segments = self.plan.segments(frame)  # type: ignore[attr-defined]
-        promising = self.settings.promising
-        if self.calibration is None:
-            best = self.plan(replace(frame, target=None))[:1]
-            promising = self.settings.share * best[0].quality if best else 0.0
-        return _Objects(frame, segments, self.settings, promising)
+        return _Objects(frame, segments, self.settings, self._promising(frame))
+
+    def _promising(self, frame: RGBDFrame) -> float:
+        """Least quality of a promising grasp. Chances of a planner that nearly always succeeds may
+        all lie above the least one: they tell no grasp from another, but its scores do."""
+        chances, least = self.calibration, self.settings.promising
+        if chances is not None and chances(0.0) < least:
+            return least
+        best = self.plan(replace(frame, target=None))[:1]
+        if not best:
+            return 0.0
+        if chances is None:
+            return self.settings.share * best[0].quality
+        return float(chances(self.settings.share * chances.scores(best[0].quality)))
 
     def _clearing(self, objects: _Objects, grasps: list[Grasp]) -> list[Grasp]:
         shown = objects.surface(objects.target)

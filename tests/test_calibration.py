@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +19,7 @@ from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything
 from envs.rounds import run_round
 from models.graspnet_io import SHIPPED
-from models.planners import PLANNERS, calibration_of, calibrations, make_planner
+from models.planners import CALIBRATIONS, PLANNERS, calibration_of, calibrations, make_planner
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.calibration import (
@@ -32,6 +36,7 @@ from utils.result_records import AttemptRecord, RoundRecord, append_round, read_
 from utils.results import stated_chances, summarise
 from utils.transforms import ImageGrasp
 
+ROOT = Path(__file__).resolve().parent.parent
 CHANCES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
 
 
@@ -236,6 +241,36 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
         main([str(tmp_path / "train"), "--output", str(file)])
     with pytest.raises(UserError, match=r"no rounds.jsonl"):
         main([str(tmp_path / "nothing")])
+
+
+CONFIGS = {
+    config.evaluate.name: config
+    for config in map(load_config, sorted(ROOT.glob("configs/calibration*")))
+}
+
+
+def test_the_shipped_fits_are_of_the_runs_that_the_configs_play() -> None:
+    """For each planner, of the runs of all configs that have it; on training objects alone."""
+    shipped = json.loads(CALIBRATIONS.read_text(encoding="utf-8"))["planners"]
+    assert {*shipped} == {name for config in CONFIGS.values() for name in config.evaluate.policies}
+    for name, fit in shipped.items():
+        of = {run.split("-", 2)[2] for run in fit["runs"]}  # date, time, name
+        assert of == {one for one, config in CONFIGS.items() if name in config.evaluate.policies}
+    for config in CONFIGS.values():
+        assert config.objects.split == "train" and config.evaluate.abstain == 0
+        assert 900 <= config.seed <= 999
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_one_command_plays_every_config_and_fits_to_all_their_runs() -> None:
+    done = subprocess.run(
+        ["make", "-n", "calibration"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    played = re.findall(r"evaluate.py --config (\S+)", done.stdout)
+    assert {load_config(ROOT / file).evaluate.name for file in played} == {*CONFIGS}
+    fitted = done.stdout.split("benchmarks.calibrate")[1]
+    assert set(re.findall(r"runs/evaluate/\*-(\S+)", fitted)) == {*CONFIGS}
+    assert f"--output {CALIBRATIONS.relative_to(ROOT)}" in fitted
 
 
 def test_the_diagram_has_a_line_for_each_name() -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from models.planner_candidates import with_chances
 from models.planner_target import TargetPlanner
 from models.planners import HeuristicPlanner, make_planner
 from tests.helpers.box_frames import boxes_frame
+from utils.calibration import Calibration
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame
@@ -78,6 +80,28 @@ def test_scores_that_are_no_chances_are_compared_with_each_other_alone() -> None
         first = [grasps[0].position for grasps in (known, scored, faint)]
         np.testing.assert_array_equal(first[1], first[2])
         assert is_of(known[0], FLAT) == is_of(scored[0], FLAT) == (boxes[1] is beside)
+
+
+def test_chances_that_are_never_low_do_not_make_every_grasp_promising() -> None:
+    """The target's grasps have a fiftieth of the score of all others. By a calibration that gives
+    even the least score a chance over 0.9, the scores decide."""
+
+    flat = Calibration(0.05, 3.5)
+
+    class Poor(HeuristicPlanner):
+        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+            scored = [
+                replace(grasp, quality=0.02 if is_of(grasp, FLAT) else 1.0)
+                for grasp in super().__call__(frame)
+            ]
+            return with_chances(sorted(scored, key=lambda grasp: -grasp.quality), flat)
+
+    beside = [((0.03, 0.09, 0.06), 0.0, (0.5 + side * 0.065, 0.0)) for side in (-1, 1)]
+    plan, frame = Poor(GripperGeometry(), Workspace()), frame_of([FLAT, *beside])
+    plan.calibration = flat
+    assert flat(0.0) > 0.94
+    assert is_of(plan(frame)[0], FLAT)  # which can be grasped as it lies
+    assert any(is_of(TargetPlanner(plan)(frame)[0], box) for box in beside)
 
 
 def test_what_lies_where_the_target_was_last_seen_is_moved_aside() -> None:

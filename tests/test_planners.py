@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.planner_candidates import Candidates
 from models.planners import PLANNERS, make_planner, needs_truth, reset_planner
 from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.errors import UserError
@@ -29,6 +30,14 @@ def test_unknown_planner_is_refused_with_the_allowed_names() -> None:
     allowed = "graspnet6d, graspnet_direct, heuristic, heuristic6d, module:name, oracle, oracle6d"
     with pytest.raises(ValueError, match=f"'grasp'.*{allowed}, ppo, ppo:FILE.pt, random"):
         planner("grasp")
+
+
+def test_a_candidates_opening_changes_without_its_width() -> None:
+    rough = Candidates.rough(
+        np.zeros((2, 2)), np.zeros(2), np.zeros(2), np.full(2, 0.04), np.ones(2)
+    )
+    rough.opening[0] = 0.08
+    assert rough.width.tolist() == [0.04, 0.04] and rough.opening.tolist() == [0.08, 0.04]
 
 
 def grasp_of_the_middle(frame: RGBDFrame) -> list[Grasp]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,24 @@ def test_differences_name_the_noise_of_the_first_pair(tmp_path):
     assert "| `random_urdfs` | pile | `realsense` | +1.5 [-0.2, +3.1] | - |" in written
     chinese = with_tables(page, tmp_path, chinese=True)
     assert "15 个物体、深度噪声为 `realsense` 时,GraspNet" in chinese
+
+
+def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
+    """450 of 500 and 300 of 400 grasps; of 500 objects as many reach the bin."""
+    for part, others in (("scoreboard", (450, 500)), ("clutter15", (300, 400))):
+        rows = [row("graspnet", 490, 500), row("heuristic", 1, 500), row("graspnet", *others)]
+        figures(tmp_path, part, [*rows[:2], noisy(rows[2])])
+    page = "<!-- results:headline -->\n<!-- /results -->"
+    written = with_tables(page, tmp_path).splitlines()[1]
+    assert written == (
+        "**Result** on unseen objects with `realsense` depth noise: 90 % of GraspNet's grasps "
+        "succeed in piles of 5 objects, 75 % in piles of 15; 90 % and 60 % of the objects reach "
+        "the bin."
+    )
+    chinese = with_tables(page, tmp_path, chinese=True)
+    assert re.findall(r"\d+ %", chinese) == ["90 %", "75 %", "90 %", "60 %"]
+    figures(tmp_path, "clutter15", [row("graspnet", 400, 500)])  # no noise in common
+    assert "on unseen objects: 98 % of" in with_tables(page, tmp_path)
 
 
 def test_every_depth_noise_is_a_column(tmp_path):
