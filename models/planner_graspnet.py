@@ -196,34 +196,33 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
 
 
 class Judged:
-    """What the planners share whose candidates a critic judges last (`models.grasp_critic`).
+    """What the planners share whose candidates a critic may judge last (`models.grasp_critic`).
 
-    judge: from a map, candidates and what the critic sees of them to their chances (N,).
+    judge: from a map, candidates and what the critic sees of them to their chances (N,); None
+    leaves the search's scores.
     """
 
     def __init__(self, critic: GraspCritic | None):
-        self.critic = critic or shipped_critic()
-        self.judge: Judge = self.chance
-
-    def chance(self, heights: HeightMap, found: Candidates, inputs: CriticInputs) -> np.ndarray:
-        return self.critic.chance(inputs)
+        self.judge: Judge | None = None
+        if critic is not None:
+            self.judge = lambda heights, found, inputs: critic.chance(inputs)
 
     def judged(
         self, heights: HeightMap, found: Candidates, seen: NetworkView, count: int
     ) -> Candidates:
-        """The best of the candidates, no two alike, ranked by their chances, and half as strongly
-        by the search's score."""
+        """The best of the candidates, no two alike, scored by their chances."""
+        if self.judge is None:
+            return found
         found = found.distinct(count, JUDGED_DISTANCE, JUDGED_TURN)
         inputs = critic_inputs(found, heights, seen.value(heights, found), seen.towards)
-        chance = self.judge(heights, found, inputs)
-        return replace(found, score=chance * np.sqrt(found.score)).best(len(found))
+        return replace(found, score=self.judge(heights, found, inputs)).best(len(found))
 
 
 class GraspNetPlanner(Judged, SearchPlanner):
     """Antipodal search ranked by a network, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. critic: the shipped one by default.
-    Raises UserError if a file cannot be loaded.
+    checkpoint: file of the network, unless `network` is given. critic: none by default, because
+    from above it was not seen to gain anything. Raises UserError if a file cannot be loaded.
     """
 
     def __init__(
@@ -300,7 +299,7 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
 class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on each view's."""
+    the last word on each view's; the shipped one by default."""
 
     def __init__(
         self,
@@ -311,7 +310,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         network: SavedGraspNet | None = None,
         critic: GraspCritic | None = None,
     ):
-        Judged.__init__(self, critic)
+        Judged.__init__(self, critic or shipped_critic())
         FanPlanner.__init__(self, gripper, workspace, seed)
         self.network = network or loaded(checkpoint)
 

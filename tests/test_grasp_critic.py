@@ -159,7 +159,7 @@ def test_a_rule_is_learned(by_patch) -> None:
     critic = fit(made_up(300, 0, by_patch), seed=0, epochs=15)
     scores = judged(critic, made_up(100, 1, by_patch))
     for name in PLANNERS:
-        assert scores[f"{name} by search"] < 0.1
+        assert scores[f"{name} by search"] < 0.2  # and as many nothing else
         assert scores[f"{name} by critic"] > 0.8  # a sixteenth of the plans holds no success
     assert scores["calibration error"] < 0.05
 
