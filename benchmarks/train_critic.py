@@ -32,14 +32,14 @@ from utils.executor import completed, open_executor
 from utils.runs import check_writable, git_state, parse_args, run_script
 
 HELD_OUT = 10  # every tenth scene
-EPOCHS, BATCH, RATE, DECAY = 12, 256, 2e-3, 1e-2
+EPOCHS, BATCH, RATE, DECAY = 4, 256, 2e-3, 1e-2
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--output", type=Path, required=True, help="file for the weights")
-        parser.add_argument("--scenes", type=int, default=1000, help="how many, ten or more")
+        parser.add_argument("--scenes", type=int, default=3000, help="how many, ten or more")
 
     config, chosen = parse_args(argv, "Train the critic of graspnet6d.", options)
     check_writable("--output", chosen.output)

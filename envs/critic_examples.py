@@ -36,12 +36,7 @@ from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 
 # Whose candidates are executed, and how many of each plan's.
-PLANNERS = {
-    "graspnet6d": (GraspNetFanPlanner, 20),
-    "graspnet": (GraspNetPlanner, 7),
-    "graspnet_direct": (GraspNetDirectPlanner, 7),
-}
-_TRIED = [count for _, count in PLANNERS.values()]
+PLANNERS = {"graspnet6d": 20, "graspnet": 7, "graspnet_direct": 7}
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
     "isolated": 0.05, "packed": 0.25, "pile": 0.35, "bin": 0.05, "tall": 0.10, "wall": 0.10,
@@ -94,9 +89,9 @@ def examples_of(config: Config, number: int) -> Examples:
         part = replace(scene, placements=tuple(scene.placements[i] for i in some))
         part = at_rest(cell, part)
         frame = draw_frame(config, cell, rng)
-        for which, planner in enumerate(planners):
+        for which, (planner, most) in enumerate(zip(planners, PLANNERS.values())):
             inputs, scores, grasps = judged_by(planner, frame)
-            tried = rng.permutation(len(grasps))[: _TRIED[which]]
+            tried = rng.permutation(len(grasps))[:most]
             success = np.array([execute(cell, part, grasps[i]) for i in tried], bool)
             plan = (number * FRAMES_PER_SCENE + frame_number) * len(PLANNERS) + which
             numbers = np.full(len(tried), number), np.full(len(tried), plan)
@@ -151,7 +146,11 @@ def _cell_of(config: Config) -> Cell:
 def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
     gripper = replace(config.gripper.geometry, opens_fully=opens_fully)
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
-    return [kind(gripper, workspace, critic=GraspCritic()) for kind, _ in PLANNERS.values()]
+    return [  # in the order of PLANNERS; the first one's critic is never asked
+        GraspNetFanPlanner(gripper, workspace, critic=GraspCritic()),
+        GraspNetPlanner(gripper, workspace),
+        GraspNetDirectPlanner(gripper, workspace),
+    ]
 
 
 @kept

@@ -202,10 +202,7 @@ class Judged:
     leaves the search's scores.
     """
 
-    def __init__(self, critic: GraspCritic | None):
-        self.judge: Judge | None = None
-        if critic is not None:
-            self.judge = lambda heights, found, inputs: critic.chance(inputs)
+    judge: Judge | None = None
 
     def judged(
         self, heights: HeightMap, found: Candidates, seen: NetworkView, count: int
@@ -221,8 +218,8 @@ class Judged:
 class GraspNetPlanner(Judged, SearchPlanner):
     """Antipodal search ranked by a network, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. critic: none by default, because
-    from above it was not seen to gain anything. Raises UserError if a file cannot be loaded.
+    checkpoint: file of the network, unless `network` is given. It has no critic, which was not seen
+    to gain anything from above. Raises UserError if the file cannot be loaded.
     """
 
     def __init__(
@@ -233,10 +230,8 @@ class GraspNetPlanner(Judged, SearchPlanner):
         checkpoint: Path = SHIPPED,
         network: SavedGraspNet | None = None,
         settings: SearchSettings = SETTINGS,
-        critic: GraspCritic | None = None,
     ):
-        Judged.__init__(self, critic)
-        SearchPlanner.__init__(self, gripper, workspace, seed, settings)
+        super().__init__(gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
@@ -299,7 +294,7 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
 class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on each view's; the shipped one by default."""
+    the last word on each view's: the shipped one, unless `critic` is given."""
 
     def __init__(
         self,
@@ -310,9 +305,10 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         network: SavedGraspNet | None = None,
         critic: GraspCritic | None = None,
     ):
-        Judged.__init__(self, critic or shipped_critic())
-        FanPlanner.__init__(self, gripper, workspace, seed)
+        super().__init__(gripper, workspace, seed)
         self.network = network or loaded(checkpoint)
+        self.critic = critic or shipped_critic()
+        self.judge = lambda heights, found, inputs: self.critic.chance(inputs)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -256,17 +257,13 @@ def test_the_ranking_of_a_planar_planner_follows_the_critic(kind) -> None:
     wide, narrow = (0.5, -0.07), (0.5, 0.07)
     frame = boxes_frame([((0.05, 0.06, 0.05), 0.0, wide), ((0.03, 0.06, 0.05), 0.0, narrow)])
 
-    class Fixed(GraspCritic):
-        likes_wide = False
+    def by_width(sign: int, heights: HeightMap, found: Candidates, inputs: CriticInputs):
+        return np.where(sign * (column(inputs, "width") - 0.04) > 0, 0.9999, 0.0001)
 
-        def chance(self, inputs: CriticInputs) -> np.ndarray:
-            is_wide = column(inputs, "width") > 0.04
-            return np.where(is_wide == self.likes_wide, 0.9999, 0.0001)
-
-    for likes_wide, place in ((True, wide), (False, narrow)):
-        critic = Fixed()
-        critic.likes_wide = likes_wide
-        grasp = kind(GripperGeometry(), Workspace(), critic=critic)(frame)[0]
+    for sign, place in ((1, wide), (-1, narrow)):
+        planner = kind(GripperGeometry(), Workspace())
+        planner.judge = partial(by_width, sign)
+        grasp = planner(frame)[0]
         assert np.linalg.norm(grasp.position[:2] - place) < 0.04
 
 
