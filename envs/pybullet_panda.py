@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
+from envs.cell_layout import GRAVITY
 from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import CARRIAGE_FORCE, FINGER_DRIVE_INERTIA
 from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Hand, Robot
@@ -246,10 +247,29 @@ class PybulletFloatingHand(PybulletHand, FloatingHand):
     ):
         super().__init__(dt, gripper, grip_force)
         self._load(client, urdf)
+        self._yields = False
+        moved = [*CARRIAGE[1:], *self.fingers]
+        self._mass = sum(
+            pybullet.getDynamicsInfo(self.body, link, physicsClientId=client)[0] for link in moved
+        )  # kg, of all that gives way to the fingers
 
     @property
     def q(self) -> np.ndarray:
         return np.array(self._positions(CARRIAGE))
+
+    def receive(self, count: int) -> int:
+        part = super().receive(count)
+        if not self._yields:
+            return part
+        # What carries the hand carries its weight as well, which would pull a sloping line down.
+        # Bullet takes a torque for one step alone.
+        self._clock += 1 - part
+        weight = self._mass * GRAVITY * float(self._placed[2, 1])
+        pybullet.setJointMotorControl2(
+            self.body, CARRIAGE[1], pybullet.TORQUE_CONTROL, force=weight,
+            physicsClientId=self.client,
+        )  # fmt: skip
+        return 1
 
     @property
     def opening(self) -> float:
@@ -260,8 +280,12 @@ class PybulletFloatingHand(PybulletHand, FloatingHand):
         return [state[0] for state in states]
 
     def yield_to_fingers(self) -> None:
-        self._send(
-            pybullet.setJointMotorControl2, self.body, CARRIAGE[1], pybullet.VELOCITY_CONTROL,
+        self._send(self._yield)
+
+    def _yield(self) -> None:
+        self._yields = True
+        pybullet.setJointMotorControl2(
+            self.body, CARRIAGE[1], pybullet.VELOCITY_CONTROL,
             targetVelocity=0.0, force=YIELDING_FORCE, physicsClientId=self.client,
         )  # fmt: skip
 
@@ -284,8 +308,12 @@ class PybulletFloatingHand(PybulletHand, FloatingHand):
             pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
 
     def _send_carriage(self, q: np.ndarray, velocity: np.ndarray) -> None:
-        self._send(
-            pybullet.setJointMotorControlArray, self.body, CARRIAGE, pybullet.POSITION_CONTROL,
+        self._send(self._drive_carriage, q, velocity)
+
+    def _drive_carriage(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        self._yields = False
+        pybullet.setJointMotorControlArray(
+            self.body, CARRIAGE, pybullet.POSITION_CONTROL,
             targetPositions=q, targetVelocities=velocity, forces=[CARRIAGE_FORCE] * 3,
             positionGains=[_POSITION_GAIN] * 3, velocityGains=[1.0] * 3,
             physicsClientId=self.client,

@@ -130,6 +130,27 @@ def test_the_hand_gives_way_to_what_its_fingers_cannot_push(cell, box_set):
     np.testing.assert_allclose(hand.q, before, atol=1e-3)
 
 
+@pytest.mark.parametrize("tilt", [0, 30, 60, 85])  # degrees, of a closing line that leans with it
+def test_a_hand_that_gives_way_does_not_sink_under_its_own_weight(cell, tilt):
+    """The carriage carries the hand's weight: with nothing between the fingers it stays."""
+    cell.load(Scene("isolated", 0, ()))
+    hand = floating_hand(cell)
+    slope = np.deg2rad(tilt)
+    approach = np.array([np.sin(slope), 0.0, -np.cos(slope)])
+    closing = np.array([np.cos(slope), 0.0, np.sin(slope)])
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([np.cross(closing, approach), closing, approach])
+    T[:3, 3] = 0.5, 0.0, 0.4
+    hand.put(T)
+    hand.hold()
+    hand.yield_to_fingers()
+    cell.step(round(0.5 / cell.dt))
+    np.testing.assert_allclose(hand.tip_pose()[:3, 3], T[:3, 3], atol=1e-3)
+    hand.hold()
+    cell.step(round(0.5 / cell.dt))
+    np.testing.assert_allclose(hand.tip_pose()[:3, 3], T[:3, 3], atol=1e-3)
+
+
 def test_an_empty_hand_misses_and_so_does_a_thin_grip(cell, box_set):
     """A plate of 6 mm is under a tenth of the opening."""
     cell.load(cube_scene(box_set))
