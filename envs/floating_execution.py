@@ -13,9 +13,9 @@ from typing import cast
 import numpy as np
 
 from envs.cell import Cell
-from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED
+from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED, table_box
 from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers
-from envs.floating_hand import FloatingHand, lowest_point, park
+from envs.floating_hand import FloatingHand, meets_box, park
 from utils.result_records import loose
 from utils.transforms import Grasp
 
@@ -27,9 +27,9 @@ _HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
 
 
 def clears_table(cell: Cell, grasp: Grasp) -> bool:
-    """Whether the whole hand is above the table on its way to a grasp."""
+    """Whether the whole hand is above the table, or beside it, at a grasp."""
     opening = cell.gripper.opening_before(grasp.width)
-    return lowest_point(cell.gripper, grasp.pose, opening) > 0.0
+    return not meets_box(cell.gripper, grasp.pose, opening, table_box())
 
 
 def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:

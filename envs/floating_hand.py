@@ -13,13 +13,15 @@ from abc import abstractmethod
 from typing import TypeVar
 
 import numpy as np
+from scipy.optimize import linprog
 
+from envs.cell_layout import Box
 from envs.panda_model import FINGERS, floating_links
 from envs.robot import Hand
 from envs.robot_kinematics import HAND_ACCELERATION, HAND_JERK
 from envs.robot_motion import SCurve
 from utils.config import WorkspaceConfig
-from utils.geometry import GripperGeometry
+from utils.geometry import ConvexSolid, GripperGeometry
 from utils.transforms import inverse_pose, top_down_pose, transform_points
 
 PARKED_HEIGHT = 1.2  # m over the workspace: above every camera that looks down at it
@@ -112,21 +114,31 @@ def park(hand: AnyFloatingHand, workspace: WorkspaceConfig) -> AnyFloatingHand:
     return hand
 
 
-def lowest_point(gripper: GripperGeometry, T_WE: np.ndarray, opening: float) -> float:
-    """m in W of the lowest point of a hand at T_WE (4, 4), fingers `opening` metres apart."""
-    palm, *fingers = _hulls(gripper)
-    apart = [np.zeros(3), (0.0, opening / 2, 0.0), (0.0, -opening / 2, 0.0)]
-    points = np.vstack([hull + shift for hull, shift in zip((palm, *fingers), apart)])
-    return float(transform_points(T_WE, points)[:, 2].min())
+def meets_box(gripper: GripperGeometry, T_WE: np.ndarray, opening: float, box: Box) -> bool:
+    """Whether a hand at T_WE (4, 4), fingers `opening` metres apart, has a point in common with a
+    box."""
+    low, high = box.position - box.half_size, box.position + box.half_size
+    for part, shift in zip(_solids(gripper), (0.0, opening / 2, -opening / 2)):
+        place = T_WE.copy()
+        place[:3, 3] += shift * T_WE[:3, 1]
+        solid = part.transformed(place)
+        if (solid.vertices.min(axis=0) > high).any() or (solid.vertices.max(axis=0) < low).any():
+            continue
+        common = linprog(
+            np.zeros(3), A_ub=solid.normals, b_ub=solid.offsets, bounds=np.column_stack([low, high])
+        )
+        if common.status == 0:
+            return True
+    return False
 
 
 @functools.cache
-def _hulls(gripper: GripperGeometry) -> tuple[np.ndarray, ...]:
-    """(V, 3) m in E of hand, left and right finger, the fingers closed."""
+def _solids(gripper: GripperGeometry) -> tuple[ConvexSolid, ...]:
+    """Hand, left and right finger in E, the fingers closed."""
     *_, hand, left, right = floating_links(gripper)
     assert (left.name, right.name) == FINGERS
     return tuple(
-        transform_points(hand.T @ T, hull)
+        ConvexSolid.from_vertices(transform_points(hand.T @ T, hull))
         for link, T in ((hand, np.eye(4)), (left, left.T), (right, right.T))
         for hull in link.hulls()
     )

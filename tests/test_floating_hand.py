@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from envs.cell import require_arm
-from envs.cell_layout import Box, Placement, Scene
+from envs.cell_layout import Box, Placement, Scene, table_box
 from envs.execution import execute_grasp
 from envs.floating_execution import PREGRASP, clears_table, execute_floating, floating_hand
-from envs.floating_hand import lowest_point
+from envs.floating_hand import meets_box
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
 from envs.robot_motion import SCurve
@@ -29,6 +29,7 @@ from utils.transforms import DOWN, Grasp, top_down_pose
 
 SIDE = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])  # 45 degrees from straight above
 HAND = GripperGeometry()
+LEVEL = Grasp(np.array([0.5, 0.0, 0.03]), 0.0, 0.08, 1.0, np.array([1.0, 0.0, 0.0]))
 
 
 def config_of(simulator: str, *overrides: str):
@@ -179,21 +180,38 @@ def test_a_round_ends_after_two_failures_in_a_row(cell, box_set):
     assert record.ended == "cleared"
 
 
-def test_the_lowest_point_of_a_hand():
-    """From above it is the tips, 7.2 mm below E. Of a level hand it is, with the fingers level, the
-    palm's side, 31.6 mm at its widest, and with the fingers one above the other the palm's end."""
-    assert lowest_point(HAND, cube_grasp().pose, 0.08) == pytest.approx(0.03 - 0.0072, abs=1e-6)
-    level = Grasp(np.array([0.5, 0.0, 0.03]), 0.0, 0.08, 1.0, np.array([1.0, 0.0, 0.0]))
-    depths = [
-        0.03 - lowest_point(HAND, replace(level, angle=angle).pose, 0.08)
-        for angle in (0.0, np.pi / 2)
-    ]
-    assert sorted(depths) == pytest.approx([0.0316, 0.1042], abs=5e-4)
+@pytest.mark.parametrize(
+    ("grasp", "depth"),
+    [
+        (cube_grasp(), 0.0072),
+        (LEVEL, 0.1042),
+        (replace(LEVEL, angle=np.pi / 2), 0.0316),
+    ],
+)
+def test_how_far_a_hand_reaches_down(grasp, depth):
+    """From above it is the tips that are lowest, 7.2 mm below E. Of a level hand it is, with the
+    fingers one above the other, the palm's end, and with the fingers level its side, 31.6 mm at its
+    widest."""
+    half = np.array([0.5, 0.5, 0.02])
+    for gap, meets in ((0.0005, False), (-0.0005, True)):
+        top = grasp.position[2] - depth - gap
+        box = Box(half, np.array([0.5, 0.0, top - half[2]]))
+        assert meets_box(HAND, grasp.pose, 0.08, box) is meets
 
 
 def test_hands_that_would_cut_into_the_table_are_out_of_reach(cell):
     assert clears_table(cell, cube_grasp())
     assert not clears_table(cell, cube_grasp(offset=(0.0, 0.0, -0.025)))
+
+
+def test_beside_the_table_a_hand_may_be_lower_than_its_top(cell):
+    """A hand that comes level from outside to 2 cm over the edge, closing vertically: its lower
+    finger is 2 cm below the table's top, its tips 1 cm outside of the edge, or 2 cm inside."""
+    edge = table_box().position[0] + table_box().half_size[0]
+    for inside, clear in ((-0.01, True), (0.02, False)):
+        tips = np.array([edge - inside, 0.0, 0.02])
+        level = Grasp(tips, 0.0, 0.08, 1.0, np.array([-1.0, 0.0, 0.0]))
+        assert clears_table(cell, level) is clear
 
 
 def test_the_parked_hand_is_in_no_side_view_and_pictures_show_it_at_work(box_set):
