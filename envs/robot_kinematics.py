@@ -135,6 +135,20 @@ def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     return np.hstack([np.cross(turns, arms).sum(axis=0), turns.sum(axis=0)])
 
 
+def link_poses(q: np.ndarray) -> np.ndarray:
+    """(N, 7, 4, 4) poses in W of the frames of link 1 to 7, for joint positions q (N, 7)."""
+    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
+    p, poses = np.zeros((len(q), 3)), np.tile(np.eye(4), (len(q), 7, 1, 1))
+    for i, ((a, turn, d), angle) in enumerate(zip(_LINKS[:-1], q.T[:, :, None])):
+        p = p + a * x
+        if turn:  # by a right angle about x
+            y, z = turn * z, -turn * y
+        p = p + d * z
+        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+        poses[:, i, :3] = np.stack([x, y, z, p], axis=2)
+    return poses
+
+
 def arm_points(q: np.ndarray, spacing: float = 0.05) -> np.ndarray:
     """(N, P, 3) points in W on the arm's links, at most `spacing` m apart, from the elbow to the
     flange, for joint positions q (N, 7)."""
