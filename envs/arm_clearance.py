@@ -23,8 +23,10 @@ from envs.robot_kinematics import (
 )
 from utils.geometry import GripperGeometry
 
-_APART = 0.015  # m, at most between a place on a link or the hand and the nearest of its points
-_MARGIN = 0.02  # m kept around these points; the arm follows its references to 2 mm
+_APART = 0.008  # m, at most between a place on a link or the hand and the nearest of its points
+# m kept around these points, so that their surface keeps 6 mm; the arm follows its references to 2.
+_MARGIN = 0.01
+_HELD_MARGIN = 0.02  # m kept around the middle line of what the hand holds
 _FIRST = 3  # of the links that are looked at: the lower ones turn over the robot's own base
 
 
@@ -43,13 +45,14 @@ def arm_is_clear(cell: Cell, q: np.ndarray) -> bool:
     )
 
 
-def _is_clear(poses: np.ndarray, points: np.ndarray, box: Box) -> bool:
-    """Whether a body stays clear of a box at poses (N, 4, 4). points: (P, 3) m in its frame."""
+def _is_clear(poses: np.ndarray, points: np.ndarray, box: Box, margin: float = _MARGIN) -> bool:
+    """Whether a body stays more than `margin` m from a box at poses (N, 4, 4). points: (P, 3) m in
+    its frame."""
     middle = points.mean(axis=0)
     reach = np.linalg.norm(points - middle, axis=1).max()
-    near = distance_to_box(_placed(poses, middle[None]), box)[:, 0] <= reach + _MARGIN
+    near = distance_to_box(_placed(poses, middle[None]), box)[:, 0] <= reach + margin
     places = _placed(poses[near], points)
-    return bool(distance_to_box(places, box).min(initial=np.inf) > _MARGIN)
+    return bool(distance_to_box(places, box).min(initial=np.inf) > margin)
 
 
 def _placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -60,10 +63,13 @@ def _placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 def hand_is_clear(cell: Cell, q: np.ndarray, held: np.ndarray | None = None) -> bool:
     """Whether the hand stays clear of the scene's walls at joint positions q (N, 7). held: (M, 3)
     metres in E, points on an object that it holds."""
-    points = hand_points(cell.gripper)
-    points = points if held is None else np.concatenate([points, held])
     poses = np.array([forward_kinematics(at) for at in q])
-    return all(_is_clear(poses, points, box) for box in (cell.scene.walls if cell.scene else ()))
+    walls = cell.scene.walls if cell.scene else ()
+    return all(
+        _is_clear(poses, hand_points(cell.gripper), wall)
+        and (held is None or _is_clear(poses, held, wall, _HELD_MARGIN))
+        for wall in walls
+    )
 
 
 def held_points(T_WE: np.ndarray) -> np.ndarray:
