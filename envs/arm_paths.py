@@ -58,8 +58,12 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
     """For each posture at the pregrasp: the way there, from there straight to the grasp, and the
     grasp's pose (4, 4), which may be flipped. Raises UnreachableError where there is none."""
     pregrasp = backed(grasp.pose, standoff(cell, grasp))
-    failures, found = [], False
-    for q_pregrasp in all_postures(pregrasp, cell.home):
+    failures, found, below = [], False, bool(hanging(cell))
+    for q_pregrasp in all_postures(pregrasp, cell.home, more=below):
+        at = q_pregrasp[None]
+        if below and not (arm_is_clear(cell, at) and hand_is_clear(cell, at)):
+            failures.append(UnreachableError("the arm meets something at the pregrasp"))
+            continue
         target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
         try:
             down = _descent(cell, q_pregrasp, target)
@@ -68,7 +72,7 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
             continue
         found = True
         yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **scales(cell)), down, target
-        if hanging(cell):
+        if below:
             with contextlib.suppress(UnreachableError):
                 yield _from_above(cell, q_pregrasp), down, target
     if not found:

@@ -309,19 +309,22 @@ def postures(T_WE: np.ndarray, home: np.ndarray) -> dict[bool, np.ndarray]:
     return found
 
 
-def all_postures(T_WE: np.ndarray, home: np.ndarray) -> list[np.ndarray]:
+def all_postures(T_WE: np.ndarray, home: np.ndarray, more: bool = False) -> list[np.ndarray]:
     """Joint positions (7,) that reach a gripper pose (4, 4) or its flip, the nearest to `home`
-    first; where none lies near it, those found from `STARTS`. Raises UnreachableError."""
+    first; those found from `STARTS` where none lies near it, or where `more` are asked for. Raises
+    UnreachableError."""
+    unreachable = None
     try:
         found = list(postures(T_WE, home).values())
     except UnreachableError as error:
-        found = []
+        found, unreachable = [], error
+    if more or not found:
         for start in STARTS:
             for pose in (T_WE, T_WE @ HALF_TURN):
                 with contextlib.suppress(UnreachableError):
                     found.append(inverse_kinematics(pose, start))
-        if not found:
-            raise error
+    if unreachable is not None and not found:
+        raise unreachable
     return sorted(found, key=lambda q: float(abs(q - home).max()))
 
 
