@@ -24,7 +24,7 @@ from envs.robot_kinematics import (
 from utils.geometry import GripperGeometry
 
 _APART = 0.008  # m, at most between a place on a link or the hand and the nearest of its points
-# m kept around these points, so that their surface keeps 6 mm; the arm follows its references to 2.
+# m kept around these points, so that a face keeps 6 mm; the arm follows its references to 2.
 _MARGIN = 0.01
 _HELD_MARGIN = 0.02  # m kept around the middle line of what the hand holds
 _FIRST = 3  # of the links that are looked at: the lower ones turn over the robot's own base
