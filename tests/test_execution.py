@@ -105,8 +105,8 @@ def test_failures_are_named(cell, box_set, grasp, reason):
 
 def test_the_arm_keeps_its_wrist_off_the_bin(cell, box_set):
     """A hand that leans by 75 degrees, low over the table: on the left side of the workspace its
-    wrist is over the table, on the right side, as far from the middle, it would be 6 mm in the bin's
-    wall."""
+    wrist is over the table, on the right side, as far from the middle, it would be in the
+    bin's wall by 6 mm."""
     cell.load(cube_scene(box_set))
     tilt, reached = np.deg2rad(75), []
     for side in (1, -1):
