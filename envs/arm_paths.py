@@ -13,34 +13,26 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from envs.arm_clearance import arm_is_clear, hand_is_clear, held_points
 from envs.cell import Cell
-from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT, Box, bin_walls, distance_to_box, table_box
+from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT, Box
 from envs.robot_kinematics import (
     HALF_TURN,
-    JOINT_LOWER,
-    JOINT_UPPER,
     UnreachableError,
     all_postures,
-    arm_points,
     choose_posture,
     forward_kinematics,
     tip_position,
 )
 from envs.robot_motion import Trajectory
-from utils.geometry import HANGS_FROM, GripperGeometry
-from utils.transforms import Grasp, top_down_pose, transform_points
+from utils.geometry import HANGS_FROM
+from utils.transforms import Grasp, top_down_pose
 
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
 _LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
 LOOK_EVERY = 12  # references between two at which arm and hand are looked at
 _OFF_TABLE = 0.015  # m by which an object is lifted before it leaves a place below something
-_ARM_RADIUS = 0.065  # m of the links between elbow and flange
-# The forearm is thicker at its ends: off its line it met a board by 0.105 m near the elbow, and the
-# table by 0.13 m near the wrist. Of its 13 points the first 6 are within 0.2 m of the elbow.
-_ELBOW_RADIUS, _BY_ELBOW, _WRIST_RADIUS, _FOREARM = 0.12, 6, 0.14, 13  # m
-_HAND_RADIUS = 0.02  # m kept around the points on hand and object
-_LENGTH = 0.105  # m of the hand, from its flange to the fingertips
 _OUT = 0.09  # m before what hangs over the table, where an object in the hand is out from under it
 _LEVEL = 0.3  # least level part of an approach that leads out from under something
 _FARTHEST = 0.4  # m, of a way out
@@ -66,8 +58,12 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
     """For each posture at the pregrasp: the way there, from there straight to the grasp, and the
     grasp's pose (4, 4), which may be flipped. Raises UnreachableError where there is none."""
     pregrasp = backed(grasp.pose, standoff(cell, grasp))
-    failures, found = [], False
-    for q_pregrasp in all_postures(pregrasp, cell.home):
+    failures, found, below = [], False, bool(hanging(cell))
+    for q_pregrasp in all_postures(pregrasp, cell.home, more=below):
+        at = q_pregrasp[None]
+        if below and not (arm_is_clear(cell, at) and hand_is_clear(cell, at)):
+            failures.append(UnreachableError("the arm meets something at the pregrasp"))
+            continue
         target = _same_side(forward_kinematics(q_pregrasp), grasp.pose)
         try:
             down = _descent(cell, q_pregrasp, target)
@@ -76,7 +72,7 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
             continue
         found = True
         yield cell.robot.joint_move(cell.robot.q, q_pregrasp, **scales(cell)), down, target
-        if hanging(cell):
+        if below:
             with contextlib.suppress(UnreachableError):
                 yield _from_above(cell, q_pregrasp), down, target
     if not found:
@@ -256,57 +252,3 @@ def height_over(cell: Cell, gripped_at: float) -> float:
     over what hangs over the table; 0 where nothing does."""
     tops = [box.position[2] + box.half_size[2] for box in hanging(cell)]
     return max(tops) + _OVER + max(gripped_at, 0.0) if tops else 0.0
-
-
-def arm_is_clear(cell: Cell, q: np.ndarray) -> bool:
-    """Whether the arm, but for its hand, stays clear of table, bin, walls and its joints' limits at
-    joint positions q (N, 7)."""
-    margin = cell.config.safety.joint_margin
-    if (q < JOINT_LOWER + margin).any() or (q > JOINT_UPPER - margin).any():
-        return False  # where a curve between waypoints may leave the limits
-    boxes = [table_box(), *bin_walls(), *(cell.scene.walls if cell.scene else ())]
-    points = arm_points(q)
-    if _apart(points, boxes) <= _ARM_RADIUS:
-        return False
-    if not hanging(cell):  # only postures for a hand below something bring the forearm near
-        return True
-    forearm = points[:, :_FOREARM]
-    return (
-        _apart(forearm[:, :_BY_ELBOW], boxes) > _ELBOW_RADIUS
-        and _apart(forearm, [table_box()]) > _WRIST_RADIUS
-    )
-
-
-def hand_is_clear(cell: Cell, q: np.ndarray, held: np.ndarray | None = None) -> bool:
-    """Whether the hand stays clear of the scene's walls at joint positions q (N, 7). held: (M, 3)
-    metres in E, points on an object that it holds."""
-    points = _hand_points(cell.gripper)
-    points = points if held is None else np.concatenate([points, held])
-    places = np.array([transform_points(forward_kinematics(at), points) for at in q])
-    return _apart(places, cell.scene.walls if cell.scene else ()) > _HAND_RADIUS
-
-
-def held_points(T_WE: np.ndarray) -> np.ndarray:
-    """(M, 3) metres in E: points on an object on the table, gripped at T_WE (4, 4), of which only
-    the place of its lower end is known: it may be as long on the other side of the hand."""
-    below = T_WE[:3, :3].T @ np.array([0.0, 0.0, max(T_WE[2, 3], 0.0)])
-    return np.linspace(-1, 1, 9)[:, None] * below
-
-
-def _hand_points(gripper: GripperGeometry) -> np.ndarray:
-    """(M, 3) metres in E: points on the hand, its fingers open."""
-    across = gripper.palm_outline[-1][0]
-    x, y, z = np.meshgrid(
-        (-across, 0.0, across),
-        np.linspace(-1, 1, 7) * gripper.palm_half_length,
-        (-_LENGTH, gripper.tip_below_centre - gripper.palm_height),
-    )
-    palm = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    outside = gripper.max_opening / 2 + gripper.finger_outline[1][0]
-    tips = [[0.0, side, gripper.tip_below_centre] for side in (-outside, outside)]
-    return np.concatenate([palm, tips])
-
-
-def _apart(points: np.ndarray, boxes) -> float:
-    """Metres of points (..., 3) from the nearest of the boxes."""
-    return min((float(distance_to_box(points, box).min()) for box in boxes), default=np.inf)

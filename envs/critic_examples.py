@@ -39,10 +39,10 @@ from utils.worker_process import kept
 PLANNERS = {"graspnet6d": 20, "graspnet": 7, "graspnet_direct": 7}
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
-    "isolated": 0.05, "packed": 0.25, "pile": 0.35, "bin": 0.05, "tall": 0.10, "wall": 0.10,
-    "flat": 0.10,
+    "isolated": 0.05, "packed": 0.20, "pile": 0.30, "bin": 0.05, "tall": 0.10, "wall": 0.10,
+    "shelf": 0.08, "flat": 0.12,
 }  # fmt: skip
-_OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "flat": ("flat",)}
+_OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",)}
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
 _FIRST_SEED = 3_000_000_000  # no evaluation and no other training uses these seeds

@@ -12,6 +12,7 @@ from typing import cast
 
 import numpy as np
 
+from envs.arm_paths import hanging
 from envs.cell import Cell
 from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED, table_box
 from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers
@@ -38,8 +39,9 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     The hand is put PREGRASP before the grasp, as wide open as the gripper's `opens_fully` says, and
     moves at execution.approach_speed. A contact where it is put is a `collision`, and so is one on
     its way in, unless execution.on_contact is `grip`: then the hand stops and closes there.
-    Success: after a retreat of RETREAT, along the approach or, from a side, straight up, both
-    fingers grip one object and are more than LEAST_WIDTH of the widest opening apart. `missed`:
+    Success: after a retreat of RETREAT, along the approach or, from a side where nothing hangs over
+    the table, straight up, both fingers grip one object and are more than LEAST_WIDTH of the widest
+    opening apart. `missed`:
     nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was, and was
     lost. A picked object is removed. With execution.strict, an object may also not move in the
     hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
@@ -110,7 +112,8 @@ def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> str:
 
 
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
-    away = np.array([0.0, 0.0, 1.0]) if grasp.tilt > SIDEWAYS + 1e-6 else -grasp.approach
+    up = grasp.tilt > SIDEWAYS + 1e-6 and not hanging(cell)
+    away = np.array([0.0, 0.0, 1.0]) if up else -grasp.approach
     goal = hand.tip_pose()[:3, 3] + RETREAT * away
     for q, velocity in zip(*hand.line(goal, cell.config.execution.approach_speed)):
         hand.command(q, velocity)

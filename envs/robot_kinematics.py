@@ -135,6 +135,20 @@ def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     return np.hstack([np.cross(turns, arms).sum(axis=0), turns.sum(axis=0)])
 
 
+def link_poses(q: np.ndarray) -> np.ndarray:
+    """(N, 7, 4, 4) poses in W of the frames of link 1 to 7, for joint positions q (N, 7)."""
+    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
+    p, poses = np.zeros((len(q), 3)), np.tile(np.eye(4), (len(q), 7, 1, 1))
+    for i, ((a, turn, d), angle) in enumerate(zip(_LINKS[:-1], q.T[:, :, None])):
+        p = p + a * x
+        if turn:  # by a right angle about x
+            y, z = turn * z, -turn * y
+        p = p + d * z
+        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+        poses[:, i, :3] = np.stack([x, y, z, p], axis=2)
+    return poses
+
+
 def arm_points(q: np.ndarray, spacing: float = 0.05) -> np.ndarray:
     """(N, P, 3) points in W on the arm's links, at most `spacing` m apart, from the elbow to the
     flange, for joint positions q (N, 7)."""
@@ -295,19 +309,22 @@ def postures(T_WE: np.ndarray, home: np.ndarray) -> dict[bool, np.ndarray]:
     return found
 
 
-def all_postures(T_WE: np.ndarray, home: np.ndarray) -> list[np.ndarray]:
+def all_postures(T_WE: np.ndarray, home: np.ndarray, more: bool = False) -> list[np.ndarray]:
     """Joint positions (7,) that reach a gripper pose (4, 4) or its flip, the nearest to `home`
-    first; where none lies near it, those found from `STARTS`. Raises UnreachableError."""
+    first; those found from `STARTS` where none lies near it, or where `more` are asked for. Raises
+    UnreachableError."""
+    unreachable = None
     try:
         found = list(postures(T_WE, home).values())
     except UnreachableError as error:
-        found = []
+        found, unreachable = [], error
+    if more or not found:
         for start in STARTS:
             for pose in (T_WE, T_WE @ HALF_TURN):
                 with contextlib.suppress(UnreachableError):
                     found.append(inverse_kinematics(pose, start))
-        if not found:
-            raise error
+    if unreachable is not None and not found:
+        raise unreachable
     return sorted(found, key=lambda q: float(abs(q - home).max()))
 
 

@@ -23,6 +23,7 @@ from typing import Protocol
 
 import numpy as np
 
+from envs.arm_paths import hanging
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
@@ -293,13 +294,14 @@ def _abstained(grasps: Sequence[Grasp], least: float) -> str:
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
-    """The grasps that the arm can go to, in their order; those from straight above are not asked,
-    because nearly all are. The first of all where the arm reaches none. A floating hand reaches all
-    that are above the table."""
+    """The grasps that the arm can go to, in their order; those from straight above are not asked
+    where nothing hangs over the table, because nearly all are. The first of all where the arm
+    reaches none. A floating hand reaches all that are above the table."""
     reachable = reaches if cell.has_arm else clears_table
+    least = 0.0 if hanging(cell) else PLANAR
     nothing = True
     for grasp in grasps:
-        if grasp.tilt < PLANAR or reachable(cell, grasp):
+        if grasp.tilt < least or reachable(cell, grasp):
             nothing = False
             yield grasp
     if nothing:

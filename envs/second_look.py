@@ -14,7 +14,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from envs.arm_paths import LOOK_EVERY, arm_is_clear, scales
+from envs.arm_clearance import arm_is_clear
+from envs.arm_paths import LOOK_EVERY, scales
 from envs.cell import ROBOT, Cell, Intrinsics, wrist_mount
 from envs.cell_layout import Box, distance_to_box
 from envs.execution import follow, go_home

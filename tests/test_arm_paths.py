@@ -10,7 +10,7 @@ from envs.execution import execute_grasp, reaches
 from envs.object_bodies import native_object
 from envs.object_primitives import NativeShape
 from envs.robot_kinematics import UnreachableError, forward_kinematics
-from envs.rounds import run_round
+from envs.rounds import run_round, within_reach
 from envs.simulators import make_cell
 from models.planners import make_planner
 from tests.helpers.simulators import INSTALLED
@@ -98,6 +98,8 @@ def test_no_arm_reaches_through_a_board(shelved):
     outcome = execute_grasp(shelved, Grasp(GRASP.position, 0.0, 0.075, 1.0))
     assert outcome.reason == "ik"
     assert not reaches(shelved, Grasp(GRASP.position, 0.0, 0.075, 1.0, LEVEL * (1, -1, 1)))
+    from_above = Grasp(GRASP.position, 0.0, 0.075, 1.0)
+    assert list(within_reach(shelved, [from_above, GRASP])) == [GRASP]
     assert len(shelved.remaining) == 1
 
 

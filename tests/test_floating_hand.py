@@ -83,6 +83,21 @@ def test_a_cube_is_gripped_and_removed(cell, box_set, approach):
     assert (frame.segmentation == -1).all(), "neither the cube nor the hand is in sight"
 
 
+def test_a_hand_leaves_a_place_below_a_board_as_it_came(cell, box_set):
+    """A level hand on a cube, 9 cm below a board, which it would meet 10 cm straight up."""
+    board = Box(np.array([0.1, 0.2, 0.01]), np.array([0.55, 0.0, 0.16]))
+    cell.load(replace(cube_scene(box_set), layout="shelf", walls=(board,)))
+    level = np.array([np.sin(np.deg2rad(80)), 0.0, -np.cos(np.deg2rad(80))])
+    grasp = replace(cube_grasp(np.pi / 2, offset=(0.0, 0.0, 0.02)), approach=level)
+    places = []
+    cell.on_step = lambda cell: places.append(cell.robot.tip_pose()[:3, 3])
+    outcome = execute_floating(cell, grasp)
+    cell.on_step = None
+    assert (outcome.reason, outcome.object_index) == ("success", 0), outcome.detail
+    before = np.array(places)[np.linalg.norm(np.array(places) - grasp.position, axis=1) < 0.15]
+    assert before[:, 2].max() < grasp.position[2] + 0.1 * np.cos(np.deg2rad(80)) + 5e-3
+
+
 def test_a_contact_where_the_hand_starts_or_on_its_way_is_a_collision(cell, box_set):
     """Turned by 45 degrees, the cube's diagonal of 8.5 cm is wider than the open hand. Where the
     hand starts 5 cm higher, 1 cm lower than the cube's top, the cube is in its way at once."""

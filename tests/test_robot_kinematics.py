@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from envs.robot_kinematics import (
     GRASP_DEPTH,
+    HAND_TURN,
     JOINT_LOWER,
     JOINT_UPPER,
+    TOOL_LENGTH,
     ServoStep,
     UnreachableError,
     all_postures,
@@ -17,6 +19,7 @@ from envs.robot_kinematics import (
     forward_kinematics,
     geometric_jacobian,
     inverse_kinematics,
+    link_poses,
     pose_error,
     postures,
     rotation_vector,
@@ -101,6 +104,28 @@ def test_points_on_the_arm_lie_on_its_links(q):
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 0.04 + 1e-9
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert length == pytest.approx(0.0825 + 0.0825 + 0.384 + 0.088 + 0.107)
+
+
+@settings(max_examples=30)
+@given(joint_positions)
+def test_the_last_link_carries_the_tool(q):
+    """E is TOOL_LENGTH along joint 7's axis; the hand is turned about it."""
+    q = np.array(q)
+    tool = np.eye(4)
+    tool[:2, :2] = [[np.cos(HAND_TURN), -np.sin(HAND_TURN)], [np.sin(HAND_TURN), np.cos(HAND_TURN)]]
+    tool[2, 3] = TOOL_LENGTH
+    np.testing.assert_allclose(link_poses(q[None])[0, 6] @ tool, forward_kinematics(q), atol=1e-12)
+
+
+def test_more_postures_are_those_near_home_and_others():
+    pose = top_down_pose(np.array([0.5, 0.0, 0.2]), 0.3)
+    near, more = all_postures(pose, HOME), all_postures(pose, HOME, more=True)
+    assert len(more) > len(near)
+    for q in more:
+        T = forward_kinematics(q)
+        np.testing.assert_allclose(T[:3, 3], pose[:3, 3], atol=2e-4)
+    for q in near:
+        assert any(np.array_equal(q, other) for other in more)
 
 
 def test_more_starts_reach_level_poses_that_home_does_not():
