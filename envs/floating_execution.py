@@ -48,7 +48,7 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     PhysicsError when the simulation blows up.
     """
     start = cell.seconds
-    outcome = attempt(cell, grasp)
+    outcome = _not_empty(cell, attempt(cell, grasp))
     if outcome.success and outcome.object_index is not None:
         _remove(cell, outcome.object_index)
     park(floating_hand(cell), cell.config.workspace)
@@ -59,8 +59,8 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
 
 
 def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
-    """As `execute_floating`, up to the judgement: afterwards the hand is where it is, with what it
-    holds."""
+    """As `execute_floating`, up to the judgement, and however thin the object is: afterwards the
+    hand is where it is, with what it holds."""
     cell.check_physics()
     hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
@@ -73,7 +73,7 @@ def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         _retreat(cell, hand, grasp)
-        _judge(cell, hand, held, motion)
+        _judge(cell, held, motion)
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
     stopped_at = None
@@ -120,25 +120,30 @@ def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
         cell.step()
 
 
-def _judge(
-    cell: Cell, hand: FloatingHand, gripped: int | None, motion: InHandMotion | None
-) -> None:
+def _judge(cell: Cell, gripped: int | None, motion: InHandMotion | None) -> None:
     """Raises GraspFailure unless the object that was gripped is held after the retreat."""
     if gripped is None or motion is None:
         raise GraspFailure("missed")
     if cell.held_object() != gripped:
         raise GraspFailure("slipped")
-    least = LEAST_WIDTH * hand.max_opening
-    if hand.opening <= least:
-        raise GraspFailure(
-            "missed",
-            f"the fingers are {1000 * hand.opening:.1f} mm apart after the retreat, where "
-            f"{1000 * least:g} mm or less count as empty",
-        )
     motion.look()
     moved = loose(motion.turned, motion.slid)
     if moved and cell.config.execution.strict:
         raise GraspFailure(moved[0])
+
+
+def _not_empty(cell: Cell, outcome: GraspOutcome) -> GraspOutcome:
+    """The outcome of an attempt by VGN's rule: a hand that is nearly closed counts as empty."""
+    hand = floating_hand(cell)
+    least = LEAST_WIDTH * hand.max_opening
+    if not outcome.success or hand.opening > least:
+        return outcome
+    thin = (
+        f"the fingers are {1000 * hand.opening:.1f} mm apart after the retreat, where "
+        f"{1000 * least:g} mm or less count as empty"
+    )
+    detail = ", and ".join(filter(None, [outcome.detail, thin]))
+    return replace(outcome, reason="missed", detail=detail)
 
 
 def _remove(cell: Cell, index: int) -> None:
