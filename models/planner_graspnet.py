@@ -258,6 +258,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, crop=True)
         heights = only_target(seen.heights, frame)
+        if len(heights.centres) == 0:  # table and walls alone
+            return []
         value = partial(seen.value, heights)
         rough = self._at_peaks(seen.peaks(PEAKS), heights)
         rough = replace(rough, score=value(rough)).best(self.settings.shortlist)

@@ -161,6 +161,13 @@ def test_a_network_that_sees_no_grasp_plans_none_without_a_search() -> None:
     assert plan(frame, FixedMaps(elsewhere=0.0, best=0.0), GraspNetDirectPlanner) == []
 
 
+def test_a_network_that_sees_grasps_where_no_object_is_plans_none() -> None:
+    """An empty table, to a network that sees a grasp in its middle."""
+    middle = np.array([111.5, 111.5])
+    for kind in (GraspNetPlanner, GraspNetDirectPlanner):
+        assert plan(boxes_frame([]), FixedMaps(middle, elsewhere=0.0), kind) == []
+
+
 def test_what_is_cut_off_is_table() -> None:
     frame = boxes_frame(BOXES[:1])
     part = around_matter(frame, 0.0)
