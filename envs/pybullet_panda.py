@@ -31,6 +31,7 @@ _URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_IN
 _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
+_ANY_SPEED = 100.0  # rad/s, at which Bullet cuts every joint off unless told otherwise
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 
 
@@ -160,6 +161,7 @@ class PybulletPanda(PybulletHand, Robot):
         super().__init__(dt, gripper, grip_force, gate)
         self.position_gain = self.velocity_gain = 1.0
         self._load(client, urdf)
+        self._held_back = np.nan
         self.limit_speed(JOINT_VELOCITY.max())
         self._felt: tuple[int, tuple, tuple] | None = None  # the clock, positions and velocities
 
@@ -191,16 +193,29 @@ class PybulletPanda(PybulletHand, Robot):
     # --- Motors -------------------------------------------------------------------------------
 
     def limit_speed(self, speed: float) -> None:
-        """No joint gets faster than `speed` rad/s, whatever moves it.
+        """No joint gets faster than `speed` rad/s while `drive_arm_to` moves the arm, whatever else
+        moves it; the motors that follow a trajectory are not held back.
 
         The motors' own limit holds back the motors only: a quick shoulder throws the light wrist.
-        Bullet has one such limit for all joints of a body.
         """
-        pybullet.changeDynamics(self.body, -1, maxJointVelocity=speed, physicsClientId=self.client)
+        self._fastest = speed
+
+    def _hold_back(self, speed: float) -> None:
+        """Cut all joints' speeds off at `speed` rad/s: Bullet has one such limit for a body. What
+        is cut off is felt as an external force."""
+        if speed != self._held_back:
+            pybullet.changeDynamics(
+                self.body, -1, maxJointVelocity=speed, physicsClientId=self.client
+            )
+            self._held_back = speed
 
     def _send_arm(self, q: np.ndarray, velocity: np.ndarray) -> None:
-        self._send(
-            pybullet.setJointMotorControlArray, self.body, ARM, pybullet.POSITION_CONTROL,
+        self._send(self._follow, q, velocity)
+
+    def _follow(self, q: np.ndarray, velocity: np.ndarray) -> None:
+        self._hold_back(_ANY_SPEED)
+        pybullet.setJointMotorControlArray(
+            self.body, ARM, pybullet.POSITION_CONTROL,
             targetPositions=q, targetVelocities=velocity, forces=JOINT_TORQUE,
             positionGains=[self.position_gain * _POSITION_GAIN] * 7,
             velocityGains=[self.velocity_gain] * 7,
@@ -211,6 +226,7 @@ class PybulletPanda(PybulletHand, Robot):
         self._send(self._drive, q.tolist(), speeds, self.position_gain * DRIVE_GAIN)
 
     def _drive(self, q: list[float], speeds: list[float], gain: float) -> None:
+        self._hold_back(self._fastest)
         for joint, position, torque, limit in zip(ARM, q, _TORQUES, speeds):
             pybullet.setJointMotorControl2(
                 self.body, joint, pybullet.POSITION_CONTROL,

@@ -8,7 +8,8 @@ from benchmarks.show_bar import grip, solid
 from envs.cell import Cell
 from envs.cell_layout import EMPTY
 from envs.object_primitives import NativeShape
-from envs.robot_kinematics import choose_posture, forward_kinematics
+from envs.robot_kinematics import JOINT_VELOCITY, choose_posture, forward_kinematics
+from envs.robot_motion import Trajectory
 from envs.simulators import make_cell
 from tests.helpers.simulators import INSTALLED, is_pybullet, pybullet
 from utils.transforms import top_down_pose
@@ -47,17 +48,36 @@ def test_a_push_at_the_fingertips_is_felt(cell, force):
     assert np.median(felt[30:]) == pytest.approx(np.linalg.norm(force), rel=0.02)
 
 
+def felt_on(cell: Cell, trajectory: Trajectory) -> list[float]:
+    felt = []
+    for q, velocity in zip(trajectory.positions, trajectory.velocities):
+        cell.robot.command_arm(q, velocity)
+        cell.step()
+        felt.append(cell.robot.external_force())
+    return felt
+
+
 def test_nothing_is_felt_where_nothing_touches(cell):
     """On a quick way there and back: the nominal robot explains all torques."""
     cell.build(EMPTY)
-    start, felt = cell.robot.q, []
+    start = cell.robot.q
     goal = choose_posture(top_down_pose([0.55, -0.2, 0.2], 0.7), cell.home)
     for there in (cell.robot.joint_move(start, goal), cell.robot.joint_move(goal, start)):
-        for q, velocity in zip(there.positions, there.velocities):
-            cell.robot.command_arm(q, velocity)
-            cell.step()
-            felt.append(cell.robot.external_force())
-    assert max(felt) < 1.0
+        assert max(felt_on(cell, there)) < 1.0
+
+
+def test_nothing_is_felt_at_the_highest_speed(cell):
+    """The hand turns as fast as it may, for a moment: v = v_max sin2(pi t / T). A speed limit for
+    `drive_arm_to` does not cut it off, which would feel like a contact."""
+    cell.build(EMPTY)
+    cell.robot.limit_speed(1.0)
+    T, fastest = 1.5, -JOINT_VELOCITY[6]
+    t = np.arange(cell.dt, T, cell.dt)
+    positions, velocities = np.tile(cell.robot.q, (len(t), 1)), np.zeros((len(t), 7))
+    velocities[:, 6] = 0.999 * fastest * np.sin(np.pi * t / T) ** 2
+    positions[:, 6] += 0.999 * fastest * (t / 2 - T / (4 * np.pi) * np.sin(2 * np.pi * t / T))
+    assert max(felt_on(cell, Trajectory(positions, velocities))) < 1.0
+    cell.robot.limit_speed(JOINT_VELOCITY.max())
 
 
 @pytest.mark.parametrize("mass", [0.2, 0.6])
