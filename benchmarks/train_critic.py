@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from envs.critic_examples import PLANNERS, Examples, examples_of, planner_of
 from models.grasp_critic import INPUTS, KIND, GraspCritic
-from models.planner_fan import FanSettings
+from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
 from utils.config import Config
@@ -114,7 +114,7 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
     and by the critic, and the half width of that share's 95 % interval; then the calibration error
     of the critic's chances."""
     chance = critic.chance(examples.inputs)
-    preference = FanSettings().preference(examples.inputs.facts[:, INPUTS.index("tilt")])
+    preference = JUDGED_FAN.preference(examples.inputs.facts[:, INPUTS.index("tilt")])
     scores = {}
     for number, name in enumerate(PLANNERS):
         own = planner_of(examples.plan) == number

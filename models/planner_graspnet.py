@@ -31,7 +31,7 @@ from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
 from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
 from models.planner_candidates import Candidates, SearchSettings
-from models.planner_fan import FanPlanner
+from models.planner_fan import SEARCH, FanPlanner, FanSettings
 from utils.depth import (
     TABLE_FLATNESS,
     depth_of_plane,
@@ -294,6 +294,10 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         )
 
 
+# The critic's chance tells already what a tilt costs; what is left is the room for the arm.
+JUDGED_FAN = FanSettings(tilt_scale=3.0)
+
+
 class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
     the last word on each view's: the shipped one, unless `critic` is given."""
@@ -307,7 +311,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         network: SavedGraspNet | None = None,
         critic: GraspCritic | None = None,
     ):
-        super().__init__(gripper, workspace, seed)
+        super().__init__(gripper, workspace, seed, SEARCH, JUDGED_FAN)
         self.network = network or loaded(checkpoint)
         self.critic = critic or shipped_critic()
         self.judge = lambda heights, found, inputs: self.critic.chance(inputs)
