@@ -42,8 +42,10 @@ cluster: $(VENV)/.installed-cluster
 calibration: $(INSTALLED)
 	$(BIN)/python evaluate.py --config configs/calibration.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_large.yaml
+	$(BIN)/python evaluate.py --config configs/calibration_flat.yaml
 	$(BIN)/python -m benchmarks.calibrate $$(ls -d runs/evaluate/*-calibration | tail -1) \
-		$$(ls -d runs/evaluate/*-calibration-large | tail -1) --output checkpoints/calibration.json
+		$$(ls -d runs/evaluate/*-calibration-large | tail -1) \
+		$$(ls -d runs/evaluate/*-calibration-flat | tail -1) --output checkpoints/calibration.json
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q $(PARALLEL) --durations=10 $(ARGS)
