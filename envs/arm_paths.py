@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.arm_clearance import arm_is_clear, hand_is_clear, held_points
 from envs.cell import Cell
-from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT, Box
+from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
 from envs.robot_kinematics import (
     HALF_TURN,
     UnreachableError,
@@ -25,7 +25,6 @@ from envs.robot_kinematics import (
     tip_position,
 )
 from envs.robot_motion import Trajectory
-from utils.geometry import HANGS_FROM
 from utils.transforms import Grasp, top_down_pose
 
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
@@ -46,10 +45,10 @@ def first_plan(cell: Cell, grasp: Grasp) -> Plan:
     """The first of `all_plans` on which the arm is clear of the cell; if none is, the first.
     Raises UnreachableError, also where something hangs over the table and none is clear of it."""
     plans = list(all_plans(cell, grasp))
-    if len(plans) == 1 and not hanging(cell):
+    if len(plans) == 1 and not cell.hanging:
         return plans[0]
     clear = next((plan for plan in plans if clears(cell, plan, grasp)), None)
-    if clear is None and hanging(cell):
+    if clear is None and cell.hanging:
         raise UnreachableError("something hangs over the table in every way of the arm")
     return clear or plans[0]
 
@@ -58,7 +57,7 @@ def all_plans(cell: Cell, grasp: Grasp) -> Iterator[Plan]:
     """For each posture at the pregrasp: the way there, from there straight to the grasp, and the
     grasp's pose (4, 4), which may be flipped. Raises UnreachableError where there is none."""
     pregrasp = backed(grasp.pose, standoff(cell, grasp))
-    failures, found, below = [], False, bool(hanging(cell))
+    failures, found, below = [], False, bool(cell.hanging)
     for q_pregrasp in all_postures(pregrasp, cell.home, more=below):
         at = q_pregrasp[None]
         if below and not (arm_is_clear(cell, at) and hand_is_clear(cell, at)):
@@ -104,13 +103,13 @@ def clears(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
     try:
         lift = way_up(cell, down.positions[-1], target, grasp.position[2])
         parts = [reach, down, lift]
-        if hanging(cell):
+        if cell.hanging:
             top = raised(cell, target, grasp.position[2])[2, 3]
             parts.append(way_to_bin(cell, lift.positions[-1], top))
     except UnreachableError:
         return False
     looked_at = [part.positions[::LOOK_EVERY] for part in parts]
-    if not hanging(cell):
+    if not cell.hanging:
         return arm_is_clear(cell, np.concatenate(looked_at))
     return (
         arm_is_clear(cell, np.concatenate(looked_at))
@@ -177,7 +176,7 @@ def way_to_bin(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
     over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
     over_bin[2] = max(over_bin[2], top - _LIFT_MARGIN)
     posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
-    if not hanging(cell):
+    if not cell.hanging:
         return cell.robot.joint_move(q, posture, **scales(cell))
     first = cell.robot.joint_move(q, cell.home, **scales(cell))
     return _joined([first, cell.robot.joint_move(cell.home, posture, **scales(cell))])
@@ -229,19 +228,13 @@ def scales(cell: Cell) -> dict[str, float]:
     }
 
 
-def hanging(cell: Cell) -> list[Box]:
-    """What hangs over the table in the cell's scene."""
-    walls = cell.scene.walls if cell.scene else ()
-    return [wall for wall in walls if wall.position[2] - wall.half_size[2] > HANGS_FROM]
-
-
 def way_out(cell: Cell, place: np.ndarray, back: np.ndarray) -> float:
     """Metres by which E has to go from a place (3,) along `back` (3,), a unit vector, to be out
     from under all that hangs over the table; 0 where it is out already, or cannot get out so."""
     steps = np.arange(0.0, _FARTHEST, _STEP)
     places = place + steps[:, None] * back
     below = np.zeros(len(steps), bool)
-    for box in hanging(cell):
+    for box in cell.hanging:
         apart = np.maximum(abs(places - box.position) - box.half_size, 0.0)[:, :2]
         below |= (np.linalg.norm(apart, axis=1) < _OUT) & (places[:, 2] < box.position[2])
     return float(steps[below.argmin()]) if below[0] and not below.all() else 0.0
@@ -250,5 +243,5 @@ def way_out(cell: Cell, place: np.ndarray, back: np.ndarray) -> float:
 def height_over(cell: Cell, gripped_at: float) -> float:
     """Metres over the table at which the hand takes an object, that it gripped at `gripped_at` m,
     over what hangs over the table; 0 where nothing does."""
-    tops = [box.position[2] + box.half_size[2] for box in hanging(cell)]
+    tops = [box.position[2] + box.half_size[2] for box in cell.hanging]
     return max(tops) + _OVER + max(gripped_at, 0.0) if tops else 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from typing_extensions import Self
 
 from envs.board import Board
-from envs.cell_layout import EMPTY, Scene, on_table
+from envs.cell_layout import EMPTY, Box, Scene, on_table
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
@@ -25,7 +25,7 @@ from utils.config import CameraConfig, Config
 from utils.depth import NoiseStream, seeded_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
-from utils.geometry import SceneGeometry, SolidObject
+from utils.geometry import HANGS_FROM, SceneGeometry, SolidObject
 from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at
 
@@ -229,6 +229,12 @@ class Cell(ABC):
         """Free what the simulator holds; may be called again."""
 
     # --- Physics ------------------------------------------------------------------------------
+
+    @property
+    def hanging(self) -> list[Box]:
+        """What hangs over the table in the scene."""
+        walls = self.scene.walls if self.scene else ()
+        return [wall for wall in walls if wall.position[2] - wall.half_size[2] > HANGS_FROM]
 
     @property
     def seconds(self) -> float:

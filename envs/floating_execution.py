@@ -12,7 +12,6 @@ from typing import cast
 
 import numpy as np
 
-from envs.arm_paths import hanging
 from envs.cell import Cell
 from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED, table_box
 from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers
@@ -55,12 +54,13 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     _let_rest(cell)
     cell.check_physics()
     cell.retire_lost_objects()
-    return replace(outcome, sim_seconds=cell.seconds - start)
+    detail = "" if outcome.success else outcome.detail
+    return replace(outcome, sim_seconds=cell.seconds - start, detail=detail)
 
 
 def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
     """As `execute_floating`, up to the judgement, and however thin the object is: afterwards the
-    hand is where it is, with what it holds."""
+    hand is where it is, with what it holds, and the detail of a success tells what it met."""
     cell.check_physics()
     hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
@@ -74,6 +74,7 @@ def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
         motion = None if held is None else InHandMotion(cell, held)
         _retreat(cell, hand, grasp)
         _judge(cell, held, motion)
+        detail = met
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
     stopped_at = None
@@ -112,7 +113,7 @@ def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> str:
 
 
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
-    up = grasp.tilt > SIDEWAYS + 1e-6 and not hanging(cell)
+    up = grasp.tilt > SIDEWAYS + 1e-6 and not cell.hanging
     away = np.array([0.0, 0.0, 1.0]) if up else -grasp.approach
     goal = hand.tip_pose()[:3, 3] + RETREAT * away
     for q, velocity in zip(*hand.line(goal, cell.config.execution.approach_speed)):

@@ -161,7 +161,7 @@ class PybulletPanda(PybulletHand, Robot):
         super().__init__(dt, gripper, grip_force, gate)
         self.position_gain = self.velocity_gain = 1.0
         self._load(client, urdf)
-        self._held_back = np.nan
+        self._held_back: float | None = None  # rad/s; as yet what Bullet has
         self.limit_speed(JOINT_VELOCITY.max())
         self._felt: tuple[int, tuple, tuple] | None = None  # the clock, positions and velocities
 

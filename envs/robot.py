@@ -258,7 +258,8 @@ class Robot(Hand):
 
     @abstractmethod
     def limit_speed(self, speed: float) -> None:
-        """Limit every joint to `speed` rad/s."""
+        """Limit every joint to `speed` rad/s while `drive_arm_to` moves the arm; a trajectory keeps
+        its own limits."""
 
     def _stay(self, q: np.ndarray) -> None:
         self.gate.restart(q)

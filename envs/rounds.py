@@ -23,7 +23,6 @@ from typing import Protocol
 
 import numpy as np
 
-from envs.arm_paths import hanging
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
@@ -298,7 +297,7 @@ def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
     where nothing hangs over the table, because nearly all are. The first of all where the arm
     reaches none. A floating hand reaches all that are above the table."""
     reachable = reaches if cell.has_arm else clears_table
-    least = 0.0 if hanging(cell) else PLANAR
+    least = 0.0 if cell.hanging else PLANAR
     nothing = True
     for grasp in grasps:
         if grasp.tilt < least or reachable(cell, grasp):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs import arm_paths
-from envs.arm_paths import first_plan, hanging, height_over, way_out, withdrawn
+from envs.arm_paths import first_plan, height_over, way_out, withdrawn
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Box, Placement, Scene
 from envs.execution import execute_grasp, reaches
 from envs.object_bodies import native_object
@@ -48,7 +48,7 @@ def test_an_only_way_that_is_blocked_is_none(shelved, monkeypatch):
 
 def test_the_way_out_ends_before_the_board(shelved):
     """E starts 9 cm behind the front edge and has 9 cm to go beyond it."""
-    assert hanging(shelved) == [SHELF[0]]
+    assert shelved.hanging == [SHELF[0]]
     assert way_out(
         shelved, np.array([0.5, -0.02, 0.1]), np.array([0.0, 1.0, 0.0])
     ) == pytest.approx(0.18, abs=0.011)

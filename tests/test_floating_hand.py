@@ -9,7 +9,7 @@ import pytest
 from envs.cell import require_arm
 from envs.cell_layout import Box, Placement, Scene, table_box
 from envs.execution import execute_grasp
-from envs.floating_execution import PREGRASP, clears_table, execute_floating, floating_hand
+from envs.floating_execution import PREGRASP, attempt, clears_table, execute_floating, floating_hand
 from envs.floating_hand import meets_box
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
@@ -175,7 +175,10 @@ def test_an_empty_hand_misses_and_so_does_a_thin_grip(cell, box_set):
     cubes = load_object_set("box", scale=0.1, cache_dir=cell.config.cache_folder)  # 6 mm
     at = Placement(cubes[0], np.array([0.5, 0.0, 0.003]), np.eye(4)[3])
     cell.load(Scene("isolated", 0, (at,)))
-    outcome = execute_floating(cell, cube_grasp(np.pi / 2, offset=(0.0, 0.0, -0.0215)))
+    grasp = cube_grasp(np.pi / 2, offset=(0.0, 0.0, -0.0215))
+    assert attempt(cell, grasp).success  # but for the rule it is held
+    cell.load(Scene("isolated", 0, (at,)))
+    outcome = execute_floating(cell, grasp)
     assert outcome.reason == "missed" and "8 mm or less count as empty" in outcome.detail
 
 
