@@ -7,6 +7,8 @@ planners may use them. This module knows no image and no search.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from models.planner_candidates import Candidates
@@ -20,6 +22,25 @@ PERTURBATIONS = np.array(
     + [(0, s * 0.005, 0) for s in (-1, 1)]
     + [(0, 0, s * np.deg2rad(5)) for s in (-1, 1)]
 )
+
+
+# Of `scored_by_contacts`. On training scenes all executed grasps of at least this score but few
+# succeeded, and of those below it, such as on plates that lie flat, none.
+_HOPELESS = 1e-3
+
+
+def scored_by_contacts(
+    found: Candidates, scene: SceneGeometry, gripper: GripperGeometry, buried: np.ndarray
+) -> Candidates:
+    """The candidates with scores that the exact contacts decide, best first. Antipodal grasps come
+    first, then those that only the height map finds good; hopeless ones are left out.
+
+    scene: in the candidates' frame. buried: (M,) share of each object that others cover.
+    """
+    quality = exact_quality(found, scene, gripper)
+    score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
+    found = replace(found, score=np.where(score >= _HOPELESS, score, 0.0))
+    return found.best(len(found))
 
 
 def exact_quality(

@@ -16,7 +16,7 @@ import numpy as np
 
 from models.planner_antipodal import SearchPlanner, search_once
 from models.planner_candidates import Candidates, SearchSettings, with_chances
-from models.planner_contacts import buried_share, exact_quality
+from models.planner_contacts import buried_share, scored_by_contacts
 from utils.depth_correction import corrected
 from utils.geometry import ConvexSolid, GripperGeometry, Workspace
 from utils.height_map import (
@@ -235,9 +235,7 @@ class OracleFanPlanner(FanPlanner):
         def by_contacts(heights: HeightMap, found: Candidates) -> Candidates:
             found = found.distinct(self.count, 0.004, np.deg2rad(8))
             scene = truth.transformed(inverse_pose(heights.T_WV))
-            quality = exact_quality(found, scene, self.gripper)
-            found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
-            return found.best(len(found))
+            return scored_by_contacts(found, scene, self.gripper, buried)
 
         covered = self.covered(truth.walls)
         return self.search_fan(of_target(overhead), exact, None, by_contacts, covered)

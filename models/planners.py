@@ -20,7 +20,7 @@ import numpy as np
 from models.graspnet_io import SHIPPED
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import SearchSettings, with_chances
-from models.planner_contacts import buried_share, exact_quality
+from models.planner_contacts import buried_share, scored_by_contacts
 from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
 from models.planner_graspnet import (
     GraspNetDirectPlanner,
@@ -152,11 +152,8 @@ class OraclePlanner(SearchPlanner):
         found = self.search(aimed).distinct(self.judged, 0.004, np.deg2rad(8))
         if len(found) == 0:
             return []
-        quality = exact_quality(found, truth, self.gripper)
         buried = buried_share(truth, heights)
-        # Antipodal grasps come first; where there is none, the height map's score ranks the rest.
-        found.score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
-        return self.grasps(found.best(len(found)))
+        return self.grasps(scored_by_contacts(found, truth, self.gripper, buried))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:

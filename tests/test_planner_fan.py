@@ -233,6 +233,17 @@ def test_an_empty_table_has_no_grasp() -> None:
         assert make_planner(name, GripperGeometry(), Workspace(), 0)(frame) == []
 
 
+@pytest.mark.parametrize("name", ["oracle", "oracle6d"])
+def test_oracles_leave_out_what_lies_too_wide_for_the_hand(name):
+    """A box of 9 x 12 cm, 4 cm high: its level faces are too far apart for a hand of 8 cm, and its
+    top and its underside look away from each other."""
+    plan = make_planner(name, GripperGeometry(), Workspace(), 0)
+    wide, cube = ((0.09, 0.12, 0.04), 0.3, (0.45, -0.06)), ((0.04,) * 3, 0.0, (0.55, 0.08))
+    assert plan(boxes_frame([wide])) == []
+    grasps = plan(boxes_frame([wide, cube]))
+    assert grasps and all(np.hypot(*(g.position[:2] - (0.55, 0.08))) < 0.03 for g in grasps)
+
+
 def test_the_oracle_needs_the_truth() -> None:
     with pytest.raises(ValueError, match="frame.truth"):
         OracleFanPlanner(GripperGeometry(), Workspace())(boxes_frame([]).without_truth())
