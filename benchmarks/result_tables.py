@@ -244,6 +244,25 @@ def calibration(say: Say, part: Figures) -> str:
     return "\n\n".join([table(header, lines), origin(say, part)])
 
 
+def calibration_by_scene(say: Say, *parts: Figures) -> str:
+    """The calibration error in each scenario, with the attempts that it is of. Few attempts make an
+    error of their own, which is why they stand beside it."""
+    cells: dict[tuple[str, str, str], dict[str, str]] = {}
+    for command in (command for part in parts for command in part["commands"].values()):
+        for row in command["rows"]:
+            if row.get("calibration_error") is not None:  # older files have no such key
+                cell = cells.setdefault((row["objects"], row["scenario"], noise_of(row)), {})
+                error = f"{row['calibration_error']:.3f} ({row['attempts']})"
+                cell.setdefault(row["policy"], error)
+    planners = dict.fromkeys(policy for of in cells.values() for policy in of)
+    lines = [
+        [f"`{objects}`", scenario, f"`{noise}`", *(of.get(policy, "-") for policy in planners)]
+        for (objects, scenario, noise), of in cells.items()
+    ]
+    header = ["objects", "scenario", "depth", *(f"`{policy}`" for policy in planners)]
+    return "\n\n".join([table(header, lines), origin(say, *parts)])
+
+
 def clutter15(say: Say, part: Figures) -> str:
     header = ["planner", "success", "cleared", "picks an hour"]
     lines = [planner_cells(row) for row in rows_of(part)]
@@ -387,6 +406,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "retrieve": (("retrieve",), retrieve),
     "vgn": (("vgn",), variants),
     "calibration": (("calibration",), calibration),
+    "calibration_by_scene": (("six_dof", "scenes", "direct"), calibration_by_scene),
     "clutter15": (("clutter15",), clutter15),
     "differences15": (("clutter15",), differences),
     "noise": (("noise", "scoreboard"), noise),

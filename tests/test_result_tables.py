@@ -45,6 +45,23 @@ def test_rate_has_wilsons_interval():
     assert rate(0, 0) == "-"
 
 
+def test_each_scene_has_the_calibration_error_of_each_planner(tmp_path):
+    sure, unsure = (
+        row(policy, 9, 10) | {"calibration_error": error}
+        for policy, error in (("graspnet", 0.0254), ("oracle", 0.1))
+    )
+    figures(tmp_path, "six_dof", [sure, row("random", 1, 10) | {"calibration_error": None}])
+    figures(tmp_path, "scenes", [unsure, unsure | {"scenario": "tall"}])
+    figures(tmp_path, "direct", [sure | {"calibration_error": 0.5}])  # six_dof's row is the first
+    page = with_tables("<!-- results:calibration_by_scene -->\n<!-- /results -->\n", tmp_path)
+    header, _, *lines = page.splitlines()[1:5]
+    assert header == "| objects | scenario | depth | `graspnet` | `oracle` |"
+    assert lines == [
+        "| `random_urdfs` | pile | `none` | 0.025 (10) | 0.100 (10) |",
+        "| `random_urdfs` | tall | `none` | - | 0.100 (10) |",
+    ]
+
+
 def test_a_table_is_written_between_its_marks_with_commit_seed_and_command(tmp_path):
     figures(tmp_path, "clutter15", [row("heuristic", 81, 263)])
     page = "before\n<!-- results:clutter15 -->\nold\n<!-- /results -->\nafter\n"
