@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 
 from benchmarks.table_cells import (
     Figures,
@@ -38,7 +39,7 @@ from utils.runs import write_atomic
 PAGES = (
     "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/graspnet.md",
     "docs/six_dof.md", "docs/vgn.md",
-    "docs/scaling.md", "docs/reliability.md",
+    "docs/scaling.md", "docs/reliability.md", "docs/servo.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
 
@@ -288,14 +289,23 @@ def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
 
 
 def servo(say: Say, part: Figures) -> str:
-    """Scenarios by controllers, both object sets together."""
+    """Scenarios by controllers, both object sets together, and how long a turn of a loop takes:
+    the median, over the rows, of the mean and of the 95th percentile."""
     counts: dict[str, dict[str, list[int]]] = {}
+    turns: dict[str, list[tuple[float, float]]] = {}
     for row in rows_of(part):
         cell = counts.setdefault(row["scenario"], {}).setdefault(row["controller"], [0, 0])
         cell[0] += row["successes"]
         cell[1] += row["attempts"]
+        if row.get("turn_ms_mean") is not None:
+            of_one = row["turn_ms_mean"], row["turn_ms_p95"]
+            turns.setdefault(row["controller"], []).append(of_one)
     names = list(next(iter(counts.values())))
     lines = [[f"`{name}`", *(rate(*cells[one]) for one in names)] for name, cells in counts.items()]
+    typical = {name: [median(column) for column in zip(*of)] for name, of in turns.items()}
+    if typical:
+        spent = (", ".join(f"{ms:.1f}" for ms in typical.get(name, ())) or "-" for name in names)
+        lines.append(["a turn, ms: mean, 95 %", *spent])
     return "\n\n".join([table(["scenario", *map(str, names)], lines), origin(say, part)])
 
 

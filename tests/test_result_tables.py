@@ -62,6 +62,23 @@ def test_each_scene_has_the_calibration_error_of_each_planner(tmp_path):
     ]
 
 
+def test_loops_have_successes_of_all_objects_and_the_median_time_of_a_turn(tmp_path):
+    def rows(controller: str, mean: float | None, most: float | None) -> list[dict]:
+        times = {"turn_ms_mean": mean, "turn_ms_p95": most, "controller": controller}
+        return [row("heuristic", 3, 4, objects) | times for objects in ("a", "b")]
+
+    loops = [*rows("open_loop", None, None), *rows("ibvs", 4.0, 6.0)]
+    loops[-1]["turn_ms_mean"] = 5.0
+    figures(tmp_path, "servo", loops)
+    page = with_tables("<!-- results:servo -->\n<!-- /results -->\n", tmp_path)
+    assert page.splitlines()[1:5] == [
+        "| scenario | open_loop | ibvs |",
+        "| --- | --- | --- |",
+        f"| `pile` | {rate(6, 8)} | {rate(6, 8)} |",
+        "| a turn, ms: mean, 95 % | - | 4.5, 6.0 |",
+    ]
+
+
 def test_a_table_is_written_between_its_marks_with_commit_seed_and_command(tmp_path):
     figures(tmp_path, "clutter15", [row("heuristic", 81, 263)])
     page = "before\n<!-- results:clutter15 -->\nold\n<!-- /results -->\nafter\n"
