@@ -13,12 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.evaluation_worker import load_objects, new_planner
 from envs.rounds import run_round
 from envs.simulators import make_cell
-from envs.studio import Studio, write_film
+from envs.studio import Film, write_film
 from utils.config import Config
 from utils.errors import UserError
 from utils.runs import parse_args, run_script
@@ -36,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     config, chosen = parse_args(argv, "Film four scenes that ask for grasps from a side.", options)
     if chosen.output.suffix not in (".gif", ".mp4"):
-        raise UserError(f"--output: {chosen.output} is neither a .gif nor a .mp4 file")
+        raise UserError(f"--output: {chosen.output} is no .gif or .mp4 file; name such a file")
     films = [film(config, layout, objects) for layout, objects in SCENES]
     longest = max(len(pictures) for pictures in films)
     ended = [pictures + [pictures[-1]] * (longest - len(pictures)) for pictures in films]
@@ -48,19 +47,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 def film(config: Config, layout: str, objects: str) -> list[np.ndarray]:
     """Pictures (H, W, 3) uint8 of one round."""
     scene = make_scene(layout, load_objects(objects, config), config.seed, config)
-    pictures: list[np.ndarray] = []
-    with make_cell(config) as cell, Studio(cell, *_SIZE) as studio:
-        every = max(1, round(1 / (_RATE * cell.dt)))
-
-        def look(cell: Cell) -> None:
-            if cell.steps % every == 0:
-                pictures.append(studio.picture())
-
-        cell.on_step = look
+    with make_cell(config) as cell:
+        filming = Film(cell, _RATE, _SIZE)
         record = run_round(
             cell, scene, new_planner(PLANNER, config), policy=PLANNER, objects=objects,
             max_failures=config.evaluate.max_failures,
         )  # fmt: skip
+        pictures = filming.stop()
     outcome = f"{layout}: {record.objects_cleared} of {record.objects_total} in the bin"
     outcome += f", {len(record.attempts)} attempts"
     print(outcome)

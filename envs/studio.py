@@ -68,25 +68,32 @@ class Studio:
 
 
 class Film:
-    """Films a cell from now on, FILM_RATE pictures a second of simulated time, until written."""
+    """Films a cell from now on until it is stopped or written.
 
-    def __init__(self, cell: Cell):
-        self._cell, self._studio = cell, Studio(cell, *FILM_SIZE)
+    rate: pictures a second of simulated time. size: width and height, pixels.
+    """
+
+    def __init__(self, cell: Cell, rate: float = FILM_RATE, size: tuple[int, int] = FILM_SIZE):
+        self._cell, self._studio, self._rate = cell, Studio(cell, *size), rate
         self._pictures: list[np.ndarray] = []
-        self._every = max(1, round(1 / (FILM_RATE * cell.dt)))
+        self._every = max(1, round(1 / (rate * cell.dt)))
         cell.on_step = self._on_step
 
     def _on_step(self, cell: Cell) -> None:
         if cell.steps % self._every == 0:
             self._pictures.append(self._studio.picture())
 
-    def write(self, path: Path, speed: float = 2.0) -> None:
-        """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
+    def stop(self) -> list[np.ndarray]:
+        """Stop filming; returns the pictures, (H, W, 3) uint8 each."""
         self._cell.on_step = None
         if not self._pictures:  # the arm has not moved: at least show the scene
             self._pictures.append(self._studio.picture())
         self._studio.close()
-        _write(path, self._pictures, speed * FILM_RATE)
+        return self._pictures
+
+    def write(self, path: Path, speed: float = 2.0) -> None:
+        """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
+        _write(path, self.stop(), speed * self._rate)
 
 
 def film_episode(

@@ -24,8 +24,8 @@ PERTURBATIONS = np.array(
 )
 
 
-# Of `scored_by_contacts`. On training scenes all executed grasps of at least this score but few
-# succeeded, and of those below it, such as on plates that lie flat, none.
+# The score of `scored_by_contacts` below which a grasp is left out. On training scenes no executed
+# grasp below it succeeded, such as on plates that lie flat, and nearly all others did.
 _HOPELESS = 1e-3
 
 
