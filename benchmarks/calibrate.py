@@ -19,7 +19,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,10 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     lines, found = [], {}
     for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
         own = [record for record in rounds if record.policy == name]
-        scores, _, successes = grasps_of(own)
+        scores, _, successes, roughness = grasps_of(own)
         if len(successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
-        fitted = Calibration.fit(scores, successes)
+        fitted = Calibration.fit(scores, successes, roughness)
         found[name] = {
             **asdict(fitted),
             "grasps": len(successes),
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         }
         for kind in [None, *dict.fromkeys((one.scenario, one.depth_noise) for one in own)]:
             some = [one for one in own if kind in (None, (one.scenario, one.depth_noise))]
-            if len(grasps_of(some)[0]) > 0:
+            if len(grasps_of(some).scores) > 0:
                 lines.append([name, *(kind or ("all", "all")), *errors(fitted, some)])
     header = ["planner", "scenario", "depth", "grasps", "success", "error before", "after"]
     print(aligned(header, lines, range(3, 7)))
@@ -95,32 +95,47 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
     return read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
 
 
-def grasps_of(rounds: Iterable[RoundRecord]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The executed grasps of some rounds: scores, qualities as stated and successes, (N,) each.
+class ExecutedGrasps(NamedTuple):
+    """N executed grasps: scores, qualities as stated, successes, and the roughness in metres of the
+    frames that they were found in, (N,) each."""
+
+    scores: np.ndarray
+    stated: np.ndarray
+    successes: np.ndarray
+    roughness: np.ndarray
+
+
+def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
+    """The executed grasps of some rounds.
 
     Where qualities are chances, the round's own calibration leads back to the scores.
     """
     scores: list[float] = []
     stated: list[float] = []
     successes: list[bool] = []
+    rough: list[float] = []
     for record in rounds:
         executed = [one for one in record.attempts if one.executed and one.grasp is not None]
         qualities = [attempt.grasp.quality for attempt in executed]
         stated += qualities
         successes += [attempt.success for attempt in executed]
+        rough += [attempt.roughness for attempt in executed]
         if record.calibration is not None:
-            qualities = Calibration(*record.calibration).scores(qualities).tolist()
+            chances = Calibration(*record.calibration)
+            qualities = chances.scores(qualities, [one.roughness for one in executed]).tolist()
         scores += qualities
-    return np.array(scores), np.array(stated), np.array(successes, dtype=bool)
+    return ExecutedGrasps(
+        np.array(scores), np.array(stated), np.array(successes, dtype=bool), np.array(rough)
+    )
 
 
 def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
     """Cells: grasps, their share of successes, the calibration error as stated and as fitted."""
-    scores, stated, successes = grasps_of(rounds)
+    scores, stated, successes, roughness = grasps_of(rounds)
     return [
         str(len(stated)), f"{100 * successes.mean():.0f} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
-        f"{calibration_error(fitted(scores), successes):.3f}",
+        f"{calibration_error(fitted(scores, roughness), successes):.3f}",
     ]  # fmt: skip
 
 

@@ -1,12 +1,12 @@
-"""Train the critic of graspnet6d: python -m benchmarks.train_critic --output FILE.pt [key=value]
+"""Train the grasp critic: python -m benchmarks.train_critic --output FILE.pt [key=value]
 
 Draws scenes of training objects, has a floating hand execute candidates of graspnet6d, graspnet and
 graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
 them succeed. Every tenth scene is held out; on these it prints how often the candidate that is
 ranked first succeeds, of those that were executed, by the search alone and by the critic, and how
 far the stated chances are from frequencies. Written to checkpoints/critic.pt, the critic is what
-graspnet6d ranks by from then on; its chances of success are then fitted again
-(`benchmarks.calibrate`).
+graspnet6d and graspnet_direct rank by from then on; their chances of success are then
+fitted again (`benchmarks.calibrate`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument("--output", type=Path, required=True, help="file for the weights")
         parser.add_argument("--scenes", type=int, default=3000, help="how many, ten or more")
 
-    config, chosen = parse_args(argv, "Train the critic of graspnet6d.", options)
+    config, chosen = parse_args(argv, "Train the grasp critic.", options)
     check_writable("--output", chosen.output)
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")

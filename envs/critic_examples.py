@@ -146,10 +146,10 @@ def _cell_of(config: Config) -> Cell:
 def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
     gripper = replace(config.gripper.geometry, opens_fully=opens_fully)
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
-    return [  # in the order of PLANNERS; the first one's critic is never asked
+    return [  # in the order of PLANNERS; these critics are never asked
         GraspNetFanPlanner(gripper, workspace, critic=GraspCritic()),
         GraspNetPlanner(gripper, workspace),
-        GraspNetDirectPlanner(gripper, workspace),
+        GraspNetDirectPlanner(gripper, workspace, critic=GraspCritic()),
     ]
 
 

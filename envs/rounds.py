@@ -33,7 +33,9 @@ from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
+from utils.depth_correction import corrected
 from utils.errors import TargetLostError, one_line
+from utils.geometry import Workspace
 from utils.result_records import (
     NO_PLAN,
     OPEN_LOOP,
@@ -120,6 +122,9 @@ def run_round(
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
     plan_seconds, ended = 0.0, "cleared"
 
+    def roughness_of(frame: RGBDFrame) -> float:
+        return corrected(replace(frame, second=None), Workspace().table_height).roughness
+
     def see() -> RGBDFrame:
         mount = cell.config.camera.mount
         return calibrated(cell, calibration, mount, cell.frame(privileged))
@@ -183,6 +188,7 @@ def run_round(
                     slid=None if outcome.motion is None else outcome.motion.slid,
                     graspable=(aim if held is None else held) not in too_large,
                     tilt=grasp.tilt,
+                    roughness=0.0 if privileged else roughness_of(frame),
                     **_turn_ms(approach),
                 )
             )
@@ -214,7 +220,7 @@ def run_round(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
         cell.config.camera.depth_noise,
-        None if chances is None else (chances.slope, chances.offset),
+        None if chances is None else (chances.slope, chances.offset, chances.penalty),
         None if wanted is None else ended == "target",
     )  # fmt: skip
 

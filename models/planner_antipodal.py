@@ -70,11 +70,12 @@ class SearchPlanner:
         returned = max(count, self.settings.returned)
         self.settings = replace(self.settings, returned=returned)
 
-    def grasps(self, found: Candidates) -> list[Grasp]:
-        """The best of the candidates as grasps, no two of them nearly alike."""
+    def grasps(self, found: Candidates, roughness: float = 0.0) -> list[Grasp]:
+        """The best of the candidates as grasps, no two of them nearly alike. roughness: m, of the
+        frame that they were found in."""
         settings = self.settings
         kept = found.distinct(settings.returned, settings.distinct_distance, settings.distinct_turn)
-        return with_chances(kept.grasps(self.gripper), self.calibration)
+        return with_chances(kept.grasps(self.gripper), self.calibration, roughness)
 
 
 def search(

@@ -111,11 +111,14 @@ class Candidates:
         ]
 
 
-def with_chances(grasps: list[Grasp], calibration: Calibration | None) -> list[Grasp]:
-    """The grasps in the same order, with chances of success in place of scores."""
+def with_chances(
+    grasps: list[Grasp], calibration: Calibration | None, roughness: float = 0.0
+) -> list[Grasp]:
+    """The grasps in the same order, with chances of success in place of scores, in a frame of this
+    roughness, m."""
     if calibration is None:
         return grasps
-    chances = calibration([grasp.quality for grasp in grasps]).tolist()
+    chances = calibration([grasp.quality for grasp in grasps], roughness).tolist()
     return [replace(grasp, quality=chance) for grasp, chance in zip(grasps, chances)]
 
 

@@ -112,7 +112,7 @@ class FanPlanner(SearchPlanner):
         judge: Judge | None = None,
         covered: bool = False,
     ) -> list[Grasp]:
-        """The grasps of all views, best first; may be empty.
+        """The grasps of all views with their scores, best first; may be empty.
 
         overhead: the map from above, without what hangs over the table. maps: gives the height map
         in a frame T_WV (4, 4). judge: has the last word on what a view's candidates are worth.
@@ -125,8 +125,7 @@ class FanPlanner(SearchPlanner):
             for heights in views:
                 grasps += self._search_view(heights, settings, value, judge)
             if grasps:
-                best = distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
-                return with_chances(best, self.calibration)
+                return distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
         return []
 
     def covered(self, solids: Sequence[ConvexSolid]) -> bool:
@@ -205,7 +204,8 @@ class HeuristicFanPlanner(FanPlanner):
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        return self.search_fan(overhead, seen, covered=self.covered(frame.fixtures))
+        grasps = self.search_fan(overhead, seen, covered=self.covered(frame.fixtures))
+        return with_chances(grasps, self.calibration, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return height_map_from_frame(frame, self.workspace, below=True)
@@ -238,7 +238,8 @@ class OracleFanPlanner(FanPlanner):
             return scored_by_contacts(found, scene, self.gripper, buried)
 
         covered = self.covered(truth.walls)
-        return self.search_fan(of_target(overhead), exact, None, by_contacts, covered)
+        grasps = self.search_fan(of_target(overhead), exact, None, by_contacts, covered)
+        return with_chances(grasps, self.calibration)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:

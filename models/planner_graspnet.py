@@ -4,20 +4,15 @@ A network's maps are exact to a few millimetres; fingers beside an object need b
 antipodal search proposes exact poses, and the network's quality at their places and angles is a
 factor on their scores: before they are measured on the height map, so that few have to be, and
 after. In the holes of the depth image, colours tell which surface is seen (`table_in_holes`,
-`surfaces_in_holes`).
-
-Where the network has a centre head, its votes segment the height map into objects. At each pixel
-the head predicts the offset to the centre of mass of the object there. All parts of one object
-point at one place, even where objects touch, so the places where many votes meet are the objects (a
-Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018; Cheng et al., Panoptic-DeepLab,
-CVPR 2020). Parts whose votes do not meet keep the height map's label.
+`surfaces_in_holes`). Where the network has a centre head, its votes tell the objects apart
+(`models.graspnet_objects`).
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -29,13 +24,13 @@ from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shippe
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
 from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
+from models.graspnet_objects import labelled_by_centres
 from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
-from models.planner_candidates import Candidates, SearchSettings
+from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_fan import SEARCH, FanPlanner, FanSettings
 from utils.depth import (
     TABLE_FLATNESS,
     depth_of_plane,
-    nearest_values,
     reach_in_pixels,
     surfaces_in_holes,
     table_in_holes,
@@ -46,12 +41,9 @@ from utils.grasp_quality import grasp_depth
 from utils.height_map import (
     OTHER_LABEL,
     HeightMap,
-    base_heights,
     height_map_from_frame,
-    local_maxima,
     tilted_height_map,
 )
-from utils.images import PixelScaling
 from utils.seen_heights import hides, without_holes
 from utils.target import only_target
 from utils.transforms import (
@@ -62,110 +54,6 @@ from utils.transforms import (
     project,
     transform_points,
 )
-
-
-@dataclass(frozen=True)
-class VoteSettings:
-    """Of the vote for centres; in pixels of the network's image unless said."""
-
-    blur: float = 2.0  # standard deviation of the Gaussian over the votes
-    apart: int = 5  # the centres of two objects are farther apart than this in u or v
-    least: float = 8e-5  # m2 of surface whose votes have to meet within the blur
-    reach: float = 12.0  # a vote that misses every centre by more belongs to no object
-    margin: int = 40  # how far outside the image a centre may lie
-
-
-def labelled_by_centres(
-    heights: HeightMap,
-    frame: RGBDFrame,
-    scaling: PixelScaling,
-    offset: np.ndarray,
-    settings: VoteSettings = VoteSettings(),
-) -> HeightMap:
-    """The height map with the network's objects: their labels and their centres of mass.
-
-    offset: (2, h, w) pixels to the centre of mass, at the network's scale; `scaling` takes the
-    frame's pixels to it. Every labelled cell keeps a label. The votes give a centre's place in the
-    image; its height is the centroid of the columns under the object's visible surface, an estimate
-    that is too low where the object rests on others.
-    """
-    row, column = np.nonzero(heights.label >= 0)
-    height = heights.height[row, column]
-    surface = np.column_stack(
-        [heights.origin + heights.cell * np.column_stack([column, row]), height]
-    )
-    place = scaling.pixels(project(surface, frame.K, frame.T_WC)[0])
-    limits = offset.shape[2] - 1, offset.shape[1] - 1
-    u, v = np.clip(np.rint(place).astype(int), 0, limits).T
-    votes = place + offset[:, v, u].T
-    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
-    seen = heights.ceiling[row, column] <= height
-    behind = np.zeros(len(row), bool)
-    if frame.second is not None:
-        behind = hides(frame, surface)
-    seen &= ~behind
-    centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
-    if len(centres) == 0:
-        return heights
-    miss = np.linalg.norm(votes[:, None] - centres, axis=2)
-    count, owner = len(centres), miss.argmin(axis=1)
-    owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
-    label = np.minimum(heights.label, -1)  # table and walls stay
-    label[row, column] = owner
-    if behind.any():
-        label = _as_beside(label, heights.label, row[behind], column[behind], count)
-
-    rise, base = height - heights.table_height, np.zeros(count)
-    if heights.fixed is not None:
-        base = base_heights(label, heights.fixed, heights.table_height)[:count]
-        base = base - heights.table_height
-        rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
-    total = np.bincount(owner, rise, count)[:count]
-    mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
-    ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
-    eye = frame.T_WC[:3, 3]
-    share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
-    found = eye + share[:, None] * (ahead - eye)
-    return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
-
-
-def _as_beside(
-    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, count: int
-) -> np.ndarray:
-    """Labels (R, C) whose cells (N,) that only a second frame shows are those of the nearest other
-    cell of the same `piece` (R, C), or the piece itself, after `count` objects, where there is
-    none."""
-    others = label >= 0
-    others[row, column] = False
-    label = label.copy()
-    label[row, column] = count + piece[row, column]
-    if others.any():
-        nearest, its_piece = (nearest_values(values, others) for values in (label, piece))
-        same = its_piece[row, column] == piece[row, column]
-        label[row[same], column[same]] = nearest[row[same], column[same]]
-    return label
-
-
-def vote_centres(
-    votes: np.ndarray,
-    shape: tuple[int, int],
-    cell: float,
-    settings: VoteSettings = VoteSettings(),
-) -> np.ndarray:
-    """(M, 2) places (u, v) in or near an image of `shape` where many of the votes (N, 2) meet, in
-    falling order of their number; each vote stands for cell x cell metres of surface."""
-    rows, columns = np.array(shape) + 2 * settings.margin
-    place = np.rint(votes + settings.margin).astype(int)
-    u, v = place[((place >= 0) & (place < (columns, rows))).all(axis=1)].T
-    count = np.bincount(v * columns + u, minlength=rows * columns).reshape(rows, columns)
-    density = cv2.GaussianBlur(count.astype(np.float32), (0, 0), settings.blur)
-    least = settings.least / cell**2 / (2 * np.pi * settings.blur**2)  # all at one point, blurred
-    peaks = local_maxima(density, settings.apart, least)
-    found = np.column_stack(peaks[::-1]) - settings.margin
-    near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
-    # The blur may make a peak between votes that are all farther away.
-    return np.array([votes[some].mean(axis=0) for some in near if some.any()]).reshape(-1, 2)
-
 
 # Half the heuristic's angles: turning onto the faces and the network make up for it. The split
 # factor is strict because the votes separate objects better than height alone.
@@ -195,6 +83,11 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
     return saved._replace(model=for_inference(saved.model))
 
 
+def chances_by(critic: GraspCritic) -> Judge:
+    """A critic as the judge of candidates."""
+    return lambda heights, found, inputs: critic.chance(inputs)
+
+
 class Judged:
     """What the planners share whose candidates a critic may judge last (`models.grasp_critic`).
 
@@ -218,9 +111,12 @@ class Judged:
 class GraspNetPlanner(Judged, SearchPlanner):
     """Antipodal search ranked by a network, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. It has no critic, which was not seen
-    to gain anything from above. Raises UserError if the file cannot be loaded.
+    checkpoint: file of the network, unless `network` is given. critic: has the last word; without
+    one, planners that rank by a critic have the shipped one, and the others none. Raises UserError
+    if a file cannot be loaded.
     """
+
+    ranks_by_critic = False
 
     def __init__(
         self,
@@ -230,16 +126,20 @@ class GraspNetPlanner(Judged, SearchPlanner):
         checkpoint: Path = SHIPPED,
         network: SavedGraspNet | None = None,
         settings: SearchSettings = SETTINGS,
+        critic: GraspCritic | None = None,
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
+        if critic is not None or self.ranks_by_critic:
+            self.judge = chances_by(critic or shipped_critic())
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace)
         heights = only_target(seen.heights, frame)
         found = self.search(heights, partial(seen.value, heights))
-        return self.grasps(self.judged(heights, found, seen, PLANAR_JUDGED))
+        found = self.judged(heights, found, seen, PLANAR_JUDGED)
+        return self.grasps(found, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace).heights
@@ -250,9 +150,11 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
     At each peak of the quality map, and at the angles that the network prefers there, a grasp is
     posed on the height map: centred between its contacts, turned onto the faces, as deep as a label
-    is or a little more or less. Those whose fingers and palm find room are ranked as `graspnet`
-    ranks its own.
+    is or a little more or less. Of those whose fingers and palm find room, a critic judges the ones
+    that `graspnet` would rank first.
     """
+
+    ranks_by_critic = True
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
@@ -269,7 +171,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
             if len(found):
                 found = turn_onto_faces(found, heights, self.gripper, settings)
                 found = replace(found, score=found.score * value(found)).best(len(found))
-                return self.grasps(self.judged(heights, found, seen, PLANAR_JUDGED))
+                found = self.judged(heights, found, seen, PLANAR_JUDGED)
+                return self.grasps(found, frame.roughness)
         return []
 
     def _at_peaks(self, points: np.ndarray, heights: HeightMap) -> Candidates:
@@ -313,8 +216,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
     ):
         super().__init__(gripper, workspace, seed, SEARCH, JUDGED_FAN)
         self.network = network or loaded(checkpoint)
-        self.critic = critic or shipped_critic()
-        self.judge = lambda heights, found, inputs: self.critic.chance(inputs)
+        self.judge = chances_by(critic or shipped_critic())
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
@@ -329,7 +231,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
             return self.judged(heights, found, seen, VIEW_JUDGED)
 
         covered = self.covered(frame.fixtures)
-        return self.search_fan(overhead, tilted, seen.value, of_view, covered)
+        grasps = self.search_fan(overhead, tilted, seen.value, of_view, covered)
+        return with_chances(grasps, self.calibration, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights

@@ -97,7 +97,7 @@ class TargetPlanner:
             return 0.0
         if chances is None:
             return self.settings.share * best[0].quality
-        return float(chances(self.settings.share * chances.scores(best[0].quality)))
+        return chances.of_share(best[0].quality, self.settings.share)
 
     def _clearing(self, objects: _Objects, grasps: list[Grasp]) -> list[Grasp]:
         shown = objects.surface(objects.target)

@@ -110,7 +110,8 @@ class RandomPlanner:
             height = max(top - 0.02, lowest)  # the fingers reach 2 cm below the surface
             angle = self._random.uniform(0, np.pi)
             grasps.append(Grasp(np.array([x, y, height]), angle, self.gripper.max_opening, quality))
-        return with_chances(grasps, self.calibration)
+        rough = corrected(frame, table).roughness
+        return with_chances(grasps, self.calibration, rough)
 
 
 class HeuristicPlanner(SearchPlanner):
@@ -118,7 +119,8 @@ class HeuristicPlanner(SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        return self.grasps(self.search(only_target(self.heights(frame), frame)))
+        found = self.search(only_target(self.heights(frame), frame))
+        return self.grasps(found, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return height_map_from_frame(frame, self.workspace)

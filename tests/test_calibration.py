@@ -30,11 +30,12 @@ from utils.calibration import (
     risk_coverage,
 )
 from utils.config import DEFAULTS, dump_config, load_config
+from utils.depth_correction import corrected
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import AttemptRecord, RoundRecord, append_round, read_rounds
 from utils.results import stated_chances, summarise
-from utils.transforms import ImageGrasp
+from utils.transforms import Grasp, ImageGrasp, RGBDFrame
 
 ROOT = Path(__file__).resolve().parent.parent
 CHANCES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
@@ -95,6 +96,34 @@ def test_a_fit_is_torchs_logistic_regression_with_platts_targets() -> None:
     )
 
 
+def test_a_fit_finds_what_rough_depth_costs() -> None:
+    rng = np.random.default_rng(0)
+    scores, truth = rng.uniform(0.05, 1.2, 40_000), Calibration(1.5, 2.0, 400.0)
+    rough = rng.choice([0.0, 0.0025], len(scores))
+    success = rng.uniform(size=len(scores)) < truth(scores, rough)
+    fitted = Calibration.fit(scores, success, rough)
+    assert fitted.slope == pytest.approx(1.5, abs=0.08)
+    assert fitted.offset == pytest.approx(2.0, abs=0.08)
+    assert fitted.penalty == pytest.approx(400, abs=25)
+    # By hand: ln(0.5) * 1.5 + 2 - 400 * 0.0025 = -0.0397, whose logistic is 0.4901.
+    assert truth(0.5, 0.0025) == pytest.approx(0.4901, abs=1e-4)
+    assert truth(0.5) > truth(0.5, 0.0025)
+    np.testing.assert_allclose(truth.scores(truth(scores, rough), rough), scores)
+
+
+def test_no_fit_states_that_noise_helps() -> None:
+    rough = np.repeat([0.0, 0.003], 100)
+    fitted = Calibration.fit(np.full(200, 0.5), np.arange(200) % 10 < 6 + 3 * (rough > 0), rough)
+    assert fitted.penalty == 0
+
+
+def test_a_share_of_a_score_has_its_own_chance_at_any_roughness() -> None:
+    line = Calibration(1.5, 2.0, 400.0)
+    for rough in (0.0, 0.002):
+        chance = float(line(0.8, rough))
+        assert line.of_share(chance, 0.25) == pytest.approx(float(line(0.2, rough)))
+
+
 @given(st.floats(0.01, 5), st.floats(-5, 5), st.floats(0.05, 3), st.floats(0.05, 3))
 def test_chances_keep_the_order_of_scores_and_lead_back_to_them(slope, offset, one, other) -> None:
     calibration = Calibration(slope, offset)
@@ -131,6 +160,45 @@ def test_planners_state_chances_in_the_order_of_their_scores() -> None:
             [grasp.position for grasp in stated], [grasp.position for grasp in scored]
         )
     assert calibration_of(make_planner(str(SHIPPED), gripper, workspace, 0)) is None
+
+
+@pytest.mark.parametrize("name", ["heuristic", "graspnet_direct", "heuristic6d"])
+def test_planners_are_less_sure_of_rough_depth(name) -> None:
+    frame, rng = boxes_frame([((0.05, 0.05, 0.05), 0.4, (0.47, 0.03))]), np.random.default_rng(0)
+    noise = rng.normal(0, 0.002, frame.depth.shape).astype(np.float32)
+    frame = replace(frame, depth=frame.depth + noise)
+    gripper, workspace, line = GripperGeometry(), Workspace(), Calibration(1.0, 2.0, 300.0)
+    planner = PLANNERS[name](gripper, workspace, 0)
+    scores = [grasp.quality for grasp in planner(frame)]
+    planner.calibration = line
+    stated = [grasp.quality for grasp in planner(frame)]
+    rough = corrected(frame, workspace.table_height).roughness
+    assert scores and rough == pytest.approx(0.002, rel=0.1)
+    np.testing.assert_allclose(stated, line(scores, rough))
+
+
+def test_a_round_records_how_rough_the_depth_was(bullet_cell, box_set, monkeypatch) -> None:
+    look, rng = bullet_cell.frame, np.random.default_rng(0)
+
+    def rough(with_truth: bool = False) -> RGBDFrame:
+        frame = look(with_truth)
+        noise = rng.normal(0, 0.004, frame.depth.shape).astype(np.float32)
+        return replace(frame, depth=frame.depth + noise)
+
+    def recorded(privileged: bool) -> float:
+        class Plan:
+            needs_truth = privileged
+
+            def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+                return [cube_grasp()]
+
+        scene, settings = cube_scene(box_set), {"policy": "x", "objects": "box", "max_failures": 1}
+        return run_round(bullet_cell, scene, Plan(), **settings).attempts[0].roughness
+
+    assert recorded(privileged=False) < 1e-5
+    monkeypatch.setattr(bullet_cell, "frame", rough)
+    assert recorded(privileged=False) == pytest.approx(0.004, rel=0.1)
+    assert recorded(privileged=True) == 0
 
 
 def test_grasps_of_less_quality_are_not_tried(bullet_cell, box_set) -> None:
@@ -199,7 +267,7 @@ def test_the_journal_leads_back_to_the_scores(tmp_path) -> None:
     )
     append_round(tmp_path / "rounds.jsonl", stated)
     (read,) = read_rounds(tmp_path / "rounds.jsonl")
-    assert read.calibration == (1.5, 2.0)
+    assert read.calibration == (1.5, 2.0, 0.0)  # older files have no penalty
     for record in (raw, read):
         np.testing.assert_allclose(grasps_of([record])[0], scores)
 

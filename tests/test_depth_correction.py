@@ -140,10 +140,20 @@ def test_roughness_is_the_standard_deviation() -> None:
 
 def test_a_good_camera_s_frame_stays_as_it_is() -> None:
     frame, rng = scene(0.4), np.random.default_rng(0)
-    assert corrected(frame, 0.0) is frame
+    same = corrected(frame, 0.0)
+    assert same.depth is frame.depth and same.roughness < 1e-6
     depth = frame.depth + rng.normal(0, 0.001, frame.depth.shape).astype(np.float32)
     frame = replace(frame, depth=depth)
-    assert corrected(frame, 0.0) is frame
+    same = corrected(frame, 0.0)
+    assert same.depth is depth and same.roughness == pytest.approx(0.001, rel=0.03)
+
+
+def test_a_frame_that_is_corrected_twice_tells_how_rough_it_was() -> None:
+    frame, rng = scene(), np.random.default_rng(0)
+    depth = frame.depth + rng.normal(0, 0.005, frame.depth.shape).astype(np.float32)
+    once = corrected(replace(frame, depth=depth), 0.0)
+    assert table_roughness(once, 0.0) < 0.003  # it was smoothed
+    assert once.roughness == corrected(once, 0.0).roughness == pytest.approx(0.005, rel=0.05)
 
 
 def test_smoothing_averages_a_surface_and_keeps_its_edge() -> None:

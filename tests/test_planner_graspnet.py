@@ -8,15 +8,13 @@ import pytest
 import torch
 
 from models.graspnet_io import SavedGraspNet
+from models.graspnet_objects import VoteSettings, labelled_by_centres, vote_centres
 from models.planner_graspnet import (
     CROP_MARGIN,
     GraspNetDirectPlanner,
     GraspNetPlanner,
-    VoteSettings,
     around_matter,
-    labelled_by_centres,
     quality_between,
-    vote_centres,
 )
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.fixed_maps import FixedMaps

@@ -1,9 +1,11 @@
 """From a planner's score to the chance that executing the grasp succeeds, and how good that is.
 
-Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm:
-P = 1 / (1 + exp(-(slope * log(score) + offset))), fitted to executed grasps. The chance rises with
-the score, so that a planner's order of grasps stays. How far chances and frequencies are apart is
-the expected calibration error (Guo et al., "On calibration of modern neural networks", ICML 2017).
+Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm,
+with a penalty for rough depth: P = 1 / (1 + exp(-(slope log(score) + offset - penalty roughness))),
+fitted to executed grasps. The chance rises with the score, so that a planner's order of grasps
+stays. The roughness is that of the table in the frame (`utils.depth_correction`): scores hardly
+tell a noisy frame, in which more grasps fail. How far chances and frequencies are apart is the
+expected calibration error (Guo et al., "On calibration of modern neural networks", ICML 2017).
 
 This module knows neither planners nor simulators.
 """
@@ -31,39 +33,49 @@ BINS = 10  # of equal width in [0, 1]
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chance of success of a score: slope, offset as in the module's formula; slope > 0."""
+    """Chance of success of a score: slope > 0, offset, and penalty >= 0 in 1 / m, of the module's
+    formula."""
 
     slope: float
     offset: float
+    penalty: float = 0.0
 
-    def __call__(self, score: ArrayLike) -> np.ndarray:
-        """(...) chances in (0, 1) of scores (...)."""
-        return expit(self.slope * np.log(np.maximum(score, LEAST_SCORE)) + self.offset)
+    def __call__(self, score: ArrayLike, roughness: ArrayLike = 0.0) -> np.ndarray:
+        """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m."""
+        logarithm = np.log(np.maximum(score, LEAST_SCORE))
+        return expit(
+            self.slope * logarithm + self.offset - self.penalty * np.asarray(roughness, float)
+        )
 
-    def scores(self, chances: ArrayLike) -> np.ndarray:
-        """(...) scores that have these chances (...)."""
-        return np.exp((logit(np.clip(chances, 1e-12, 1 - 1e-12)) - self.offset) / self.slope)
+    def scores(self, chances: ArrayLike, roughness: ArrayLike = 0.0) -> np.ndarray:
+        """(...) scores that have these chances (...) in frames of this roughness (...), m."""
+        line = logit(np.clip(chances, 1e-12, 1 - 1e-12)) - self.offset
+        return np.exp((line + self.penalty * np.asarray(roughness, float)) / self.slope)
+
+    def of_share(self, chance: float, share: float) -> float:
+        """The chance of a score that is this share of the one with that chance, in one frame."""
+        return float(expit(logit(np.clip(chance, 1e-12, 1 - 1e-12)) + self.slope * np.log(share)))
 
     @staticmethod
-    def fit(scores: ArrayLike, successes: ArrayLike) -> Calibration:
-        """The most likely calibration of executed grasps: scores (N,), successes (N,) bool."""
-        return Calibration(*_fit(np.log(np.maximum(scores, LEAST_SCORE)), successes))
+    def fit(scores: ArrayLike, successes: ArrayLike, roughness: ArrayLike = 0.0) -> Calibration:
+        """The most likely calibration of executed grasps: scores (N,), successes (N,) bool, and the
+        roughness (N,) of their frames, m.
 
+        A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
+        where there are few grasps.
+        """
+        x = np.log(np.maximum(scores, LEAST_SCORE))
+        won = np.asarray(successes, dtype=bool)
+        target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
+        rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
 
-def _fit(x: np.ndarray, successes: ArrayLike) -> tuple[float, float]:
-    """Slope and offset of a logistic regression on x (N,), with Platt's targets, which are nearer
-    to each other than 0 and 1 where there are few grasps."""
-    won = np.asarray(successes, dtype=bool)
-    target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
+        def loss(line: np.ndarray) -> float:
+            z = line[0] * x + line[1] - line[2] * rough
+            return -float(np.mean(target * log_expit(z) + (1 - target) * log_expit(-z)))
 
-    def loss(line: np.ndarray) -> float:
-        z = line[0] * x + line[1]
-        return -float(np.mean(target * log_expit(z) + (1 - target) * log_expit(-z)))
-
-    found = minimize(
-        loss, (1.0, 0.0), method="L-BFGS-B", bounds=((LEAST_SLOPE, None), (None, None))
-    )
-    return float(found.x[0]), float(found.x[1])
+        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None))
+        slope, offset, penalty = minimize(loss, (1.0, 0.0, 0.0), method="L-BFGS-B", bounds=bounds).x
+        return Calibration(float(slope), float(offset), 1000 * float(penalty))
 
 
 def load_calibrations(path: Path) -> dict[str, Calibration]:
@@ -71,7 +83,10 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
     if not path.exists():
         return {}
     planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
-    return {name: Calibration(one["slope"], one["offset"]) for name, one in planners.items()}
+    return {
+        name: Calibration(one["slope"], one["offset"], one.get("penalty", 0.0))
+        for name, one in planners.items()
+    }
 
 
 class ReliabilityBin(NamedTuple):

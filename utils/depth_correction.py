@@ -26,16 +26,18 @@ COLOUR_NOISE = 0.01  # standard deviation of colours, 0..1, that are one surface
 
 def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     """The frame with its depth scaled until the table lies at `table_height` (m in W), and smoothed
-    where the table is rough; the frame itself where its camera is as good as that already. So is
-    its second frame."""
+    where the table is rough; as it is where its camera is as good as that already. It tells how
+    rough the table was. So is its second frame."""
     if frame.second is not None:
         frame = replace(frame, second=corrected(frame.second, table_height))
     scale = scale_to_table(frame, table_height)
     if abs(scale - 1) > TRUSTED_SCALE:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))
-    if table_roughness(frame, table_height) > TRUSTED_ROUGHNESS:
+    roughness = table_roughness(frame, table_height)
+    if roughness > TRUSTED_ROUGHNESS:
         frame = replace(frame, depth=smoothed_by_colour(frame))
-    return frame
+    # A frame that was corrected before is less rough now, but no more certain.
+    return replace(frame, roughness=max(frame.roughness, roughness))
 
 
 def scale_to_table(frame: RGBDFrame, table_height: float) -> float:

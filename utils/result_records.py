@@ -84,6 +84,7 @@ class AttemptRecord:
     turned, slid: rad and m by which it moved there; None without it.
     graspable: whether the object that was held, or at which the grasp aimed, fits the gripper.
     tilt: rad of the executed grasp's approach from straight above.
+    roughness: m, of the table in the frame that the planner saw; 0 where it saw the truth.
     """
 
     success: bool
@@ -99,6 +100,7 @@ class AttemptRecord:
     slid: float | None = None
     graspable: bool = True
     tilt: float = 0.0
+    roughness: float = 0.0
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -123,7 +125,7 @@ class RoundRecord:
     randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
     ungraspable: how many of the scene's objects do not fit the gripper.
     depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
-    calibration: slope and offset by which the grasps' qualities are chances of success
+    calibration: slope, offset and penalty by which the grasps' qualities are chances of success
         (`utils.calibration`); None where they are scores.
     target_in_hand: whether the one object that was wanted ended in the bin; None where all were.
     """
@@ -140,7 +142,7 @@ class RoundRecord:
     randomization: dict[str, Any] | None = None
     ungraspable: int = 0
     depth_noise: str = CLEAN
-    calibration: tuple[float, float] | None = None
+    calibration: tuple[float, float, float] | None = None
     target_in_hand: bool | None = None
 
     def __post_init__(self) -> None:
@@ -244,10 +246,11 @@ def _round(content: dict[str, Any]) -> RoundRecord:
                 raise ValueError("a grasp does not consist of numbers")
             attempt["grasp"] = ImageGrasp(**grasp)
     if content.get("calibration") is not None:
-        slope, offset = content["calibration"]
-        if not (_is_number(slope) and _is_number(offset)):
-            raise ValueError("a calibration does not consist of two numbers")
-        content["calibration"] = (slope, offset)
+        numbers = content["calibration"]
+        if len(numbers) not in (2, 3) or not all(map(_is_number, numbers)):
+            raise ValueError("a calibration does not consist of three numbers")
+        slope, offset, penalty = [*numbers, 0.0][:3]  # older files have no penalty
+        content["calibration"] = (slope, offset, penalty)
     return RoundRecord(**content, attempts=tuple(AttemptRecord(**one) for one in attempts))
 
 
@@ -258,8 +261,10 @@ _ROUND_TYPES = {
 }  # fmt: skip
 _ATTEMPT_TYPES = {
     "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
+    "roughness": float,
 }  # fmt: skip
-_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True}  # missing in older files
+# missing in older files
+_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True, "roughness": 0.0}
 _GRASP_NUMBERS = ("angle", "depth", "width", "quality")
 
 

@@ -150,6 +150,8 @@ class RGBDFrame:
         segmenter gives them; None: any object.
     second: another frame of the same still scene, from another side, which adds to what this one
         shows; None: there is none. Its own fixtures, target and second count for nothing.
+    roughness: m, how rough the table is in the depth that the camera measured, as
+        `utils.depth_correction.corrected` found it; 0 before.
     """
 
     rgb: np.ndarray
@@ -161,6 +163,7 @@ class RGBDFrame:
     fixtures: tuple[ConvexSolid, ...] = ()  # type: ignore[name-defined]  # noqa: F821 - as above
     target: np.ndarray | None = None
     second: RGBDFrame | None = None
+    roughness: float = 0.0
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""

@@ -1,0 +1,123 @@
+"""Objects by vote: GraspNet's centre head segments the height map.
+
+At each pixel the head predicts the offset to the centre of mass of the object there. All parts of
+one object point at one place, even where objects touch, so the places where many votes meet are the
+objects (a Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018; Cheng et al.,
+Panoptic-DeepLab, CVPR 2020). Parts whose votes do not meet keep the height map's label.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from utils.depth import nearest_values
+from utils.height_map import HeightMap, base_heights, local_maxima
+from utils.images import PixelScaling
+from utils.seen_heights import hides
+from utils.transforms import RGBDFrame, deproject, project
+
+
+@dataclass(frozen=True)
+class VoteSettings:
+    """Of the vote for centres; in pixels of the network's image unless said."""
+
+    blur: float = 2.0  # standard deviation of the Gaussian over the votes
+    apart: int = 5  # the centres of two objects are farther apart than this in u or v
+    least: float = 8e-5  # m2 of surface whose votes have to meet within the blur
+    reach: float = 12.0  # a vote that misses every centre by more belongs to no object
+    margin: int = 40  # how far outside the image a centre may lie
+
+
+def labelled_by_centres(
+    heights: HeightMap,
+    frame: RGBDFrame,
+    scaling: PixelScaling,
+    offset: np.ndarray,
+    settings: VoteSettings = VoteSettings(),
+) -> HeightMap:
+    """The height map with the network's objects: their labels and their centres of mass.
+
+    offset: (2, h, w) pixels to the centre of mass, at the network's scale; `scaling` takes the
+    frame's pixels to it. Every labelled cell keeps a label. The votes give a centre's place in the
+    image; its height is the centroid of the columns under the object's visible surface, an estimate
+    that is too low where the object rests on others.
+    """
+    row, column = np.nonzero(heights.label >= 0)
+    height = heights.height[row, column]
+    surface = np.column_stack(
+        [heights.origin + heights.cell * np.column_stack([column, row]), height]
+    )
+    place = scaling.pixels(project(surface, frame.K, frame.T_WC)[0])
+    limits = offset.shape[2] - 1, offset.shape[1] - 1
+    u, v = np.clip(np.rint(place).astype(int), 0, limits).T
+    votes = place + offset[:, v, u].T
+    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
+    seen = heights.ceiling[row, column] <= height
+    behind = np.zeros(len(row), bool)
+    if frame.second is not None:
+        behind = hides(frame, surface)
+    seen &= ~behind
+    centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
+    if len(centres) == 0:
+        return heights
+    miss = np.linalg.norm(votes[:, None] - centres, axis=2)
+    count, owner = len(centres), miss.argmin(axis=1)
+    owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
+    label = np.minimum(heights.label, -1)  # table and walls stay
+    label[row, column] = owner
+    if behind.any():
+        label = _as_beside(label, heights.label, row[behind], column[behind], count)
+
+    rise, base = height - heights.table_height, np.zeros(count)
+    if heights.fixed is not None:
+        base = base_heights(label, heights.fixed, heights.table_height)[:count]
+        base = base - heights.table_height
+        rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
+    total = np.bincount(owner, rise, count)[:count]
+    mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
+    ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
+    eye = frame.T_WC[:3, 3]
+    share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
+    found = eye + share[:, None] * (ahead - eye)
+    return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
+
+
+def _as_beside(
+    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, count: int
+) -> np.ndarray:
+    """Labels (R, C) whose cells (N,) that only a second frame shows are those of the nearest other
+    cell of the same `piece` (R, C), or the piece itself, after `count` objects, where there is
+    none."""
+    others = label >= 0
+    others[row, column] = False
+    label = label.copy()
+    label[row, column] = count + piece[row, column]
+    if others.any():
+        nearest, its_piece = (nearest_values(values, others) for values in (label, piece))
+        same = its_piece[row, column] == piece[row, column]
+        label[row[same], column[same]] = nearest[row[same], column[same]]
+    return label
+
+
+def vote_centres(
+    votes: np.ndarray,
+    shape: tuple[int, int],
+    cell: float,
+    settings: VoteSettings = VoteSettings(),
+) -> np.ndarray:
+    """(M, 2) places (u, v) in or near an image of `shape` where many of the votes (N, 2) meet, in
+    falling order of their number; each vote stands for cell x cell metres of surface."""
+    rows, columns = np.array(shape) + 2 * settings.margin
+    place = np.rint(votes + settings.margin).astype(int)
+    u, v = place[((place >= 0) & (place < (columns, rows))).all(axis=1)].T
+    count = np.bincount(v * columns + u, minlength=rows * columns).reshape(rows, columns)
+    density = cv2.GaussianBlur(count.astype(np.float32), (0, 0), settings.blur)
+    least = settings.least / cell**2 / (2 * np.pi * settings.blur**2)  # all at one point, blurred
+    peaks = local_maxima(density, settings.apart, least)
+    found = np.column_stack(peaks[::-1]) - settings.margin
+    near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
+    # The blur may make a peak between votes that are all farther away.
+    return np.array([votes[some].mean(axis=0) for some in near if some.any()]).reshape(-1, 2)
