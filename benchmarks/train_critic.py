@@ -2,16 +2,19 @@
 
 Draws scenes of training objects, has a floating hand execute candidates of graspnet6d, graspnet and
 graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
-them succeed. Every tenth scene is held out; on these it prints how often the candidate that is
-ranked first succeeds, of those that were executed, by the search alone and by the critic, and how
-far the stated chances are from frequencies. Written to checkpoints/critic.pt, the critic is what
-graspnet6d and graspnet_direct rank by from then on; their chances of success are then
-fitted again (`benchmarks.calibrate`).
+them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
+folder of `--examples`, where a run that was stopped finds them again. Every tenth scene is held
+out; on these it prints how often the candidate that is ranked first succeeds, of those that were
+executed, by the search alone, by the critic that it began with, and by the new one, and how far the
+stated chances are from frequencies. Written to checkpoints/critic.pt, the critic is what graspnet6d
+and graspnet_direct rank by from then on; their chances of success are then fitted again
+(`benchmarks.calibrate`).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -22,16 +25,17 @@ from torch.nn import functional
 from tqdm import tqdm
 
 from envs.critic_examples import PLANNERS, Examples, examples_of, planner_of
-from models.grasp_critic import INPUTS, KIND, GraspCritic
+from models.grasp_critic import INPUTS, KIND, GraspCritic, load_critic
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
 from utils.config import Config
 from utils.errors import UserError
 from utils.executor import completed, open_executor
-from utils.runs import check_writable, git_state, parse_args, run_script
+from utils.runs import check_writable, git_state, parse_args, run_script, write_json_atomic
 
 HELD_OUT = 10  # every tenth scene
+SHARD = 50  # scenes of a file
 EPOCHS, BATCH, RATE, DECAY = 4, 256, 2e-3, 1e-2
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
@@ -40,15 +44,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--output", type=Path, required=True, help="file for the weights")
         parser.add_argument("--scenes", type=int, default=3000, help="how many, ten or more")
+        parser.add_argument(
+            "--examples", type=Path, default=Path("data/critic"), help="folder of executed grasps"
+        )
+        parser.add_argument("--initial", type=Path, help="critic whose weights to start from")
 
     config, chosen = parse_args(argv, "Train the grasp critic.", options)
     check_writable("--output", chosen.output)
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
-    examples = collect(config, chosen.scenes)
+    initial = None if chosen.initial is None else load_critic(chosen.initial)
+    examples = collect(config, chosen.scenes, chosen.examples)
     held_out = examples.scene % HELD_OUT == 0
-    critic = fit(examples.where(~held_out), config.seed)
-    scores = judged(critic, examples.where(held_out))
+    scores = {}
+    if initial is not None:
+        before = judged(initial, examples.where(held_out))
+        scores |= {f"{name} before": value for name, value in before.items()}
+    critic = fit(examples.where(~held_out), config.seed, initial=initial)
+    scores |= judged(critic, examples.where(held_out))
     print(
         f"{len(examples.success)} grasps of {chosen.scenes} scenes, "
         f"{100 * examples.success.mean():.0f} % of them succeeded"
@@ -63,24 +76,51 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def collect(config: Config, scenes: int) -> Examples:
-    """The candidates of so many scenes, in the scenes' order."""
-    found = []
-    with open_executor(config.compute, config.data.workers) as workers:
-        results = completed(workers, partial(examples_of, config), range(scenes))
-        found = list(tqdm(results, total=scenes, unit="scene"))
-    return Examples.joined(sorted(found, key=lambda one: one.scene[:1].tolist()))
+def collect(config: Config, scenes: int, folder: Path) -> Examples:
+    """The candidates of so many scenes, in the scenes' order; the folder keeps those of SHARD
+    scenes each in a file, and what it has already is not played again. Raises UserError where it
+    holds scenes of another seed or a damaged file."""
+    settings = {"seed": config.seed, "object_sets": list(config.data.object_sets)}
+    note = folder / "settings.json"
+    if not note.exists():
+        write_json_atomic(note, settings)
+    elif json.loads(note.read_text(encoding="utf-8")) != settings:
+        raise UserError(f"--examples {folder}: holds other seeds or sets; give another folder")
+    parts = []
+    with (
+        open_executor(config.compute, config.data.workers) as workers,
+        tqdm(total=scenes, unit="scene") as progress,
+    ):
+        for first in range(0, scenes, SHARD):
+            numbers = range(first, min(first + SHARD, scenes))
+            path = folder / f"scenes-{numbers.start:05d}-{numbers.stop - 1:05d}.npz"
+            if path.exists():
+                progress.update(len(numbers))
+            else:
+                found = []
+                for one in completed(workers, partial(examples_of, config), numbers):
+                    found.append(one)
+                    progress.update()
+                Examples.joined(sorted(found, key=lambda one: one.scene[:1].tolist())).save(path)
+            parts.append(Examples.load(path))
+    return Examples.joined(parts)
 
 
-def fit(examples: Examples, seed: int, epochs: int = EPOCHS) -> GraspCritic:
-    """A critic of these candidates, by cross-entropy."""
+def fit(
+    examples: Examples, seed: int, epochs: int = EPOCHS, initial: GraspCritic | None = None
+) -> GraspCritic:
+    """A critic of these candidates, by cross-entropy. initial: whose weights to start from; the
+    facts keep its mean and scale."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     critic = GraspCritic()
     facts, patches = map(torch.from_numpy, examples.inputs)
     success = torch.from_numpy(examples.success.astype(np.float32))
-    critic.mean.copy_(facts.mean(dim=0))
-    critic.scale.copy_(facts.std(dim=0).clamp_min(1e-3))
+    if initial is not None:
+        critic.load_state_dict(initial.state_dict())
+    else:
+        critic.mean.copy_(facts.mean(dim=0))
+        critic.scale.copy_(facts.std(dim=0).clamp_min(1e-3))
     optimizer = torch.optim.AdamW(critic.parameters(), lr=RATE, weight_decay=DECAY)
     steps = epochs * -(-len(success) // BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)

@@ -1,14 +1,19 @@
 """Examples for the critic: what the planners see of their candidates, and what becomes of them.
 
-Scenes of training objects are seen by a camera from above or from a side, with one of the depth
-noises. A floating hand executes some of the candidates, good and bad (`envs.floating_execution`).
-The examples of a scene are a pure function of the config and its number.
+Scenes of training objects, some of them larger than usual, are seen by a camera from above or from
+a side, with one of the depth noises. A floating hand executes some of the candidates
+(`envs.floating_execution`): half of them the ones that the shipped critic likes best, so that the
+next one learns what this one overrates, the others at random. The examples of a scene are a pure
+function of the config, its number and the shipped critic.
 """
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +24,10 @@ from envs.cell_scenes import SceneError, make_scene
 from envs.floating_execution import attempt, clears_table
 from envs.objects import ObjectSet, load_object_set
 from envs.simulators import make_cell
-from models.grasp_critic import CriticInputs, GraspCritic, nothing
+from models.grasp_critic import INPUTS, CriticInputs, GraspCritic, nothing, shipped_critic
 from models.planner_candidates import Candidates
 from models.planner_graspnet import (
+    JUDGED_FAN,
     GraspNetDirectPlanner,
     GraspNetFanPlanner,
     GraspNetPlanner,
@@ -30,8 +36,10 @@ from models.planner_graspnet import (
 from utils.config import Config, with_settings
 from utils.depth import make_depth_noise
 from utils.depth import measure as measured
+from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import HeightMap
+from utils.runs import write_atomic
 from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 
@@ -39,9 +47,12 @@ from utils.worker_process import kept
 PLANNERS = {"graspnet6d": 20, "graspnet": 7, "graspnet_direct": 7}
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
-    "isolated": 0.05, "packed": 0.20, "pile": 0.30, "bin": 0.05, "tall": 0.10, "wall": 0.10,
-    "shelf": 0.08, "flat": 0.12,
+    "isolated": 0.05, "packed": 0.15, "pile": 0.22, "bin": 0.10, "household": 0.18, "tall": 0.07,
+    "wall": 0.09, "shelf": 0.05, "flat": 0.09,
 }  # fmt: skip
+# Scale of larger objects, which stand for household things that the hand hardly spans, and the
+# share of the scenes that hold them.
+_LARGE, _LARGE_SHARE = {"random_urdfs": 1.0, "primitives": 1.3}, 0.35
 _OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",)}
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
@@ -67,6 +78,27 @@ class Examples(NamedTuple):
         inputs = CriticInputs.joined([part.inputs for part in parts])
         return Examples(inputs, *(np.concatenate(column) for column in list(zip(*parts))[1:]))
 
+    def save(self, path: Path) -> None:
+        """Write a NumPy archive, whole or not at all. Raises UserError where that fails."""
+        columns = {"facts": self.inputs.facts, "patches": self.inputs.patches}
+        columns |= dict(zip(self._fields[1:], self[1:]))
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **columns)
+        write_atomic(path, buffer.getvalue())
+
+    @staticmethod
+    def load(path: Path) -> Examples:
+        """Raises UserError, naming the file, where it is no archive of examples."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                inputs = CriticInputs(file["facts"], file["patches"])
+                return Examples(inputs, *(file[name] for name in Examples._fields[1:]))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise UserError(
+                f"{path}: holds no executed grasps ({error}); remove it, and its scenes are played "
+                "again"
+            ) from error
+
 
 _NONE = Examples(nothing(), np.empty(0, bool), np.empty(0), *np.empty((2, 0), int))
 
@@ -91,12 +123,21 @@ def examples_of(config: Config, number: int) -> Examples:
         frame = draw_frame(config, cell, rng)
         for which, (planner, most) in enumerate(zip(planners, PLANNERS.values())):
             inputs, scores, grasps = judged_by(planner, frame)
-            tried = rng.permutation(len(grasps))[:most]
+            tried = _worth_trying(inputs, most, rng)
             success = np.array([execute(cell, part, grasps[i]) for i in tried], bool)
             plan = (number * FRAMES_PER_SCENE + frame_number) * len(PLANNERS) + which
             numbers = np.full(len(tried), number), np.full(len(tried), plan)
             found.append(Examples(inputs.take(tried), success, scores[tried], *numbers))
     return Examples.joined(found)
+
+
+def _worth_trying(inputs: CriticInputs, most: int, rng: np.random.Generator) -> np.ndarray:
+    """Up to `most` indices of candidates: half of them are those that the shipped critic ranks
+    first, the others are drawn."""
+    tilt = inputs.facts[:, INPUTS.index("tilt")]
+    rank = np.argsort(-shipped_critic().chance(inputs) * JUDGED_FAN.preference(tilt))
+    best = rank[: most // 2]
+    return np.concatenate([best, rng.permutation(rank[most // 2 :])[: most - len(best)]])
 
 
 def judged_by(planner: Judged, frame: RGBDFrame) -> tuple[CriticInputs, np.ndarray, list[Grasp]]:
@@ -155,13 +196,22 @@ def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
 
 @kept
 def _sets_of(config: Config) -> dict[str, ObjectSet]:
+    """Of each name, and those of `_LARGE` once more as NAME, large."""
+    names = dict.fromkeys([*config.data.object_sets, "tall", "flat"])
+    kinds = {name: (name, config.objects.scale) for name in names}
+    kinds |= {_large(name): (name, scale) for name, scale in _LARGE.items() if name in names}
     settings = config.objects.model_dump() | {"split": "train"}
     return {
-        name: load_object_set(
-            name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
+        kind: load_object_set(
+            name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder,
+            **settings | {"scale": scale},
         )
-        for name in dict.fromkeys([*config.data.object_sets, "tall", "flat"])
-    }
+        for kind, (name, scale) in kinds.items()
+    }  # fmt: skip
+
+
+def _large(name: str) -> str:
+    return f"{name}, large"
 
 
 def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Generator) -> Scene:
@@ -169,6 +219,8 @@ def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Genera
     while True:
         layout = str(rng.choice(list(_LAYOUTS), p=list(_LAYOUTS.values())))
         name = str(rng.choice(_OWN_SETS.get(layout, config.data.object_sets)))
+        if rng.random() < _LARGE_SHARE and _large(name) in sets:
+            name = _large(name)
         crowd = with_settings(
             config, "scene", {"count": int(rng.integers(2, 7 if layout == "packed" else 9))}
         )

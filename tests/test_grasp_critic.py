@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.train_critic import TILTS, first_of_plans, fit, judged, mirrored
+from benchmarks.train_critic import TILTS, collect, first_of_plans, fit, judged, mirrored
 from benchmarks.train_critic import main as train
+from envs import critic_examples
 from envs.cell_scenes import make_scene
 from envs.critic_examples import PLANNERS, Examples, at_rest, examples_of, execute
 from envs.objects import load_object_set
@@ -292,6 +293,73 @@ def test_examples_of_a_scene_are_a_function_of_its_number() -> None:
     assert 0 < first.success.mean() < 1
     for one, other in zip((*first.inputs, *first[1:]), (*again.inputs, *again[1:])):
         np.testing.assert_array_equal(one, other)
+
+
+def test_half_of_what_is_tried_is_what_the_critic_likes_best(monkeypatch) -> None:
+    class Liking(GraspCritic):
+        def chance(self, inputs: CriticInputs) -> np.ndarray:
+            return column(inputs, "cover").astype(float)
+
+    monkeypatch.setattr(critic_examples, "shipped_critic", Liking)
+    facts = np.zeros((30, len(INPUTS)), np.float32)  # all from straight above
+    facts[:, INPUTS.index("cover")] = cover = np.random.default_rng(0).permutation(30) / 30
+    inputs = CriticInputs(facts, np.zeros((30, 3, 24, 48), np.int8))
+    tried = critic_examples._worth_trying(inputs, 9, np.random.default_rng(1))
+    assert len(tried) == len(set(tried)) == 9
+    assert set(np.argsort(-cover)[:4]) <= set(tried)
+    others = critic_examples._worth_trying(inputs, 9, np.random.default_rng(2))
+    assert set(tried) != set(others)
+    assert (
+        len(critic_examples._worth_trying(inputs.take(np.arange(3)), 9, np.random.default_rng(1)))
+        == 3
+    )
+
+
+def test_some_scenes_hold_larger_objects() -> None:
+    config = load_config(None, [])
+    sets = critic_examples._sets_of(config)
+    usual, large = sets["random_urdfs"][0].extents, sets["random_urdfs, large"][0].extents
+    np.testing.assert_allclose(np.divide(large, usual), 1 / 0.65, rtol=0.01)  # as their files say
+    assert "thin, large" not in sets
+
+
+def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
+    """Of 120 scenes in files of 50, the last file is missing: its 20 scenes alone are played."""
+    played = []
+
+    def examples(config, number: int) -> Examples:
+        played.append(number)
+        return made_up(1, number)._replace(scene=np.full(12, number))
+
+    monkeypatch.setattr("benchmarks.train_critic.examples_of", examples)
+    monkeypatch.setattr(
+        "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
+    )
+    config = load_config(None, ["data.workers=1"])
+    whole = collect(config, 120, tmp_path)
+    assert played == list(range(120))
+    (tmp_path / "scenes-00100-00119.npz").unlink()
+    played.clear()
+    again = collect(config, 120, tmp_path)
+    assert played == list(range(100, 120))
+    for one, other in zip((*whole.inputs, *whole[1:]), (*again.inputs, *again[1:])):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(UserError, match="holds other seeds or sets; give another folder"):
+        collect(load_config(None, ["seed=1"]), 120, tmp_path)
+    (tmp_path / "scenes-00000-00049.npz").write_bytes(b"no archive")
+    with pytest.raises(UserError, match=r"scenes-00000-00049\.npz: holds no executed grasps"):
+        collect(config, 120, tmp_path)
+
+
+def test_a_critic_goes_on_from_another_ones_weights() -> None:
+    """Of a rule that is known already, few examples take nothing away."""
+    known = fit(made_up(300, 0), seed=0, epochs=15)
+    few = made_up(20, 2)
+    again, anew = fit(few, seed=0, epochs=1, initial=known), fit(few, seed=0, epochs=1)
+    torch.testing.assert_close(again.mean, known.mean)
+    tested = made_up(100, 1)
+    assert judged(again, tested)["graspnet6d by critic"] > 0.8
+    assert judged(anew, tested)["graspnet6d by critic"] < 0.7
 
 
 def test_too_few_scenes_are_refused(tmp_path) -> None:
