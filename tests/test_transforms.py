@@ -22,6 +22,7 @@ from utils.transforms import (
     pose_matrix,
     position_quaternion,
     project,
+    ray_component,
     rotation_exp,
     rotation_log,
     skew,
@@ -84,6 +85,17 @@ def test_camera_above_the_table_by_hand():
     np.testing.assert_allclose(pixel, [111.5 - 50, 111.5], atol=1e-9)
     assert depth == pytest.approx(0.8)
     np.testing.assert_allclose(deproject(pixel, depth, K, T), [0.5, 0.1, 0.0], atol=1e-12)
+
+
+def test_rays_lead_where_pixels_are_deprojected():
+    camera = np.array([[400.0, 0.0, 3.2], [0.0, 380.0, 1.7], [0.0, 0.0, 1.0]])
+    T = look_at([0.2, -0.3, 0.7], [0.5, 0.1, 0.0])
+    depth = np.random.default_rng(0).uniform(0.4, 0.9, (5, 7))
+    v, u = np.mgrid[:5, :7]
+    points = deproject(np.stack([u, v], axis=-1), depth, camera, T)
+    for axis in range(3):
+        along = T[axis, 3] + depth * ray_component(axis, depth.shape, camera, T)
+        np.testing.assert_allclose(along, points[..., axis], atol=1e-12)
 
 
 def test_points_behind_the_camera_have_no_pixel():

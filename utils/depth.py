@@ -34,7 +34,7 @@ from scipy.special import ndtri
 
 from utils.errors import UserError, unknown_choice
 from utils.plugins import is_import_path, load_plugin
-from utils.transforms import RGBDFrame, deproject, known_depth
+from utils.transforms import RGBDFrame, known_depth, ray_component
 
 # (H, W) float32 metres and a generator for the draws, and (H, W, 3) uint8 colours for noises that
 # have `sees_colours` -> (H, W) float32 metres, 0 where unknown.
@@ -621,7 +621,6 @@ def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
 def depth_of_plane(frame: RGBDFrame, height: float) -> np.ndarray:
     """(H, W) depth at which each pixel's ray meets the plane z = height in W; infinite or negative
     where it does not."""
-    v, u = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
-    along = deproject(np.stack([u, v], axis=-1), np.ones(u.shape), frame.K, frame.T_WC)
+    down = ray_component(2, frame.depth.shape, frame.K, frame.T_WC)
     with np.errstate(divide="ignore"):
-        return (height - frame.T_WC[2, 3]) / (along[..., 2] - frame.T_WC[2, 3])
+        return (height - frame.T_WC[2, 3]) / down

@@ -30,10 +30,12 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     rough the table was. So is its second frame."""
     if frame.second is not None:
         frame = replace(frame, second=corrected(frame.second, table_height))
-    scale = scale_to_table(frame, table_height)
+    asked = _ratio_to_table(frame, table_height)
+    scale = _densest(asked)
     if abs(scale - 1) > TRUSTED_SCALE:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))
-    roughness = table_roughness(frame, table_height)
+        asked = asked / scale
+    roughness = _roughness(asked, frame.depth)
     if roughness > TRUSTED_ROUGHNESS:
         frame = replace(frame, depth=smoothed_by_colour(frame))
     # A frame that was corrected before is less rough now, but no more certain.
@@ -42,14 +44,18 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
 
 def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
     """The factor by which depths have to be multiplied for the table to lie at its height; 1 where
-    too little of a table is seen.
+    too little of a table is seen."""
+    return _densest(_ratio_to_table(frame, table_height))
 
-    Each pixel asks for a factor; those of the table ask for the same one. It is the densest of all,
+
+def _densest(asked: np.ndarray) -> float:
+    """The factor of the table, of those that pixels (N,) ask for; 1 where too few agree.
+
+    Those of the table ask for the same one. It is the densest of all,
     weighted by how likely a camera is to be that wrong, because the top of a box asks alike, too.
     But nothing lies under a table: where a flat surface is seen beneath that one, it is the table,
     and what asked alike was the top of something wide.
     """
-    asked = _ratio_to_table(frame, table_height)
     least = _LEAST_SHARE * len(asked)
     asked = asked[np.abs(asked - 1) < SCALE_REACH]
     if len(asked) <= least:
@@ -82,12 +88,17 @@ _NEAREST = 0.01  # m, in front of which a camera sees nothing
 def table_roughness(frame: RGBDFrame, table_height: float) -> float:
     """Standard deviation in metres of the table's depth, from the median absolute deviation of all
     pixels near it; 0 where none is."""
-    error = _ratio_to_table(frame, table_height) - 1
+    return _roughness(_ratio_to_table(frame, table_height), frame.depth)
+
+
+def _roughness(asked: np.ndarray, depth: np.ndarray) -> float:
+    """As `table_roughness`, of the factors (N,) that pixels ask for."""
+    error = asked - 1
     near = error[np.abs(error) < 4 * _BLUR]
     if len(near) <= _LEAST_SHARE * len(error):
         return 0.0
     spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    return spread * float(np.median(frame.depth[known_depth(frame.depth)]))
+    return spread * float(np.median(depth[known_depth(depth)]))
 
 
 def _ratio_to_table(frame: RGBDFrame, table_height: float) -> np.ndarray:

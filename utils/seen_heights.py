@@ -17,7 +17,14 @@ import numpy as np
 
 from utils.depth import HOLE_REACH, at_edges, depth_of_plane, near_side, reach_in_pixels
 from utils.geometry import Workspace
-from utils.transforms import RGBDFrame, deproject, inverse_pose, known_depth, project
+from utils.transforms import (
+    RGBDFrame,
+    deproject,
+    inverse_pose,
+    known_depth,
+    project,
+    ray_component,
+)
 
 # Depth cameras lose thin parts whole, such as the mast of a toy ship. So matter in a hole that is
 # not at an edge may be this much higher than the surface beside it.
@@ -208,12 +215,15 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     of a hand that comes from a side; what has no depth counts as table."""
     known = known_depth(frame.depth)
     depth = np.where(known, frame.depth, depth_of_plane(frame, workspace.table_height))
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
     ahead = np.isfinite(depth) & (depth > 0)
-    places = deproject(np.stack([u, v], axis=-1), np.where(ahead, depth, 0), frame.K, frame.T_WC)
-    apart = np.abs(places[..., :2] - workspace.centre).max(axis=-1)
+    depth = np.where(ahead, depth, 0)
+    x, y, z = (
+        depth * ray_component(axis, depth.shape, frame.K, frame.T_WC) + frame.T_WC[axis, 3]
+        for axis in range(3)
+    )
+    apart = np.maximum(np.abs(x - workspace.centre[0]), np.abs(y - workspace.centre[1]))
     near = ahead & (apart <= workspace.size / 2 + MARGIN)
-    stands = places[..., 2] > workspace.table_height + _STANDS
+    stands = z > workspace.table_height + _STANDS
     near |= ahead & stands & (apart <= workspace.size / 2 + _HAND_REACH)
     if not near.any():
         return slice(0, depth.shape[0]), slice(0, depth.shape[1])

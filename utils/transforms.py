@@ -268,6 +268,16 @@ def deproject(pixels: ArrayLike, depth: ArrayLike, K: np.ndarray, T_WC: np.ndarr
     return transform_points(T_WC, np.stack([x, y, depth], axis=-1))
 
 
+def ray_component(axis: int, shape: tuple[int, ...], K: np.ndarray, T_WC: np.ndarray) -> np.ndarray:
+    """(H, W) by how much each pixel's ray advances along an axis of W (0, 1, 2) for each metre of
+    depth: `deproject` of all pixels of an image of this shape is the camera's place plus depth
+    times it."""
+    x = (np.arange(shape[1]) - K[0, 2]) / K[0, 0]
+    y = (np.arange(shape[0]) - K[1, 2]) / K[1, 1]
+    right, down, ahead = T_WC[axis, :3]
+    return right * x + (down * y + ahead)[:, None]
+
+
 def project(points: ArrayLike, K: np.ndarray, T_WC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (..., 2) and depths (...) of points in W (..., 3); NaN pixels behind the camera."""
     in_camera = transform_points(inverse_pose(T_WC), np.asarray(points, dtype=float))
