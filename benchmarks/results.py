@@ -4,7 +4,7 @@
     make results PARTS=scoreboard,servo           # some of them
     make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
     make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
-    make results PARTS=cornell CORNELL=path/to/cornell
+    make results PARTS=cornell,household,clutter CORNELL=path/to/cornell YCB=... CLUTTER=...
     python -m benchmarks.results --list           # the parts, their commands and how long they take
     python -m benchmarks.results --write          # only write the tables from docs/results/*.json
     python -m benchmarks.results --commit HASH    # what was measured at another commit, from runs/
@@ -28,7 +28,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -49,6 +49,14 @@ SEED = load_config(SEALED).seed
 SPLIT = load_config(SEALED).objects.split
 FIGURES = Path("docs/results")  # what the tables are written from
 RUNS = Path("runs/results")
+Folders = Mapping[str, Path]  # of what SOURCES names
+NOWHERE: Folders = {}
+# What a reader has to bring, because it is not ours to ship: the option --NAME, and what it holds.
+SOURCES = {
+    "cornell": "Cornell's photographs",
+    "ycb": "YCB's objects",
+    "clutter": "VGN's objects, in pile and packed",
+}
 # Files on which a figure depends: a commit that touches none of them changes no table.
 CODE = ("envs", "models", "utils", "configs", "checkpoints", ":(glob)*.py",
         "benchmarks/bench_*.py",
@@ -59,8 +67,9 @@ CODE = ("envs", "models", "utils", "configs", "checkpoints", ":(glob)*.py",
 class Command:
     """One program run, whose results.json makes rows of a table.
 
-    rounds: of each row, None for what has no rounds. kept: rounds of each row that stay in the
-    repository, so that a reader can check them in minutes.
+    arguments: the folders of SOURCES stand there by their names in capitals. rounds: of each row,
+    None for what has no rounds. kept: rounds of each row that stay in the repository, so that a
+    reader can check them in minutes.
     """
 
     name: str
@@ -68,20 +77,24 @@ class Command:
     arguments: str
     rounds: int | None = None
     kept: int = 10
+    split: str = SPLIT
 
     def scaled(self, scale: float) -> int | None:
         return None if self.rounds is None else max(1, round(self.rounds * scale))
 
-    def line(self, rounds: int | None, cornell: Path | None = None) -> str:
+    def line(self, rounds: int | None, folders: Folders = NOWHERE) -> str:
         """The command as a reader would type it."""
         start = self.program if self.program.endswith(".py") else f"-m benchmarks.{self.program}"
         parts = [f"python {start}"]
         if self.program.endswith(".py"):
-            parts += [f"seed={SEED}", f"objects.split={SPLIT}"]
+            parts += [f"seed={SEED}", f"objects.split={self.split}"]
         parts += [self.arguments] if self.arguments else []
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")
-        return " ".join(parts).replace("CORNELL", str(cornell or "path/to/cornell"))
+        line = " ".join(parts)
+        for name in SOURCES:
+            line = line.replace(name.upper(), str(folders.get(name, f"path/to/{name}")))
+        return line
 
 
 @dataclass(frozen=True)
@@ -92,7 +105,7 @@ class Part:
     about: str
     minutes: int
     commands: tuple[Command, ...]
-    needs_cornell: bool = False
+    needs: tuple[str, ...] = ()  # of SOURCES
 
 
 EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
@@ -102,10 +115,15 @@ NOISY_FIRST = "realsense,none"
 
 
 def _evaluation(
-    name: str, rounds: int, arguments: str, kept: int = 10, noises: str = "none"
+    name: str,
+    rounds: int,
+    arguments: str,
+    kept: int = 10,
+    noises: str = "none",
+    split: str = SPLIT,
 ) -> Command:
     ending = f"evaluate.depth_noises={noises} evaluate.videos=0"
-    return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept)
+    return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept, split)
 
 
 def _policy(objects: str, file: str) -> Command:
@@ -137,6 +155,27 @@ PARTS = (
                     f"evaluate.object_sets={name}", noises="realsense", kept=3)
         for name, scenarios in (("tall", "tall,wall,shelf"), ("flat", "wall,flat"))
     )),
+    Part("oblique", "a camera 45 degrees off the vertical", 15, (
+        _evaluation("oblique", 20, "evaluate.policies=heuristic,graspnet,graspnet6d,oracle6d "
+                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs,primitives "
+                    "'camera.position=[0.5,-0.566,0.566]' 'camera.up=[0,0,1]'",
+                    noises=NOISY_FIRST, kept=3),
+    )),
+    Part("unseen", "primitives of families that no training sees", 15, (
+        _evaluation("unseen", 30, "evaluate.policies=heuristic,graspnet,graspnet_direct,graspnet6d,"
+                    "oracle6d evaluate.scenarios=pile evaluate.object_sets=primitives",
+                    noises=NOISY_FIRST, kept=3, split="unseen_families"),
+    )),
+    Part("household", "YCB's objects, as large and as heavy as they are", 15, (
+        _evaluation("household", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=household "
+                    "evaluate.object_sets=YCB", noises=NOISY_FIRST, kept=0),
+    ), needs=("ycb",)),
+    Part("clutter", "VGN's objects, with the whole arm", 20, tuple(
+        _evaluation(layout, 20, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={layout} "
+                    f"evaluate.object_sets=CLUTTER/{layout} objects.scale={scale}",
+                    noises=NOISY_FIRST, kept=0)
+        for layout, scale in (("pile", 0.9), ("packed", 0.8))
+    ), needs=("clutter",)),
     Part("retrieve", "one object under a pile", 20, (
         _evaluation("retrieve", 25, "evaluate.policies=graspnet,oracle "
                     "evaluate.scenarios=retrieve evaluate.object_sets=random_urdfs,primitives",
@@ -190,7 +229,7 @@ PARTS = (
         Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="
                 "cornell,cornell_as_taken transfer.cornell=CORNELL"),
         Command("folds", "train_graspnet.py", "--config configs/cornell.yaml data.root=CORNELL"),
-    ), needs_cornell=True),
+    ), needs=("cornell",)),
     Part("speed", "the environment against its peers, and the planners; on a quiet machine", 8, (
         Command("environment", "bench_env", ""),
         Command("planning", "bench_planning", ""),
@@ -204,6 +243,7 @@ PARTS = (
 def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     parts = chosen_parts(options.parts)
+    folders = {name: getattr(options, name) for name in SOURCES if getattr(options, name)}
     if options.list:
         print_parts(parts, options.scale)
         return 0
@@ -215,10 +255,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         for part in parts:
             if options.commit is not None and not is_finished(part, commit, options.scale):
                 print(f"{part.name}: skipped, because {RUNS / commit} does not hold all of it")
-            elif part.needs_cornell and options.cornell is None and options.commit is None:
-                print(f"{part.name}: skipped, because no --cornell names a folder of photographs")
+            elif options.commit is None and (missing := set(part.needs) - folders.keys()):
+                for name in missing:
+                    print(f"{part.name}: skipped, because no --{name} names {SOURCES[name]}")
             else:
-                measure(part, commit, options.scale, options.cornell)
+                measure(part, commit, options.scale, folders)
                 if writes_docs(options):
                     publish(part, commit, options.scale)
                     write_tables(FIGURES)
@@ -241,7 +282,8 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="write figures of a scale below 1 to the docs, too",
     )
-    parser.add_argument("--cornell", type=Path, help="folder of Cornell's photographs")
+    for name, what in SOURCES.items():
+        parser.add_argument(f"--{name}", type=Path, help=f"folder of {what}")
     parser.add_argument("--list", action="store_true", help="print the parts and measure nothing")
     parser.add_argument("--write", action="store_true", help="only write the tables again")
     parser.add_argument("--commit", metavar="HASH", help="write what runs/ holds of that commit")
@@ -292,12 +334,12 @@ def _git(*arguments: str) -> str:
 # --- Measuring --------------------------------------------------------------------------------
 
 
-def measure(part: Part, commit: str, scale: float, cornell: Path | None) -> None:
+def measure(part: Part, commit: str, scale: float, folders: Folders = NOWHERE) -> None:
     """Run a part's commands that are not finished yet."""
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
         if not file.exists():
-            write_json_atomic(file, run_command(part, command, scale, commit, cornell))
+            write_json_atomic(file, run_command(part, command, scale, commit, folders))
 
 
 def publish(part: Part, commit: str, scale: float) -> None:
@@ -309,7 +351,9 @@ def publish(part: Part, commit: str, scale: float) -> None:
         # Files of older versions hold no date: the day on which they were written.
         figures.setdefault("date", str(date.fromtimestamp(file.stat().st_mtime)))
         if "run" in figures:
-            keep_rounds(part, command, Path(figures.pop("run")))
+            run = Path(figures.pop("run"))
+            if command.kept:
+                keep_rounds(part, command, run)
         measured[command.name] = figures
     content = {
         "part": part.name, "commit": commit, "seed": SEED, "scale": scale,
@@ -331,12 +375,12 @@ def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> s
 
 
 def run_command(
-    part: Part, command: Command, scale: float, commit: str, cornell: Path | None
+    part: Part, command: Command, scale: float, commit: str, folders: Folders
 ) -> dict[str, Any]:
     """Run a command to its end, going on where an earlier call stopped; its figures."""
     rounds, start = command.scaled(scale), time.perf_counter()
     name = run_name(part, command, rounds, commit)
-    line = command.line(rounds, cornell)
+    line = command.line(rounds, folders)
     if not command.program.endswith(".py"):
         output = RUNS / commit / f"{name}.metrics.json"
         run_program([*shlex.split(line), "--json", str(output)])
@@ -352,7 +396,7 @@ def run_command(
             run = latest_run(script, name)
         if run is None:
             raise UserError(f"results: {line} left no folder runs/{script}/*-{name}")
-        figures = figures_of(run)
+        figures = without_places(figures_of(run), folders)
     environment_of = environment()
     return {
         "command": command.line(rounds),
@@ -400,6 +444,14 @@ def figures_of(run: Path) -> dict[str, Any]:
         figures |= {"comparisons": [asdict(pair) for pair in comparisons], "run": str(run)}
         figures["calibration"] = calibration_of(rounds)
     return figures
+
+
+def without_places(figures: dict[str, Any], folders: Folders) -> dict[str, Any]:
+    """Figures in which path/to/NAME stands for the place of each source on this machine."""
+    text = json.dumps(figures)
+    for name, folder in folders.items():
+        text = text.replace(json.dumps(str(folder))[1:-1], f"path/to/{name}")
+    return json.loads(text)
 
 
 def calibration_of(rounds: Sequence[RoundRecord]) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -212,13 +213,39 @@ def test_commands_are_valid_and_take_fresh_seeds(capsys):
     sealed = load_config(results.SEALED)
     for part in PARTS:
         for command in part.commands:
-            words = command.line(command.scaled(0.001)).split()
+            words = shlex.split(command.line(command.scaled(0.001)))
             if words[1].endswith(".py"):
                 overrides = [w for w in words[2:] if "=" in w and "path/to" not in w]
                 config = load_config(None, overrides)
-                assert (config.seed, config.objects.split) == (sealed.seed, "sealed")
+                assert (config.seed, config.objects.split) == (sealed.seed, command.split)
     assert main(["--list", "--scale", "0.1"]) == 0
     assert f"seed={sealed.seed} objects.split=sealed" in capsys.readouterr().out
+
+
+def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts, capsys):
+    assert main(["--parts", "household,cornell"]) == 0
+    said = capsys.readouterr().out
+    assert "household: skipped, because no --ycb names YCB's objects" in said
+    assert "cornell: skipped, because no --cornell names Cornell's photographs" in said
+    assert not results.FIGURES.exists()
+    assert main(["--parts", "household", "--ycb", "some/ycb"]) == 0
+    (part,) = chosen_parts("clutter")
+    line = part.commands[0].line(3, {"clutter": Path("some/vgn")})
+    assert "evaluate.object_sets=some/vgn/pile objects.scale=0.9" in line
+    assert "path/to/clutter/pile" in part.commands[0].line(3)
+    content = json.loads((results.FIGURES / "household.json").read_text())
+    assert "path/to/ycb" in content["commands"]["household"]["command"]
+    told = {"rows": [row("oracle", 3, 4, "../some/ycb")], "run": "runs/evaluate/x"}
+    told = results.without_places(told, {"ycb": Path("../some/ycb")})
+    assert (told["rows"][0]["objects"], told["run"]) == ("path/to/ycb", "runs/evaluate/x")
+
+
+def test_objects_that_fit_the_hand_stand_apart(tmp_path):
+    fitting = {"graspable_successes": 60, "graspable_attempts": 64, "graspable_total": 75}
+    figures(tmp_path, "household", [noisy(row("graspnet", 80, 100) | fitting)])
+    written = with_tables("<!-- results:household -->\n<!-- /results -->", tmp_path).splitlines()
+    assert written[1].endswith("| success, graspable | cleared, graspable |")
+    assert written[3].endswith(f"| {rate(60, 64)} | {rate(60, 75)} |")
 
 
 def test_sealed_scenes_are_named_by_the_tables_alone():
@@ -234,7 +261,7 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = []
 
-    def run_command(part, command, scale, commit, cornell):
+    def run_command(part, command, scale, commit, folders):
         lines.append(command.line(command.scaled(scale)))
         if command.name == "primitives" and len(lines) == 3:
             raise KeyboardInterrupt
@@ -243,8 +270,8 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(results, "run_command", run_command)
     (part,) = chosen_parts("ppo")
     with pytest.raises(KeyboardInterrupt):
-        results.measure(part, "c0ffee", 0.1, None)
-    results.measure(part, "c0ffee", 0.1, None)
+        results.measure(part, "c0ffee", 0.1)
+    results.measure(part, "c0ffee", 0.1)
     assert len(lines) == 4 and lines[2] == lines[3]
     assert not results.FIGURES.exists(), "measuring alone writes no docs"
     results.publish(part, "c0ffee", 0.1)
@@ -262,7 +289,7 @@ def two_parts(tmp_path, monkeypatch):
     blocks = [f"<!-- results:{name} -->\n<!-- /results -->\n" for name in ("clutter15", "mujoco")]
     (tmp_path / "docs" / "results.md").write_text("".join(blocks))
 
-    def run_command(part, command, scale, commit, cornell):
+    def run_command(part, command, scale, commit, folders):
         rounds = command.scaled(scale)
         figures = {"command": command.line(rounds), "rounds": rounds, "date": "2026-01-02"}
         return figures | {"rows": [row("heuristic", 3, 4, rounds=rounds)]}

@@ -236,7 +236,7 @@ def tilted_height_map(
 
     filled, hiding: the frame `without_holes`. Objects are those of the map from above: a surface
     belongs to the object over its place on the table, unless a fixture that hangs over the table
-    is there. complete: as in `height_map_from_frame`.
+    is there.
     """
     shape, origin, cell = overhead.height.shape, overhead.origin, overhead.cell
     seen = seen_heights(filled, hiding, T_WV, shape, origin, cell, overhead.table_height)
