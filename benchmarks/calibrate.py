@@ -116,13 +116,19 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
     rough: list[float] = []
     for record in rounds:
         executed = [one for one in record.attempts if one.executed and one.grasp is not None]
+        roughness = [one.roughness for one in executed if one.roughness is not None]
+        if len(roughness) < len(executed):
+            raise UserError(
+                f"{record.policy}, scene {record.seed}: an older run, which does not tell how "
+                "rough its frames were; play it again"
+            )
         qualities = [attempt.grasp.quality for attempt in executed]
         stated += qualities
         successes += [attempt.success for attempt in executed]
-        rough += [attempt.roughness for attempt in executed]
+        rough += roughness
         if record.calibration is not None:
             chances = Calibration(*record.calibration)
-            qualities = chances.scores(qualities, [one.roughness for one in executed]).tolist()
+            qualities = chances.scores(qualities, roughness).tolist()
         scores += qualities
     return ExecutedGrasps(
         np.array(scores), np.array(stated), np.array(successes, dtype=bool), np.array(rough)

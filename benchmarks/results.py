@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -91,10 +92,8 @@ class Command:
         parts += [self.arguments] if self.arguments else []
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")
-        line = " ".join(parts)
-        for name in SOURCES:
-            line = line.replace(name.upper(), str(folders.get(name, f"path/to/{name}")))
-        return line
+        places = {name.upper(): str(folders.get(name, f"path/to/{name}")) for name in SOURCES}
+        return re.sub("|".join(places), lambda found: places[found[0]], " ".join(parts))
 
 
 @dataclass(frozen=True)
@@ -447,11 +446,17 @@ def figures_of(run: Path) -> dict[str, Any]:
 
 
 def without_places(figures: dict[str, Any], folders: Folders) -> dict[str, Any]:
-    """Figures in which path/to/NAME stands for the place of each source on this machine."""
-    text = json.dumps(figures)
-    for name, folder in folders.items():
-        text = text.replace(json.dumps(str(folder))[1:-1], f"path/to/{name}")
-    return json.loads(text)
+    """Figures whose object sets are path/to/NAME instead of places on this machine."""
+
+    def told(objects: str) -> str:
+        for name, folder in folders.items():
+            if Path(objects).is_relative_to(folder):
+                return str(Path("path/to") / name / Path(objects).relative_to(folder))
+        return objects
+
+    for one in (*figures.get("rows", ()), *figures.get("comparisons", ())):
+        one["objects"] = " + ".join(map(told, one["objects"].split(" + ")))
+    return figures
 
 
 def calibration_of(rounds: Sequence[RoundRecord]) -> list[dict[str, Any]]:

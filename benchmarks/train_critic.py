@@ -5,15 +5,16 @@ graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_cri
 them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
 folder of `--examples`, where a run that was stopped finds them again. Every tenth scene is held
 out; on these it prints how often the candidate that is ranked first succeeds, of those that were
-executed, by the search alone, by the critic that it began with, and by the new one, and how far the
-stated chances are from frequencies. Written to checkpoints/critic.pt, the critic is what graspnet6d
-and graspnet_direct rank by from then on; their chances of success are then fitted again
-(`benchmarks.calibrate`).
+drawn at random, by the search alone, by the critic that it began with, and by the new one, and how
+far the stated chances of all are from frequencies. Written to checkpoints/critic.pt, the critic is
+what graspnet6d and graspnet_direct rank by from then on; their chances of success are then fitted
+again (`benchmarks.calibrate`).
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 from collections.abc import Sequence
 from functools import partial
@@ -25,7 +26,7 @@ from torch.nn import functional
 from tqdm import tqdm
 
 from envs.critic_examples import PLANNERS, Examples, examples_of, planner_of
-from models.grasp_critic import INPUTS, KIND, GraspCritic, load_critic
+from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
@@ -80,12 +81,7 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
     """The candidates of so many scenes, in the scenes' order; the folder keeps those of SHARD
     scenes each in a file, and what it has already is not played again. Raises UserError where it
     holds scenes of another seed or a damaged file."""
-    settings = {"seed": config.seed, "object_sets": list(config.data.object_sets)}
-    note = folder / "settings.json"
-    if not note.exists():
-        write_json_atomic(note, settings)
-    elif json.loads(note.read_text(encoding="utf-8")) != settings:
-        raise UserError(f"--examples {folder}: holds other seeds or sets; give another folder")
+    check_same_settings(folder, config)
     parts = []
     with (
         open_executor(config.compute, config.data.workers) as workers,
@@ -104,6 +100,28 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
                 Examples.joined(sorted(found, key=lambda one: one.scene[:1].tolist())).save(path)
             parts.append(Examples.load(path))
     return Examples.joined(parts)
+
+
+def check_same_settings(folder: Path, config: Config) -> None:
+    """Note in a folder what the examples depend on besides their numbers. Raises UserError where it
+    holds examples of something else."""
+    sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera")
+    settings = {name: getattr(config, name).model_dump(mode="json") for name in sections}
+    settings |= {"seed": config.seed, "object_sets": list(config.data.object_sets)}
+    settings["critic"] = hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
+    note = folder / "settings.json"
+    if not note.exists():
+        write_json_atomic(note, settings)
+        return
+    try:
+        known = json.loads(note.read_text(encoding="utf-8"))
+        other = [name for name, value in settings.items() if known.get(name) != value]
+    except (OSError, ValueError, AttributeError) as error:
+        raise UserError(f"{note}: cannot be read ({error}); give another --examples") from error
+    if other:
+        raise UserError(
+            f"--examples {folder}: holds grasps of another {', '.join(other)}; give another folder"
+        )
 
 
 def fit(
@@ -150,14 +168,14 @@ def mirrored(
 
 
 def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
-    """For each planner, how many of its plans' first candidates succeed, ranked by the search alone
-    and by the critic, and the half width of that share's 95 % interval; then the calibration error
-    of the critic's chances."""
+    """For each planner, how many of its plans' first candidates succeed, of those that were drawn,
+    ranked by the search alone and by the critic, and the half width of that share's 95 % interval;
+    then the calibration error of the critic's chances of all."""
     chance = critic.chance(examples.inputs)
     preference = JUDGED_FAN.preference(examples.inputs.facts[:, INPUTS.index("tilt")])
     scores = {}
     for number, name in enumerate(PLANNERS):
-        own = planner_of(examples.plan) == number
+        own = (planner_of(examples.plan) == number) & examples.drawn
         for kind, score in (
             ("search", examples.score * preference),
             ("critic", chance * preference),

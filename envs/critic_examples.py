@@ -3,14 +3,15 @@
 Scenes of training objects, some of them larger than usual, are seen by a camera from above or from
 a side, with one of the depth noises. A floating hand executes some of the candidates
 (`envs.floating_execution`): half of them the ones that the shipped critic likes best, so that the
-next one learns what this one overrates, the others at random. The examples of a scene are a pure
-function of the config, its number and the shipped critic.
+next one learns what this one overrates, the others drawn at random. The examples of a scene are a
+pure function of the config, its number and the shipped critic.
 """
 
 from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -50,25 +51,27 @@ _LAYOUTS = {
     "isolated": 0.05, "packed": 0.15, "pile": 0.22, "bin": 0.10, "household": 0.18, "tall": 0.07,
     "wall": 0.09, "shelf": 0.05, "flat": 0.09,
 }  # fmt: skip
-# Scale of larger objects, which stand for household things that the hand hardly spans, and the
-# share of the scenes that hold them.
+# Scale of larger objects, which stand for household things that the hand hardly spans, and their
+# share among the scenes of these sets.
 _LARGE, _LARGE_SHARE = {"random_urdfs": 1.0, "primitives": 1.3}, 0.35
 _OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",)}
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zlib.error)
 _FIRST_SEED = 3_000_000_000  # no evaluation and no other training uses these seeds
 
 
 class Examples(NamedTuple):
     """N executed candidates: what the critic sees of them, which succeeded (N,) bool, the scores
     (N,) by which the search ranked them, the numbers (N,) of their scenes and of their plans, each
-    of one planner for one frame."""
+    of one planner for one frame, and which were drawn (N,) bool, not chosen by a critic."""
 
     inputs: CriticInputs
     success: np.ndarray
     score: np.ndarray
     scene: np.ndarray
     plan: np.ndarray
+    drawn: np.ndarray
 
     def where(self, mask: np.ndarray) -> Examples:
         return Examples(self.inputs.take(mask), *(column[mask] for column in self[1:]))
@@ -93,14 +96,16 @@ class Examples(NamedTuple):
             with np.load(path, allow_pickle=False) as file:
                 inputs = CriticInputs(file["facts"], file["patches"])
                 return Examples(inputs, *(file[name] for name in Examples._fields[1:]))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (*_UNREADABLE, zipfile.BadZipFile) as error:
             raise UserError(
                 f"{path}: holds no executed grasps ({error}); remove it, and its scenes are played "
                 "again"
             ) from error
 
 
-_NONE = Examples(nothing(), np.empty(0, bool), np.empty(0), *np.empty((2, 0), int))
+_NONE = Examples(
+    nothing(), np.empty(0, bool), np.empty(0), *np.empty((2, 0), int), np.empty(0, bool)
+)
 
 
 def planner_of(plan: np.ndarray) -> np.ndarray:
@@ -123,21 +128,24 @@ def examples_of(config: Config, number: int) -> Examples:
         frame = draw_frame(config, cell, rng)
         for which, (planner, most) in enumerate(zip(planners, PLANNERS.values())):
             inputs, scores, grasps = judged_by(planner, frame)
-            tried = _worth_trying(inputs, most, rng)
+            tried, drawn = worth_trying(inputs, most, rng)
             success = np.array([execute(cell, part, grasps[i]) for i in tried], bool)
             plan = (number * FRAMES_PER_SCENE + frame_number) * len(PLANNERS) + which
             numbers = np.full(len(tried), number), np.full(len(tried), plan)
-            found.append(Examples(inputs.take(tried), success, scores[tried], *numbers))
+            found.append(Examples(inputs.take(tried), success, scores[tried], *numbers, drawn))
     return Examples.joined(found)
 
 
-def _worth_trying(inputs: CriticInputs, most: int, rng: np.random.Generator) -> np.ndarray:
-    """Up to `most` indices of candidates: half of them are those that the shipped critic ranks
-    first, the others are drawn."""
+def worth_trying(
+    inputs: CriticInputs, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `most` indices (M,) of candidates, and which of them were drawn (M,) bool: the others,
+    half of them, are those that the shipped critic ranks first."""
     tilt = inputs.facts[:, INPUTS.index("tilt")]
     rank = np.argsort(-shipped_critic().chance(inputs) * JUDGED_FAN.preference(tilt))
     best = rank[: most // 2]
-    return np.concatenate([best, rng.permutation(rank[most // 2 :])[: most - len(best)]])
+    drawn = rng.permutation(rank[most // 2 :])[: most - len(best)]
+    return np.concatenate([best, drawn]), np.arange(len(best) + len(drawn)) >= len(best)
 
 
 def judged_by(planner: Judged, frame: RGBDFrame) -> tuple[CriticInputs, np.ndarray, list[Grasp]]:

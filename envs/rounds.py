@@ -33,7 +33,7 @@ from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
-from utils.depth_correction import corrected
+from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
 from utils.result_records import (
@@ -120,10 +120,7 @@ def run_round(
     failed: list[Grasp] = []  # in a row
     missed: list[Grasp] = []  # in the round
     stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
-    plan_seconds, ended = 0.0, "cleared"
-
-    def roughness_of(frame: RGBDFrame) -> float:
-        return corrected(replace(frame, second=None), Workspace().table_height).roughness
+    plan_seconds, ended, table_height = 0.0, "cleared", Workspace().table_height
 
     def see() -> RGBDFrame:
         mount = cell.config.camera.mount
@@ -188,7 +185,7 @@ def run_round(
                     slid=None if outcome.motion is None else outcome.motion.slid,
                     graspable=(aim if held is None else held) not in too_large,
                     tilt=grasp.tilt,
-                    roughness=0.0 if privileged else roughness_of(frame),
+                    roughness=0.0 if privileged else table_roughness(frame, table_height),
                     **_turn_ms(approach),
                 )
             )

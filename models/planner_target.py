@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from models.planners import Planner, calibration_of, needs_truth, reset_planner, takes_targets
 from utils.calibration import Calibration
+from utils.depth_correction import table_roughness
 from utils.errors import UserError
 from utils.target import MOSTLY
 from utils.transforms import Grasp, RGBDFrame
@@ -87,11 +88,15 @@ class TargetPlanner:
         return _Objects(frame, segments, self.settings, self._promising(frame))
 
     def _promising(self, frame: RGBDFrame) -> float:
-        """Least quality of a promising grasp. Chances of a planner that nearly always succeeds may
-        all lie above the least one: they tell no grasp from another, but its scores do."""
+        """Least quality of a promising grasp: that of the score which has the least chance of
+        `ClearingSettings` in a frame that is not rough, because roughness lowers all chances.
+        Chances of a planner that nearly always succeeds may all lie above the least one: they tell
+        no grasp from another, but its scores do."""
         chances, least = self.calibration, self.settings.promising
         if chances is not None and chances(0.0) < least:
-            return least
+            table = self.plan.workspace.table_height  # type: ignore[attr-defined] - calibrated: ours
+            rough = 0.0 if self.needs_truth else table_roughness(frame, table)
+            return float(chances(chances.scores(least), max(rough, frame.roughness)))
         best = self.plan(replace(frame, target=None))[:1]
         if not best:
             return 0.0

@@ -28,7 +28,7 @@ from models.planner_graspnet import (
     GraspNetPlanner,
 )
 from utils.calibration import Calibration, load_calibrations
-from utils.depth_correction import corrected
+from utils.depth_correction import corrected, table_roughness
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, height_map_from_scene
@@ -110,7 +110,7 @@ class RandomPlanner:
             height = max(top - 0.02, lowest)  # the fingers reach 2 cm below the surface
             angle = self._random.uniform(0, np.pi)
             grasps.append(Grasp(np.array([x, y, height]), angle, self.gripper.max_opening, quality))
-        rough = corrected(frame, table).roughness
+        rough = max(frame.roughness, table_roughness(frame, table))
         return with_chances(grasps, self.calibration, rough)
 
 

@@ -13,7 +13,14 @@ from benchmarks.train_critic import TILTS, collect, first_of_plans, fit, judged,
 from benchmarks.train_critic import main as train
 from envs import critic_examples
 from envs.cell_scenes import make_scene
-from envs.critic_examples import PLANNERS, Examples, at_rest, examples_of, execute
+from envs.critic_examples import (
+    PLANNERS,
+    Examples,
+    at_rest,
+    examples_of,
+    execute,
+    worth_trying,
+)
 from envs.objects import load_object_set
 from envs.simulators import make_cell
 from models.grasp_critic import (
@@ -26,7 +33,12 @@ from models.grasp_critic import (
 )
 from models.planner_antipodal import measure
 from models.planner_candidates import FACTS, Candidates, SearchSettings
-from models.planner_graspnet import GraspNetDirectPlanner, GraspNetFanPlanner, GraspNetPlanner
+from models.planner_graspnet import (
+    JUDGED_FAN,
+    GraspNetDirectPlanner,
+    GraspNetFanPlanner,
+    GraspNetPlanner,
+)
 from tests.helpers.box_frames import boxes_frame
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
@@ -153,7 +165,10 @@ def made_up(scenes: int, seed: int, by_patch: bool = False) -> Examples:
     merit = high if by_patch else facts[:, INPUTS.index("cover")]
     number = np.repeat(np.arange(scenes), 12)
     plan = len(PLANNERS) * number + np.tile(np.arange(12) % len(PLANNERS), scenes)
-    return Examples(CriticInputs(facts, patches), merit > 0.5, (1 - merit) ** 4, number, plan)
+    drawn = np.ones(count, bool)
+    return Examples(
+        CriticInputs(facts, patches), merit > 0.5, (1 - merit) ** 4, number, plan, drawn
+    )
 
 
 @pytest.mark.parametrize("by_patch", [False, True])
@@ -252,6 +267,29 @@ def test_the_ranking_of_a_fan_follows_the_critic() -> None:
     assert first[1] > np.deg2rad(25)
 
 
+def test_who_ranks_by_the_shipped_critic_and_who_by_one_that_is_given() -> None:
+    frame = boxes_frame([((0.05, 0.06, 0.05), 0.0, (0.5, 0.0))])
+
+    class Fixed(GraspCritic):
+        def chance(self, inputs: CriticInputs) -> np.ndarray:
+            return np.full(len(inputs.facts), 0.123)
+
+    parts = GripperGeometry(), Workspace()
+    assert GraspNetPlanner(*parts).judge is None
+    for kind in (GraspNetPlanner, GraspNetDirectPlanner, GraspNetFanPlanner):
+        preferred = [grasp for grasp in kind(*parts, critic=Fixed())(frame) if grasp.tilt < 1e-6]
+        assert {round(grasp.quality, 6) for grasp in preferred} == {0.123}
+    for kind in (GraspNetDirectPlanner, GraspNetFanPlanner):
+        planner = kind(*parts)
+        inputs, _, _ = critic_examples.judged_by(kind(*parts), frame)
+        stated = np.concatenate([shipped_critic().chance(inputs), [0.0]])
+        for grasp in planner(frame)[:3]:
+            factor = (
+                JUDGED_FAN.preference(np.array(grasp.tilt)) if kind is GraspNetFanPlanner else 1
+            )
+            assert np.abs(stated * factor - grasp.quality).min() < 1e-6
+
+
 @pytest.mark.parametrize("kind", [GraspNetPlanner, GraspNetDirectPlanner])
 def test_the_ranking_of_a_planar_planner_follows_the_critic(kind) -> None:
     """One critic likes wide things, the other one narrow things."""
@@ -304,15 +342,25 @@ def test_half_of_what_is_tried_is_what_the_critic_likes_best(monkeypatch) -> Non
     facts = np.zeros((30, len(INPUTS)), np.float32)  # all from straight above
     facts[:, INPUTS.index("cover")] = cover = np.random.default_rng(0).permutation(30) / 30
     inputs = CriticInputs(facts, np.zeros((30, 3, 24, 48), np.int8))
-    tried = critic_examples._worth_trying(inputs, 9, np.random.default_rng(1))
+    tried, drawn = worth_trying(inputs, 9, np.random.default_rng(1))
     assert len(tried) == len(set(tried)) == 9
-    assert set(np.argsort(-cover)[:4]) <= set(tried)
-    others = critic_examples._worth_trying(inputs, 9, np.random.default_rng(2))
+    assert set(tried[~drawn]) == set(np.argsort(-cover)[:4])
+    others, _ = worth_trying(inputs, 9, np.random.default_rng(2))
     assert set(tried) != set(others)
-    assert (
-        len(critic_examples._worth_trying(inputs.take(np.arange(3)), 9, np.random.default_rng(1)))
-        == 3
+    assert len(worth_trying(inputs.take(np.arange(3)), 9, np.random.default_rng(1))[0]) == 3
+
+
+def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn() -> None:
+    """Of each plan, the candidate of highest cover was chosen by a critic: it does not count."""
+    examples, critic = made_up(60, 1), fit(made_up(300, 0), seed=0, epochs=15)
+    chosen = first_of_plans(
+        examples._replace(success=np.arange(720)), column(examples.inputs, "cover")
     )
+    examples.drawn[chosen] = False
+    examples.success[:] = False
+    examples.success[chosen] = True
+    assert judged(critic, examples)["graspnet6d by critic"] == 0
+    assert judged(critic, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
 
 
 def test_some_scenes_hold_larger_objects() -> None:
@@ -321,6 +369,28 @@ def test_some_scenes_hold_larger_objects() -> None:
     usual, large = sets["random_urdfs"][0].extents, sets["random_urdfs, large"][0].extents
     np.testing.assert_allclose(np.divide(large, usual), 1 / 0.65, rtol=0.01)  # as their files say
     assert "thin, large" not in sets
+
+
+def test_a_third_of_the_scenes_of_a_set_hold_its_larger_objects(monkeypatch) -> None:
+    """Of those sets that have larger ones, and of no others."""
+    drawn = []
+
+    def scene(layout: str, objects: str, seed: int, config) -> str:
+        drawn.append((layout, objects))
+        return objects
+
+    monkeypatch.setattr(critic_examples, "make_scene", scene)
+    config, rng = load_config(None, []), np.random.default_rng(0)
+    sets = {name: name for name in critic_examples._sets_of(config)}
+    for _ in range(2000):
+        critic_examples.draw_scene(config, sets, rng)  # type: ignore[arg-type]
+    names = [name for _, name in drawn]
+    for kind in ("random_urdfs", "primitives"):
+        large, usual = names.count(f"{kind}, large"), names.count(kind)
+        assert large / (large + usual) == pytest.approx(0.35, abs=0.05)
+    layouts = [layout for layout, _ in drawn]
+    assert layouts.count("household") / 2000 == pytest.approx(0.18, abs=0.03)
+    assert {name for layout, name in drawn if layout == "shelf"} == {"tall"}
 
 
 def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
@@ -344,10 +414,13 @@ def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
     assert played == list(range(100, 120))
     for one, other in zip((*whole.inputs, *whole[1:]), (*again.inputs, *again[1:])):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(UserError, match="holds other seeds or sets; give another folder"):
+    with pytest.raises(UserError, match="holds grasps of another seed; give another folder"):
         collect(load_config(None, ["seed=1"]), 120, tmp_path)
     (tmp_path / "scenes-00000-00049.npz").write_bytes(b"no archive")
     with pytest.raises(UserError, match=r"scenes-00000-00049\.npz: holds no executed grasps"):
+        collect(config, 120, tmp_path)
+    (tmp_path / "settings.json").write_text("{")
+    with pytest.raises(UserError, match=r"settings\.json: cannot be read"):
         collect(config, 120, tmp_path)
 
 

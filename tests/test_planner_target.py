@@ -58,6 +58,21 @@ def test_neighbours_in_the_way_come_first_and_the_target_when_they_are_gone(name
     assert is_of(plan(frame_of([FLAT, FAR]))[0], FLAT)
 
 
+def test_a_rough_frame_moves_nothing_aside_that_a_smooth_one_leaves() -> None:
+    """Its roughness lowers every chance under 0.9: no grasp gets more promising than another."""
+    calibration = Calibration(2.0, 3.0, 2000.0)
+    plan = HeuristicPlanner(GripperGeometry(), Workspace())
+    beside = ((0.04, 0.06, 0.05), 0.0, (0.5, 0.085))
+    frame, rng = frame_of([FLAT, beside]), np.random.default_rng(0)
+    noise = rng.normal(0, 0.0015, frame.depth.shape).astype(np.float32)
+    rough = replace(frame, depth=frame.depth + noise)
+    assert calibration(1.0) > 0.9 > calibration(2.0, 0.0015)
+    plan.calibration = calibration
+    for seen in (frame, rough):
+        assert is_of(TargetPlanner(plan)(seen)[0], FLAT)
+        assert TargetPlanner(plan).clearing(seen, plan(seen)) == []
+
+
 def test_scores_that_are_no_chances_are_compared_with_each_other_alone() -> None:
     """The same planner without its calibration, and all of its scores divided by a thousand: what
     goes first is the same, of a free target and of one that is walled in."""

@@ -235,9 +235,16 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
     assert "path/to/clutter/pile" in part.commands[0].line(3)
     content = json.loads((results.FIGURES / "household.json").read_text())
     assert "path/to/ycb" in content["commands"]["household"]["command"]
-    told = {"rows": [row("oracle", 3, 4, "../some/ycb")], "run": "runs/evaluate/x"}
-    told = results.without_places(told, {"ycb": Path("../some/ycb")})
-    assert (told["rows"][0]["objects"], told["run"]) == ("path/to/ycb", "runs/evaluate/x")
+    rows = [row("oracle", 3, 4, name) for name in ("../some/vgn/pile", "ycb", "a/ycb + b")]
+    here = {"clutter": Path("../some/vgn/"), "ycb": Path("a/ycb")}
+    told = results.without_places({"rows": rows, "run": "runs/ycb"}, here)
+    assert [one["objects"] for one in told["rows"]] == [
+        "path/to/clutter/pile", "ycb", "path/to/ycb + b",
+    ]  # fmt: skip
+    assert told["run"] == "runs/ycb"
+    (cornell,) = chosen_parts("cornell")
+    line = cornell.commands[0].line(None, {"cornell": Path("YCB/cornell")})
+    assert line.endswith("transfer.columns=cornell,cornell_as_taken transfer.cornell=YCB/cornell")
 
 
 def test_objects_that_fit_the_hand_stand_apart(tmp_path):

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 LEAST_SCORE = 1e-6  # scores below it count as it
 LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
+# Standard deviation of slopes that are expected: so few grasps do not make a step of the line.
+SLOPE_SPREAD = 10.0
+_NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 BINS = 10  # of equal width in [0, 1]
 
 
@@ -49,12 +52,12 @@ class Calibration:
 
     def scores(self, chances: ArrayLike, roughness: ArrayLike = 0.0) -> np.ndarray:
         """(...) scores that have these chances (...) in frames of this roughness (...), m."""
-        line = logit(np.clip(chances, 1e-12, 1 - 1e-12)) - self.offset
+        line = logit(np.clip(chances, _NEVER, _ALWAYS)) - self.offset
         return np.exp((line + self.penalty * np.asarray(roughness, float)) / self.slope)
 
     def of_share(self, chance: float, share: float) -> float:
         """The chance of a score that is this share of the one with that chance, in one frame."""
-        return float(expit(logit(np.clip(chance, 1e-12, 1 - 1e-12)) + self.slope * np.log(share)))
+        return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) + self.slope * np.log(share)))
 
     @staticmethod
     def fit(scores: ArrayLike, successes: ArrayLike, roughness: ArrayLike = 0.0) -> Calibration:
@@ -62,7 +65,8 @@ class Calibration:
         roughness (N,) of their frames, m.
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
-        where there are few grasps.
+        where there are few grasps, and a Gaussian prior of standard deviation SLOPE_SPREAD on the
+        slope.
         """
         x = np.log(np.maximum(scores, LEAST_SCORE))
         won = np.asarray(successes, dtype=bool)
@@ -71,7 +75,8 @@ class Calibration:
 
         def loss(line: np.ndarray) -> float:
             z = line[0] * x + line[1] - line[2] * rough
-            return -float(np.mean(target * log_expit(z) + (1 - target) * log_expit(-z)))
+            likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
+            return float((line[0] / SLOPE_SPREAD) ** 2 / 2 - likelihood) / len(x)
 
         bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None))
         slope, offset, penalty = minimize(loss, (1.0, 0.0, 0.0), method="L-BFGS-B", bounds=bounds).x

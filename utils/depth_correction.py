@@ -30,12 +30,9 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     rough the table was. So is its second frame."""
     if frame.second is not None:
         frame = replace(frame, second=corrected(frame.second, table_height))
-    asked = _ratio_to_table(frame, table_height)
-    scale = _densest(asked)
-    if abs(scale - 1) > TRUSTED_SCALE:
+    scale, roughness = _scale_and_roughness(frame, table_height)
+    if scale != 1:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))
-        asked = asked / scale
-    roughness = _roughness(asked, frame.depth)
     if roughness > TRUSTED_ROUGHNESS:
         frame = replace(frame, depth=smoothed_by_colour(frame))
     # A frame that was corrected before is less rough now, but no more certain.
@@ -86,19 +83,25 @@ _NEAREST = 0.01  # m, in front of which a camera sees nothing
 
 
 def table_roughness(frame: RGBDFrame, table_height: float) -> float:
-    """Standard deviation in metres of the table's depth, from the median absolute deviation of all
-    pixels near it; 0 where none is."""
-    return _roughness(_ratio_to_table(frame, table_height), frame.depth)
+    """Standard deviation in metres of the table's depth, once the frame is scaled to the table,
+    from the median absolute deviation of all pixels near it; 0 where no table is seen. Depth in
+    steps, as a Kinect's, has none: half of the table lies on one step."""
+    return _scale_and_roughness(frame, table_height)[1]
 
 
-def _roughness(asked: np.ndarray, depth: np.ndarray) -> float:
-    """As `table_roughness`, of the factors (N,) that pixels ask for."""
-    error = asked - 1
+def _scale_and_roughness(frame: RGBDFrame, table_height: float) -> tuple[float, float]:
+    """The factor by which a frame's depth is corrected, 1 where it is trusted as it is, and the
+    roughness in metres of the table then."""
+    asked = _ratio_to_table(frame, table_height)
+    scale = _densest(asked)
+    if abs(scale - 1) <= TRUSTED_SCALE:
+        scale = 1.0
+    error = asked / scale - 1
     near = error[np.abs(error) < 4 * _BLUR]
     if len(near) <= _LEAST_SHARE * len(error):
-        return 0.0
+        return scale, 0.0
     spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    return spread * float(np.median(depth[known_depth(depth)]))
+    return scale, spread * scale * float(np.median(frame.depth[known_depth(frame.depth)]))
 
 
 def _ratio_to_table(frame: RGBDFrame, table_height: float) -> np.ndarray:

@@ -84,7 +84,8 @@ class AttemptRecord:
     turned, slid: rad and m by which it moved there; None without it.
     graspable: whether the object that was held, or at which the grasp aimed, fits the gripper.
     tilt: rad of the executed grasp's approach from straight above.
-    roughness: m, of the table in the frame that the planner saw; 0 where it saw the truth.
+    roughness: m, of the table in the frame that the planner saw; 0 where it saw the truth, None
+        without a grasp and in older files.
     """
 
     success: bool
@@ -100,7 +101,7 @@ class AttemptRecord:
     slid: float | None = None
     graspable: bool = True
     tilt: float = 0.0
-    roughness: float = 0.0
+    roughness: float | None = None
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -239,7 +240,9 @@ def _round(content: dict[str, Any]) -> RoundRecord:
     _check_types(content, _ROUND_TYPES)
     for attempt in attempts:
         _check_types(attempt, _ATTEMPT_TYPES)
-        grasp = attempt["grasp"]
+        roughness, grasp = attempt.get("roughness"), attempt["grasp"]
+        if roughness is not None and not _is_number(roughness):
+            raise ValueError(f"roughness is {roughness!r:.40}")
         if grasp is not None:
             numbers = [*grasp["pixel"], *(grasp[name] for name in _GRASP_NUMBERS)]
             if len(numbers) != 2 + len(_GRASP_NUMBERS) or not all(map(_is_number, numbers)):
@@ -261,10 +264,8 @@ _ROUND_TYPES = {
 }  # fmt: skip
 _ATTEMPT_TYPES = {
     "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
-    "roughness": float,
 }  # fmt: skip
-# missing in older files
-_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True, "roughness": 0.0}
+_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True}  # missing in older files
 _GRASP_NUMBERS = ("angle", "depth", "width", "quality")
 
 
