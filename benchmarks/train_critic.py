@@ -37,7 +37,7 @@ from utils.runs import check_writable, git_state, parse_args, run_script, write_
 
 HELD_OUT = 10  # every tenth scene
 SHARD = 50  # scenes of a file
-EPOCHS, BATCH, RATE, DECAY = 4, 256, 2e-3, 1e-2
+EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
 
