@@ -221,19 +221,6 @@ def variants(say: Say, part: Figures) -> str:
     return "\n\n".join([scoreboard(say, part), beside])
 
 
-def household(say: Say, part: Figures) -> str:
-    """All objects, and those apart that fit the hand."""
-    rows = rows_of(part)
-    lines = [
-        [f"`{row['policy']}`", success(row), cleared(row),
-         rate(row["graspable_successes"], row["graspable_attempts"]),
-         rate(row["graspable_successes"], row["graspable_total"])]
-        for row in rows
-    ]  # fmt: skip
-    header = ["planner", "success", "cleared", "success, graspable", "cleared, graspable"]
-    return "\n\n".join([with_depths(header, lines, noises_of(rows), 1), origin(say, part)])
-
-
 def retrieve(say: Say, part: Figures) -> str:
     rows = rows_of(part)
     lines = [
@@ -428,7 +415,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "scenes": (("scenes",), variants),
     "oblique": (("oblique",), variants),
     "unseen": (("unseen",), variants),
-    "household": (("household",), household),
+    "household": (("household",), variants),
     "clutter": (("clutter",), variants),
     "retrieve": (("retrieve",), retrieve),
     "vgn": (("vgn",), variants),

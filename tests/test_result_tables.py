@@ -247,14 +247,6 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
     assert line.endswith("transfer.columns=cornell,cornell_as_taken transfer.cornell=YCB/cornell")
 
 
-def test_objects_that_fit_the_hand_stand_apart(tmp_path):
-    fitting = {"graspable_successes": 60, "graspable_attempts": 64, "graspable_total": 75}
-    figures(tmp_path, "household", [noisy(row("graspnet", 80, 100) | fitting)])
-    written = with_tables("<!-- results:household -->\n<!-- /results -->", tmp_path).splitlines()
-    assert written[1].endswith("| success, graspable | cleared, graspable |")
-    assert written[3].endswith(f"| {rate(60, 64)} | {rate(60, 75)} |")
-
-
 def test_sealed_scenes_are_named_by_the_tables_alone():
     """In code, configs and tests, neither the seed nor the objects appear anywhere else."""
     seed, named = str(load_config(results.SEALED).seed), []
