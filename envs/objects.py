@@ -7,6 +7,7 @@ no file format.
 
 from __future__ import annotations
 
+import copy
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -222,7 +223,8 @@ def _no_objects(path: str, found: object, where: str) -> ObjectError:
 def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> None:
     """Make every object of a set, in parallel, so that the cache holds it. One remark names those
     that do not fit the gripper."""
-    make, indices = partial(_make, objects, gripper), range(len(objects))
+    # A set of their own for the workers: a thread pickles it while this one keeps what they made.
+    make, indices = partial(_make, copy.deepcopy(objects), gripper), range(len(objects))
     made: Iterable[tuple[int, ObjectModel, bool, dict[str, str]]]
     if min(workers.size(), len(objects)) > 1:
         made = completed(workers, make, indices)

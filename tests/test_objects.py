@@ -1,8 +1,10 @@
 """Object sets: what they hold, folders, plug-ins, clear errors, and repeatability."""
 
 import importlib
+import pickle
 import sys
 import warnings
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +110,33 @@ def test_a_set_is_a_sequence_that_makes_each_object_once(tmp_path):
     assert objects[-1] is objects[99]
     with pytest.raises(IndexError):
         objects[100]
+
+
+def test_what_workers_get_does_not_change_while_objects_are_kept(tmp_path):
+    """A thread pickles it at any time: a dictionary that grows meanwhile ends the run."""
+    (tmp_path / "things").mkdir()
+    for k in range(5):
+        box = trimesh.creation.box((0.02 + 0.005 * k, 0.04, 0.03))
+        box.export(tmp_path / "things" / f"box{k}.stl")
+    objects = load_object_set(str(tmp_path / "things"), cache_dir=tmp_path / "cache")
+    sent = []
+
+    class Two:
+        def size(self) -> int:
+            return 2
+
+        def waits(self) -> bool:
+            return False
+
+        def submit(self, function, item) -> Future:
+            sent.append(pickle.dumps(function))
+            done = Future()
+            done.set_result(pickle.loads(sent[-1])(item))
+            return done
+
+    prepare(objects, Two(), GripperGeometry())
+    assert len(sent) == 5 and len(set(sent)) == 1
+    assert objects[4].name == "box4"
 
 
 def test_prepare_in_parallel_makes_the_same_objects(tmp_path):
