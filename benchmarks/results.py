@@ -171,8 +171,8 @@ PARTS = (
     ), needs=("ycb",)),
     Part("clutter", "VGN's objects, with the whole arm", 20, tuple(
         _evaluation(layout, 20, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={layout} "
-                    f"evaluate.object_sets=CLUTTER/{layout} objects.scale={scale}",
-                    noises=NOISY_FIRST, kept=0)
+                    f"evaluate.object_sets=CLUTTER/{layout} objects.scale={scale} "
+                    "objects.skip_broken=true", noises=NOISY_FIRST, kept=0)
         for layout, scale in (("pile", 0.9), ("packed", 0.8))
     ), needs=("clutter",)),
     Part("retrieve", "one object under a pile", 20, (
