@@ -37,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", type=Path, nargs="+", help="run folders of evaluate.py")
     parser.add_argument("--output", type=Path, help="JSON file for the fits")
     options = parser.parse_args(argv)
-    rounds = [record for run in options.runs for record in rounds_of(run, options.output)]
+    played = {run.name: rounds_of(run, options.output) for run in options.runs}
+    rounds = [record for own in played.values() for record in own]
     commit = git_state().commit
     lines, found = [], {}
     for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             **asdict(fitted),
             "grasps": len(successes),
             "successes": int(successes.sum()),
-            "runs": [run.name for run in options.runs],
+            "runs": [run for run, of in played.items() if any(one.policy == name for one in of)],
             "commit": commit,
         }
         for kind in [None, *dict.fromkeys((one.scenario, one.depth_noise) for one in own)]:
