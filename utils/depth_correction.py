@@ -48,10 +48,10 @@ def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
 def _densest(asked: np.ndarray) -> float:
     """The factor of the table, of those that pixels (N,) ask for; 1 where too few agree.
 
-    Those of the table ask for the same one. It is the densest of all,
-    weighted by how likely a camera is to be that wrong, because the top of a box asks alike, too.
-    But nothing lies under a table: where a flat surface is seen beneath that one, it is the table,
-    and what asked alike was the top of something wide.
+    Those of the table ask for the same one. It is the densest of all, weighted by how likely a
+    camera is to be that wrong, because the top of a box asks alike, too. But nothing lies under a
+    table: where a flat surface is seen beneath that one, it is the table, and what asked alike was
+    the top of something wide.
     """
     least = _LEAST_SHARE * len(asked)
     asked = asked[np.abs(asked - 1) < SCALE_REACH]

@@ -354,7 +354,11 @@ def label_pieces(
 def without_bumps(heights: HeightMap, frame: RGBDFrame) -> HeightMap:
     """The map from above without those pieces that are bumps of a rough table: lower than `_BUMP`
     times its roughness, smaller than `_BUMP_AREA`, and of the table's colour. A frame that is not
-    rough has none."""
+    rough has none.
+
+    heights: of the frame, which is corrected by its table (`utils.depth_correction`), so that its
+    roughness is known. The heights stay; labels and centres of bumps go.
+    """
     count, cell = len(heights.centres), heights.cell
     low = heights.height < heights.table_height + _BUMP * frame.roughness
     on = np.flatnonzero(heights.label >= 0)
