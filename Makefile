@@ -41,10 +41,10 @@ cluster: $(VENV)/.installed-cluster
 # The chances of success of all planners, fitted again to executed grasps: ten minutes on two cores.
 calibration: $(INSTALLED)
 	$(BIN)/python evaluate.py --config configs/calibration.yaml
-	$(BIN)/python evaluate.py --config configs/calibration_large.yaml
+	$(BIN)/python evaluate.py --config configs/calibration_household.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_flat.yaml
 	$(BIN)/python -m benchmarks.calibrate $$(ls -d runs/evaluate/*-calibration | tail -1) \
-		$$(ls -d runs/evaluate/*-calibration-large | tail -1) \
+		$$(ls -d runs/evaluate/*-calibration-household | tail -1) \
 		$$(ls -d runs/evaluate/*-calibration-flat | tail -1) --output checkpoints/calibration.json
 
 test: $(VENV)/.installed-dev

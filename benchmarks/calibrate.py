@@ -7,9 +7,9 @@ they are what the planners state from then on; planners that the runs do not hav
 `make calibration` plays all planners on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
-    python evaluate.py --config configs/calibration_large.yaml
+    python evaluate.py --config configs/calibration_household.yaml
     python -m benchmarks.calibrate runs/evaluate/<time>-calibration \\
-        runs/evaluate/<time>-calibration-large --output checkpoints/calibration.json
+        runs/evaluate/<time>-calibration-household --output checkpoints/calibration.json
 """
 
 from __future__ import annotations

@@ -416,6 +416,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "oblique": (("oblique",), variants),
     "unseen": (("unseen",), variants),
     "household": (("household",), variants),
+    "ycb": (("ycb",), variants),
     "clutter": (("clutter",), variants),
     "retrieve": (("retrieve",), retrieve),
     "vgn": (("vgn",), variants),

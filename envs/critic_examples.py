@@ -54,7 +54,10 @@ _LAYOUTS = {
 # Scale of larger objects, which stand for household things that the hand hardly spans, and their
 # share among the scenes of these sets.
 _LARGE, _LARGE_SHARE = {"random_urdfs": 1.0, "primitives": 1.3}, 0.35
-_OWN_SETS = {"tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",)}
+_OWN_SETS = {
+    "tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",),
+    "household": ("household",),
+}  # fmt: skip
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zlib.error)
@@ -178,10 +181,11 @@ def at_rest(cell: Cell, scene: Scene) -> Scene:
 
 
 def execute(cell: Cell, scene: Scene, grasp: Grasp) -> bool:
-    """Whether a grasp of the freshly loaded scene succeeds; not, where the simulation blows up."""
+    """Whether a grasp of the freshly loaded scene lifts something and carries it away; not, where
+    the simulation blows up."""
     cell.load(scene)
     try:
-        return clears_table(cell, grasp) and attempt(cell, grasp).success
+        return clears_table(cell, grasp) and attempt(cell, grasp, carry=True).success
     except PhysicsError:  # the next one loads its scene into a rebuilt cell
         return False
 
@@ -205,7 +209,7 @@ def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
 @kept
 def _sets_of(config: Config) -> dict[str, ObjectSet]:
     """Of each name, and those of `_LARGE` once more as NAME, large."""
-    names = dict.fromkeys([*config.data.object_sets, "tall", "flat"])
+    names = dict.fromkeys([*_usual_sets(config), "tall", "flat"])
     kinds = {name: (name, config.objects.scale) for name in names}
     kinds |= {_large(name): (name, scale) for name, scale in _LARGE.items() if name in names}
     settings = config.objects.model_dump() | {"split": "train"}
@@ -218,6 +222,10 @@ def _sets_of(config: Config) -> dict[str, ObjectSet]:
     }  # fmt: skip
 
 
+def _usual_sets(config: Config) -> list[str]:
+    return [*config.data.object_sets, "household"]
+
+
 def _large(name: str) -> str:
     return f"{name}, large"
 
@@ -226,7 +234,7 @@ def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Genera
     """A scene of random layout, object set and number of objects."""
     while True:
         layout = str(rng.choice(list(_LAYOUTS), p=list(_LAYOUTS.values())))
-        name = str(rng.choice(_OWN_SETS.get(layout, config.data.object_sets)))
+        name = str(rng.choice(_OWN_SETS.get(layout, _usual_sets(config))))
         if rng.random() < _LARGE_SHARE and _large(name) in sets:
             name = _large(name)
         crowd = with_settings(

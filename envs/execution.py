@@ -75,6 +75,11 @@ class InHandMotion:
         self.slid = max(self.slid, float(np.linalg.norm(moved[[0, 2], 3])))
 
 
+def holding_force(pull: float) -> float:
+    """N a finger that hold what pulls at the hand with so many newtons."""
+    return min(_HOLD_MARGIN * pull / (2 * _LEAST_FRICTION), FINGER_FORCE)
+
+
 class WeighingGrip:
     """Presses as hard as the weight needs that the arm feels, and never less than
     robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one."""
@@ -90,7 +95,7 @@ class WeighingGrip:
     def press(self) -> None:
         """Press as hard as what was felt since the last time needs, or harder."""
         pull, self._felt = float(np.median(self._felt or [0.0])), []
-        force = min(_HOLD_MARGIN * pull / (2 * _LEAST_FRICTION), FINGER_FORCE)
+        force = holding_force(pull)
         if force > self._force:
             self._force = force
             self._robot.command_gripper(0.0, force)

@@ -12,9 +12,10 @@ from typing import cast
 
 import numpy as np
 
+from envs.arm_paths import LIFT_MARGIN
 from envs.cell import Cell
-from envs.cell_layout import REST_CHECK_STEPS, REST_SPEED, table_box
-from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers
+from envs.cell_layout import GRAVITY, REST_CHECK_STEPS, REST_SPEED, table_box
+from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers, holding_force
 from envs.floating_hand import FloatingHand, meets_box, park
 from utils.result_records import loose
 from utils.transforms import Grasp
@@ -23,6 +24,7 @@ PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
 RETREAT = 0.10  # m, VGN's
 LEAST_WIDTH = 0.1  # of the widest opening: narrower objects do not count as held; VGN's
 SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
+CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's bin
 _HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
 
 
@@ -58,9 +60,13 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     return replace(outcome, sim_seconds=cell.seconds - start, detail=detail)
 
 
-def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
+def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
     """As `execute_floating`, up to the judgement, and however thin the object is: afterwards the
-    hand is where it is, with what it holds, and the detail of a success tells what it met."""
+    hand is where it is, with what it holds, and the detail of a success tells what it met.
+
+    carry: ask for what an arm has to do (`envs.execution.execute_grasp`) as far as a hand can show
+    it. The fingers press as hard as its weight needs, and after the retreat the object is carried
+    CARRY away; it has to be off the table and, unless something hangs over it, lifted."""
     cell.check_physics()
     hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
@@ -72,8 +78,12 @@ def attempt(cell: Cell, grasp: Grasp) -> GraspOutcome:
         hand.hold()
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
+        if carry and held is not None:
+            hand.command_gripper(0.0, max(holding_force(_weight(cell, held)), hand.grip_force))
         _retreat(cell, hand, grasp)
         _judge(cell, held, motion)
+        if carry and held is not None:
+            _carry(cell, hand, held, grasp)
         detail = met
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
@@ -115,10 +125,34 @@ def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> str:
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
     up = grasp.tilt > SIDEWAYS + 1e-6 and not cell.hanging
     away = np.array([0.0, 0.0, 1.0]) if up else -grasp.approach
-    goal = hand.tip_pose()[:3, 3] + RETREAT * away
-    for q, velocity in zip(*hand.line(goal, cell.config.execution.approach_speed)):
+    _move(cell, hand, hand.tip_pose()[:3, 3] + RETREAT * away, cell.config.execution.approach_speed)
+
+
+def _move(cell: Cell, hand: FloatingHand, goal: np.ndarray, speed: float) -> None:
+    """Move the hand on a straight line to `goal` (3,) m in W."""
+    for q, velocity in zip(*hand.line(goal, speed)):
         hand.command(q, velocity)
         cell.step()
+
+
+def _weight(cell: Cell, index: int) -> float:
+    """Newtons."""
+    assert cell.scene is not None  # something is held
+    return cell.scene.placements[index].model.mass * GRAVITY
+
+
+def _carry(cell: Cell, hand: FloatingHand, held: int, grasp: Grasp) -> None:
+    """Lift what is held as high as an arm has to, and carry it aside; below something that hangs,
+    it stays where it is. Raises GraspFailure."""
+    least = 0.0
+    if not cell.hanging:
+        least = cell.config.execution.lift_height
+        top = hand.tip_pose()[:3, 3]
+        top[2] = max(top[2], max(grasp.position[2], 0.0) + least + LIFT_MARGIN)
+        _move(cell, hand, top, cell.config.execution.approach_speed)
+        _move(cell, hand, top + CARRY, CARRY_SPEED)
+    if not cell.is_lifted(held, least):
+        raise GraspFailure("dropped")
 
 
 def _judge(cell: Cell, gripped: int | None, motion: InHandMotion | None) -> None:

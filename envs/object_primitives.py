@@ -1,10 +1,11 @@
 """Procedural solids: eleven families, four that no training sees, four of thin and dark things,
-three of tall and three of flat ones, each object determined by its index alone.
+three of tall, three of flat and ten of household ones, each object determined by its index alone.
 
-A hand that opens 0.08 m can grasp every one of them, but for the flat ones, in every resting pose:
-across the whole, across a bar, or across a wall with one finger inside. Flat ones are wider than
-the hand and too thin to be gripped from above where they lie on a table. This module knows no
-simulator.
+A hand that opens 0.08 m can grasp every one of them, but for flat and household ones, in every
+resting pose: across the whole, across a bar, or across a wall with one finger inside. Flat ones are
+wider than the hand and too thin to be gripped from above where they lie on a table. Household ones
+have the sizes and masses of what lies in kitchens and on workbenches: some are wider than the hand
+as they lie, or however they lie. This module knows no simulator.
 """
 
 from __future__ import annotations
@@ -23,13 +24,21 @@ UNSEEN_FAMILIES = ("frustum", "wedge", "Z", "dumbbell")
 THIN_FAMILIES = ("strap", "cable", "loop", "goggles")
 TALL_FAMILIES = ("bottle", "can", "carton")  # 12 to 25 cm high where they stand
 FLAT_FAMILIES = ("plate", "book", "lid")  # 5 to 15 mm high where they lie, wider than the hand
+# Masses in kg, of household things, which are full or empty, of wood or of steel.
+HOUSEHOLD_MASSES = {
+    "package": (0.04, 0.9), "tin": (0.1, 0.6), "fruit": (0.02, 0.25), "basin": (0.1, 0.4),
+    "cup": (0.02, 0.35), "cutlery": (0.02, 0.08), "tool": (0.05, 0.8), "board": (0.1, 1.4),
+    "toy": (0.03, 0.2), "banana": (0.05, 0.2),
+}  # fmt: skip
+HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD_MASSES)
 _STREAMS = {
     FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,), TALL_FAMILIES: (3,),
-    FLAT_FAMILIES: (4,),
+    FLAT_FAMILIES: (4,), HOUSEHOLD_FAMILIES: (5,),
 }  # fmt: skip
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
-_MASS_RANGE = (0.03, 0.3)
+_DENSITIES, _MASS_RANGE = (300, 1500), (0.03, 0.3)  # of the other families
+_HOUSEHOLD_DENSITIES = (100, 2500)  # kg/m3
 _DARK_SHARE, _DARKENED = 0.6, 0.12  # of the thin things, and their colours
 
 
@@ -90,7 +99,12 @@ def make_primitive(
     else:
         parts = tuple(scale * part for part in shape)
         volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)
-    density = float(np.clip(rng.uniform(300, 1500), *(m / volume for m in _MASS_RANGE)))
+    if family in HOUSEHOLD_MASSES:
+        mass = rng.uniform(*HOUSEHOLD_MASSES[family])
+        density = float(np.clip(mass / volume, *_HOUSEHOLD_DENSITIES))
+    else:
+        masses = (mass / volume for mass in _MASS_RANGE)
+        density = float(np.clip(rng.uniform(*_DENSITIES), *masses))
     friction = float(rng.uniform(0.4, 1.0))
     color = random_color(rng)
     if families == THIN_FAMILIES and rng.random() < _DARK_SHARE:
@@ -212,7 +226,10 @@ def _ring(rng) -> list[np.ndarray]:
 
 
 def _bowl(rng) -> list[np.ndarray]:
-    wall, base, rim, height = rng.uniform((0.004, 0.02, 0.04, 0.03), (0.007, 0.026, 0.06, 0.055))
+    return _open_bowl(*rng.uniform((0.004, 0.02, 0.04, 0.03), (0.007, 0.026, 0.06, 0.055)))
+
+
+def _open_bowl(wall: float, base: float, rim: float, height: float) -> list[np.ndarray]:
     # The base spans the wall's foot, so that wall and base only touch.
     foot = base + wall
     return [
@@ -223,6 +240,18 @@ def _bowl(rng) -> list[np.ndarray]:
 
 def _mug(rng) -> list[np.ndarray]:
     wall, radius, height = rng.uniform((0.003, 0.025, 0.055), (0.006, 0.032, 0.09))
+    return [*_tumbler(wall, radius, height), *_handle(rng, radius, height)]
+
+
+def _tumbler(wall: float, radius: float, height: float) -> list[np.ndarray]:
+    """A floor and a round wall on it."""
+    inner = radius - wall
+    floor = _disc(radius, radius, 0, wall)
+    return [floor, *_wall((inner, inner), (radius, radius), (wall, height))]
+
+
+def _handle(rng, radius: float, height: float) -> list[np.ndarray]:
+    """The three bars of a mug's handle."""
     bar = rng.uniform(0.006, 0.009)
     reach = rng.uniform(0.02, 0.028)
     low, high = 0.2 * height, 0.85 * height
@@ -237,12 +266,7 @@ def _mug(rng) -> list[np.ndarray]:
     rotation = np.array([
         [np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]
     ])  # fmt: skip
-    inner = radius - wall
-    return [
-        _disc(radius, radius, 0, wall),
-        *_wall((inner, inner), (radius, radius), (wall, height)),
-        *(part @ rotation.T for part in handle),
-    ]
+    return [part @ rotation.T for part in handle]
 
 
 def _ribbon(points: np.ndarray, width: float, heights, closed: bool = False) -> list[np.ndarray]:
@@ -347,8 +371,71 @@ def _plate(rng) -> list[np.ndarray]:
     ]
 
 
-# Bounds in metres. Of a convex solid the two smaller sides stay below 0.06: one of them is
-# always across when it lies on a face.
+def _cup(rng) -> list[np.ndarray]:
+    """Wider than a mug, often than the hand; half of them have a handle."""
+    wall, radius, height = rng.uniform((0.003, 0.032, 0.05), (0.006, 0.047, 0.11))
+    handle = _handle(rng, radius, height) if rng.random() < 0.5 else []
+    return [*_tumbler(wall, radius, height), *handle]
+
+
+def _cutlery(rng) -> list[np.ndarray]:
+    """A thin handle and a wider, thinner blade, head or bowl."""
+    length, width, thick = rng.uniform((0.08, 0.009, 0.004), (0.11, 0.02, 0.011))
+    long, wide, thin = rng.uniform((0.05, 0.016, 0.003), (0.11, 0.042, 0.007))
+    return [
+        _box((0, -width / 2, 0), (length, width / 2, thick)),
+        _box((length, -wide / 2, 0), (length + long, wide / 2, thin)),
+    ]
+
+
+def _tool(rng) -> list[np.ndarray]:
+    """A long handle, in two of three with a thicker head across its end."""
+    length, side, thick = rng.uniform((0.13, 0.018, 0.015), (0.26, 0.036, 0.034))
+    wide, long, high = rng.uniform((0.05, 0.02, 0.02), (0.13, 0.036, 0.036))
+    handle = _box((0, -side / 2, -thick / 2), (length, side / 2, thick / 2))
+    if rng.random() < 1 / 3:
+        return [handle]
+    shift = rng.uniform(-0.3, 0.3) * wide
+    low, upper = (length, shift - wide / 2, -high / 2), (length + long, shift + wide / 2, high / 2)
+    return [handle, _box(low, upper)]
+
+
+def _board(rng) -> list[np.ndarray]:
+    """Wider than the hand both ways; in two of three something sticks out of a side or the top."""
+    a, b, thick = rng.uniform((0.09, 0.1, 0.015), (0.14, 0.17, 0.05))
+    slab, kind = _box((0, 0, 0), (a, b, thick)), rng.integers(3)
+    place = rng.uniform(0.1, 0.7) * b
+    reach, wide = rng.uniform((0.012, 0.01), (0.04, 0.03))
+    if kind == 0:
+        return [slab]
+    if kind == 1:
+        low = rng.uniform(0, 0.3) * thick
+        return [slab, _box((a, place, low), (a + reach, place + wide, 0.8 * thick))]
+    left = rng.uniform(0.1, 0.6) * a
+    return [slab, _box((left, place, thick), (left + wide, place + wide, thick + reach))]
+
+
+def _toy(rng) -> list[np.ndarray]:
+    """A body with wings to both sides and a fin on it."""
+    length, side, high = rng.uniform((0.07, 0.02, 0.02), (0.18, 0.045, 0.045))
+    span, chord, thick = rng.uniform((0.02, 0.02, 0.006), (0.07, 0.05, 0.018))
+    start = rng.uniform(0.2, 0.5) * length
+    level = rng.uniform(0, 1) * (high - thick)
+    wings = [
+        _box((start, y, level), (start + min(chord, length - start), y + span, level + thick))
+        for y in (-side / 2 - span, side / 2)
+    ]
+    fin = _box((0, -thick / 2, high), (0.25 * length, thick / 2, high + 0.5 * span))
+    return [_box((0, -side / 2, 0), (length, side / 2, high)), *wings, fin]
+
+
+def _banana(rng) -> list[np.ndarray]:
+    length, side = rng.uniform((0.12, 0.026), (0.2, 0.04))
+    return _ribbon(_arc(length, rng.uniform(0.4, 1.6), 6), side, (0, side))
+
+
+# Bounds in metres. Of a convex solid of the first families the two smaller sides stay below 0.06:
+# one of them is always across when it lies on a face.
 _SHAPES = {
     "box": lambda rng: NativeShape(
         "box", tuple(rng.uniform((0.025, 0.025, 0.03), (0.06, 0.06, 0.12)))
@@ -385,4 +472,18 @@ _SHAPES = {
         "box", tuple(rng.uniform((0.09, 0.12, 0.006), (0.13, 0.19, 0.015)))
     ),
     "lid": lambda rng: NativeShape("cylinder", tuple(rng.uniform((0.05, 0.005), (0.085, 0.01)))),
+    "package": lambda rng: NativeShape(
+        "box", tuple(rng.uniform((0.02, 0.045, 0.07), (0.075, 0.13, 0.2)))
+    ),
+    "tin": lambda rng: NativeShape("cylinder", tuple(rng.uniform((0.025, 0.03), (0.052, 0.13)))),
+    "fruit": lambda rng: NativeShape("sphere", (rng.uniform(0.016, 0.039),)),
+    "basin": lambda rng: _open_bowl(
+        *rng.uniform((0.004, 0.025, 0.05, 0.035), (0.008, 0.045, 0.085, 0.075))
+    ),
+    "cup": _cup,
+    "cutlery": _cutlery,
+    "tool": _tool,
+    "board": _board,
+    "toy": _toy,
+    "banana": _banana,
 }

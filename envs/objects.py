@@ -26,6 +26,7 @@ from envs.object_meshes import ObjectError
 from envs.object_primitives import (
     FAMILIES,
     FLAT_FAMILIES,
+    HOUSEHOLD_FAMILIES,
     TALL_FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
@@ -42,7 +43,10 @@ from utils.plugins import is_import_path, load_plugin
 # Numbers of the first object of each kind of `primitives` and of special families, and the end.
 PRIMITIVES = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
 SPECIAL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
-SPECIAL_FAMILIES = {"thin": THIN_FAMILIES, "tall": TALL_FAMILIES, "flat": FLAT_FAMILIES}
+SPECIAL_FAMILIES = {
+    "thin": THIN_FAMILIES, "tall": TALL_FAMILIES, "flat": FLAT_FAMILIES,
+    "household": HOUSEHOLD_FAMILIES,
+}  # fmt: skip
 PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
@@ -287,7 +291,8 @@ class BoxSet(ObjectSet):
 class PrimitiveSet(ObjectSet):
     """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
     for tests, 100 for the published tables alone, and 100 of the families that no training sees.
-    name: of an entry of SPECIAL_FAMILIES instead, 200, 50 and 50."""
+    name: of an entry of SPECIAL_FAMILIES instead, 200, 50 and 50; of `household`, with its ten
+    families, as many as of `primitives`."""
 
     def __init__(self, settings: SetSettings, name: str = "primitives") -> None:
         _refuse_fit(name, settings)
@@ -298,7 +303,7 @@ class PrimitiveSet(ObjectSet):
                 f"objects.split=unseen_families: training may see all families of {name}; use "
                 "primitives, or objects.split=test"
             )
-        first = SPECIAL if special else PRIMITIVES
+        first = SPECIAL if special and name != "household" else PRIMITIVES
         self.indices = {
             "train": range(first["train"], first["test"]),
             "test": range(first["test"], first["sealed"]),

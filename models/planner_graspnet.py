@@ -102,7 +102,7 @@ class Judged:
         self, heights: HeightMap, found: Candidates, seen: NetworkView, count: int
     ) -> Candidates:
         """The best of the candidates, no two alike, scored by their chances."""
-        if self.judge is None:
+        if self.judge is None or len(found) == 0:
             return found
         found = found.distinct(count, JUDGED_DISTANCE, JUDGED_TURN)
         inputs = critic_inputs(found, heights, seen.value(heights, found), seen.towards)
@@ -136,11 +136,16 @@ class GraspNetPlanner(Judged, SearchPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        seen = NetworkView(self.network, frame, self.workspace)
+        seen = NetworkView(self.network, frame, self.workspace, crop=True)
         heights = only_target(seen.heights, frame)
-        found = self.search(heights, partial(seen.value, heights))
-        found = self.judged(heights, found, seen, PLANAR_JUDGED)
+        if len(heights.centres) == 0:  # table and walls alone
+            return []
+        found = self.judged(heights, self.found(heights, seen), seen, PLANAR_JUDGED)
         return self.grasps(found, frame.roughness)
+
+    def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
+        """Measured candidates on the map of a view, best first."""
+        return self.search(heights, partial(seen.value, heights))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace).heights
@@ -157,12 +162,7 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
     ranks_by_critic = True
 
-    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-        frame = corrected(frame, self.workspace.table_height)
-        seen = NetworkView(self.network, frame, self.workspace, crop=True)
-        heights = only_target(seen.heights, frame)
-        if len(heights.centres) == 0:  # table and walls alone
-            return []
+    def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
         value = partial(seen.value, heights)
         rough = self._at_peaks(seen.peaks(PEAKS), heights)
         rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
@@ -171,10 +171,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
             found = found.best(settings.finalists)
             if len(found):
                 found = turn_onto_faces(found, heights, self.gripper, settings)
-                found = replace(found, score=found.score * value(found)).best(len(found))
-                found = self.judged(heights, found, seen, PLANAR_JUDGED)
-                return self.grasps(found, frame.roughness)
-        return []
+                return replace(found, score=found.score * value(found)).best(len(found))
+        return found
 
     def _at_peaks(self, points: np.ndarray, heights: HeightMap) -> Candidates:
         """Candidates at points (N, 3) at all angles, their fingertips at the surface."""

@@ -12,6 +12,8 @@ from envs.execution import execute_grasp
 from envs.floating_execution import PREGRASP, attempt, clears_table, execute_floating, floating_hand
 from envs.floating_hand import meets_box
 from envs.grasping_env import RobotGraspingEnv
+from envs.object_bodies import native_object
+from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from envs.robot_motion import SCurve
 from envs.rounds import run_round
@@ -180,6 +182,22 @@ def test_an_empty_hand_misses_and_so_does_a_thin_grip(cell, box_set):
     cell.load(Scene("isolated", 0, (at,)))
     outcome = execute_floating(cell, grasp)
     assert outcome.reason == "missed" and "8 mm or less count as empty" in outcome.detail
+
+
+def test_what_is_carried_has_to_leave_the_table(cell):
+    """A beam of 0.5 kg, gripped 12 cm beside its middle: the hand still holds it after the retreat
+    of 10 cm, but its other end lies on the table, or it hangs from the fingers."""
+    beam = native_object("beam", NativeShape("box", (0.3, 0.03, 0.03)), 1850, 0.8, (0, 0, 1, 1))
+    assert beam.mass == pytest.approx(0.5, abs=0.01)
+    at = Placement(beam, np.array([0.5, 0.0, 0.015]), np.eye(4)[3])
+    middle, end = (
+        Grasp(np.array([x, 0.0, 0.015]), np.pi / 2, 0.08, 1.0) for x in (0.5, 0.62)
+    )  # fmt: skip
+    for grasp, carried in ((middle, "success"), (end, "dropped")):
+        cell.load(Scene("isolated", 0, (at,)))
+        assert attempt(cell, grasp).success
+        cell.load(Scene("isolated", 0, (at,)))
+        assert attempt(cell, grasp, carry=True).reason == carried
 
 
 def test_a_round_ends_after_two_failures_in_a_row(cell, box_set):

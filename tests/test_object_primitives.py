@@ -9,6 +9,7 @@ import trimesh
 from envs.object_primitives import (
     FAMILIES,
     FLAT_FAMILIES,
+    HOUSEHOLD_FAMILIES,
     TALL_FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
@@ -127,8 +128,10 @@ def test_every_family_has_a_side_that_the_hand_can_span():
 
 
 def test_parts_of_primitives_touch_but_do_not_overlap():
-    for family in ("L", "T", "U", "cross", "ring", "bowl", "mug"):
-        parts = make_primitive(FAMILIES.index(family)).parts
+    hollow = [(FAMILIES, FAMILIES.index(family))
+              for family in ("L", "T", "U", "cross", "ring", "bowl", "mug")]  # fmt: skip
+    for families, index in (*hollow, *((HOUSEHOLD_FAMILIES, index) for index in range(40))):
+        parts = make_primitive(index, families=families).parts
         hulls = [trimesh.convex.convex_hull(part) for part in parts]
         union = trimesh.boolean.union(hulls, engine="manifold")
         assert union.volume == pytest.approx(sum(hull.volume for hull in hulls), rel=1e-3)
@@ -205,6 +208,19 @@ def test_flat_things_are_too_wide_for_the_hand_and_too_low_for_it_on_a_table(tmp
     assert 0.03 - 1e-6 <= model.mass <= 0.3 + 1e-6
     # From the side the hand spans it.
     assert fits(model, GripperGeometry())
+
+
+@pytest.mark.parametrize(("family", "sides"), [
+    ("package", (0.075, 0.13, 0.2)), ("tin", (0.104, 0.104, 0.13)), ("fruit", (0.078,) * 3),
+    ("basin", (0.17, 0.17, 0.075)), ("cup", (0.125, 0.095, 0.11)), ("cutlery", (0.22, 0.042, 0.011)),
+    ("board", (0.18, 0.17, 0.09)), ("tool", (0.296, 0.13, 0.036)),
+])  # fmt: skip
+def test_household_things_are_as_large_as_such_things(family, sides):
+    for k in range(5):
+        index = HOUSEHOLD_FAMILIES.index(family) + k * len(HOUSEHOLD_FAMILIES)
+        shape = make_primitive(index, families=HOUSEHOLD_FAMILIES)
+        assert shape.name == f"{family}_{index:04d}"
+        assert (np.ptp(np.concatenate(shape.parts), axis=0) <= np.array(sides) + 1e-9).all()
 
 
 def test_a_band_has_the_volume_of_its_line():

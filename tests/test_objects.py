@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from envs.object_bodies import load_object
-from envs.object_primitives import FAMILIES, UNSEEN_FAMILIES
+from envs.object_primitives import FAMILIES, HOUSEHOLD_MASSES, UNSEEN_FAMILIES
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object_set, prepare
 from envs.pybullet_files import data_folder
 from tests.helpers.object_files import urdf_box, urdf_inertia
@@ -95,6 +95,20 @@ def test_other_special_sets_are_split_alike(tmp_path, name):
              for split in ("train", "test", "sealed")]  # fmt: skip
     assert [len(part) for part in parts] == [200, 50, 50]
     assert len(set().union(*parts)) == 300
+
+
+def test_household_things_weigh_what_such_things_do(tmp_path):
+    parts = [load_object_set("household", split=split, cache_dir=tmp_path)
+             for split in ("train", "test", "sealed")]  # fmt: skip
+    assert [len(part) for part in parts] == [900, 100, 100]
+    assert len({index for part in parts for index in part.indices}) == 1100
+    for model in (parts[0][index] for index in range(30)):
+        low, high = HOUSEHOLD_MASSES[model.name.split("_")[0]]
+        volume = sum(trimesh.convex.convex_hull(part).volume for part in model.parts)
+        # As drawn, but no matter is lighter than 100 kg/m3 nor heavier than 2,500.
+        assert low <= model.mass <= high or model.mass / volume == pytest.approx(
+            100 if model.mass > high else 2500, rel=0.02
+        )
 
 
 def test_primitives_weigh_and_slide_as_promised(tmp_path):

@@ -16,7 +16,8 @@ def test_the_shipped_configs_name_entries_of_the_registries():
 
 @pytest.mark.parametrize("key", [*REGISTRIES, *OBJECT_SET_KEYS])
 def test_any_entry_can_be_named(key):
-    known = REGISTRIES.get(key, ("box", "primitives", "random_urdfs", "thin", "tall", "flat"))
+    sets = ("box", "primitives", "random_urdfs", "thin", "tall", "flat", "household")
+    known = REGISTRIES.get(key, sets)
     for name in known:
         check_names(load_config(None, [f"{key}={name}", "env.goal=object"]))
 

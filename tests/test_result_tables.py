@@ -223,18 +223,18 @@ def test_commands_are_valid_and_take_fresh_seeds(capsys):
 
 
 def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts, capsys):
-    assert main(["--parts", "household,cornell"]) == 0
+    assert main(["--parts", "ycb,cornell"]) == 0
     said = capsys.readouterr().out
-    assert "household: skipped, because no --ycb names YCB's objects" in said
+    assert "ycb: skipped, because no --ycb names YCB's objects" in said
     assert "cornell: skipped, because no --cornell names Cornell's photographs" in said
     assert not results.FIGURES.exists()
-    assert main(["--parts", "household", "--ycb", "some/ycb"]) == 0
+    assert main(["--parts", "ycb", "--ycb", "some/ycb"]) == 0
     (part,) = chosen_parts("clutter")
     line = part.commands[0].line(3, {"clutter": Path("some/vgn")})
     assert "evaluate.object_sets=some/vgn/pile objects.scale=0.9" in line
     assert "path/to/clutter/pile" in part.commands[0].line(3)
-    content = json.loads((results.FIGURES / "household.json").read_text())
-    assert "path/to/ycb" in content["commands"]["household"]["command"]
+    content = json.loads((results.FIGURES / "ycb.json").read_text())
+    assert "path/to/ycb" in content["commands"]["ycb"]["command"]
     rows = [row("oracle", 3, 4, name) for name in ("../some/vgn/pile", "ycb", "a/ycb + b")]
     here = {"clutter": Path("../some/vgn/"), "ycb": Path("a/ycb")}
     told = results.without_places({"rows": rows, "run": "runs/ycb"}, here)

@@ -117,6 +117,25 @@ def test_after_a_failure_another_object_comes_first() -> None:
     assert elsewhere_first([near, far], []) == [near, far]
 
 
+def test_a_round_goes_on_elsewhere_after_a_failure(cell, box_set) -> None:
+    """Before it tries the same place from another side, and comes back when nothing else is left:
+    three grasps 13 cm beside the cube, which fail, are ranked before the cube's."""
+    beside = [
+        replace(cube_grasp(offset=(0.13, y, 0)), angle=angle, quality=0.9)
+        for y, angle in ((0, 0.0), (0, 1.0), (0.03, 0.0))
+    ]
+    tried = []
+    record = run_round(
+        cell, cube_scene(box_set), planner_of([*beside, replace(cube_grasp(), quality=0.6)]),
+        policy="x", objects="box", max_failures=2,
+        on_attempt=lambda frame, grasp, outcome: tried.append(grasp.quality),
+    )  # fmt: skip
+    assert (record.ended, tried) == ("cleared", [0.9, 0.6])
+    poor = planner_of([*beside, replace(cube_grasp(), quality=0.4)])
+    record = run_round(cell, cube_scene(box_set), poor, policy="x", objects="box", max_failures=2)
+    assert (record.ended, record.executed) == ("failures", 2)
+
+
 def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
     first, again, beside, turned = (
         Grasp(np.array([x, 0.0, 0.05]), angle, 0.08, 1.0)
@@ -188,7 +207,7 @@ def test_a_round_goes_through_the_plan_until_something_succeeds(cell, box_set) -
         "packed", 0, tuple(Placement(box_set[0], np.array(p), np.eye(4)[3]) for p in places)
     )
     bad = [Grasp(np.array([1.5, y, 0.03]), 0.0, 0.08, 1.0) for y in (0.0, 0.1)]
-    good = [Grasp(np.array(p), 0.0, 0.08, 0.5) for p in places]
+    good = [Grasp(np.array(p), 0.0, 0.08, 0.4) for p in places]  # too poor to come first
     tried = []
 
     def plan(frame):
