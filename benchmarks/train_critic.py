@@ -3,7 +3,8 @@
 Draws scenes of training objects, has a floating hand execute candidates of graspnet6d, graspnet and
 graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
 them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
-folder of `--examples`, where a run that was stopped finds them again. Every tenth scene is held
+folder of `--examples`, where a run that was stopped finds them again; those in folders of `--more`
+are learned from as well, whatever they were played with. Every tenth scene of `--examples` is held
 out; on these it prints how often the candidate that is ranked first succeeds, of those that were
 drawn at random, by the search alone, by the critic that it began with, and by the new one, and how
 far the stated chances of all are from frequencies. Written to checkpoints/critic.pt, the critic is
@@ -48,6 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument(
             "--examples", type=Path, default=Path("data/critic"), help="folder of executed grasps"
         )
+        parser.add_argument(
+            "--more", type=Path, nargs="+", default=[], help="folders of others to train on, too"
+        )
         parser.add_argument("--initial", type=Path, help="critic whose weights to start from")
 
     config, chosen = parse_args(argv, "Train the grasp critic.", options)
@@ -61,11 +65,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if initial is not None:
         before = judged(initial, examples.where(held_out))
         scores |= {f"{name} before": value for name, value in before.items()}
-    critic = fit(examples.where(~held_out), config.seed, initial=initial)
+    more = [Examples.load(path) for folder in chosen.more for path in shards(folder)]
+    learned = Examples.joined([examples.where(~held_out), *more])
+    critic = fit(learned, config.seed, initial=initial)
     scores |= judged(critic, examples.where(held_out))
     print(
         f"{len(examples.success)} grasps of {chosen.scenes} scenes, "
-        f"{100 * examples.success.mean():.0f} % of them succeeded"
+        f"{100 * examples.success.mean():.0f} % of them succeeded; learned from {len(learned.success)}"
     )
     print(", ".join(f"{name} {value:.3g}" for name, value in scores.items()))
     save_checkpoint(
@@ -100,6 +106,14 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
                 Examples.joined(sorted(found, key=lambda one: one.scene[:1].tolist())).save(path)
             parts.append(Examples.load(path))
     return Examples.joined(parts)
+
+
+def shards(folder: Path) -> list[Path]:
+    """The files of executed grasps in a folder. Raises UserError where it has none."""
+    found = sorted(folder.glob("scenes-*.npz"))
+    if not found:
+        raise UserError(f"--more {folder}: holds no executed grasps (scenes-*.npz)")
+    return found
 
 
 def check_same_settings(folder: Path, config: Config) -> None:

@@ -284,8 +284,9 @@ class Robot(Hand):
 
     # --- What the robot feels -----------------------------------------------------------------
 
-    def external_force(self) -> float:
-        """Newtons with which things press on the hand, by the torques that the joints feel.
+    def external_push(self) -> np.ndarray:
+        """(3,) newtons in W with which things press on the hand, by the torques that the joints
+        feel.
 
         The force of the wrench at E that explains the external torques best, as libfranka's
         O_F_ext_hat_K. Forces on the hand that cancel are not felt, nor are an object's weight and
@@ -294,10 +295,13 @@ class Robot(Hand):
         """
         torques = self.external_torques()
         if not torques.any():
-            return 0.0
+            return np.zeros(3)
         J = geometric_jacobian(self.q)
-        wrench = np.linalg.solve(J @ J.T + _NEARLY_SINGULAR * np.eye(6), J @ torques)
-        return math.hypot(*wrench[:3])
+        return np.linalg.solve(J @ J.T + _NEARLY_SINGULAR * np.eye(6), J @ torques)[:3]
+
+    def external_force(self) -> float:
+        """Newtons: how hard `external_push` is."""
+        return math.hypot(*self.external_push())
 
     @abstractmethod
     def external_torques(self) -> np.ndarray:
