@@ -71,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     scores |= judged(critic, examples.where(held_out))
     print(
         f"{len(examples.success)} grasps of {chosen.scenes} scenes, "
-        f"{100 * examples.success.mean():.0f} % of them succeeded; learned from {len(learned.success)}"
+        f"{100 * examples.success.mean():.0f} % of them succeeded; "
+        f"learned from {len(learned.success)}"
     )
     print(", ".join(f"{name} {value:.3g}" for name, value in scores.items()))
     save_checkpoint(

@@ -47,10 +47,10 @@ from utils.transforms import Grasp
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _LEAST_FRICTION = 0.4  # that a grip counts on
-_HOLD_MARGIN = 3.0  # times the force that this friction needs: what is held beside its middle also turns
+_HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs beside its middle
 # N along the closing line that the arm feels when one finger presses alone (two of the closing
 # force), where a grip of both makes a few; steps in which it feels; and m and number of shifts.
-_ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 8.0, 4, 0.002, 10
+_ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 8.0, 4, 0.002, 12
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _HIGH = 0.2  # m over the table, from which the arm may go home on any way
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
@@ -270,7 +270,10 @@ def give_way(cell: Cell) -> bool:
             break
         follow(cell, way)
         before = push
-    return before != 0.0
+    if before == 0.0:
+        return False
+    cell.step(round(_CHECK_SECONDS / cell.dt))  # both fingers come to rest on it
+    return True
 
 
 def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:

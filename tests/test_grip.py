@@ -7,7 +7,7 @@ import pytest
 from benchmarks.show_bar import bar, grip, solid, tilt
 from envs.cell import Cell
 from envs.cell_layout import Placement, Scene
-from envs.execution import execute_grasp
+from envs.execution import close_fingers, execute_grasp, give_way, open_loop
 from envs.object_primitives import NativeShape
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
@@ -86,7 +86,8 @@ def test_a_bar_that_turns_in_the_hand_is_reported(config, box_set):
 
 @pytest.mark.parametrize("mass", [0.1, 1.2])
 def test_the_grip_follows_the_weight(config, box_set, mass, cell):
-    """10 N a finger hold 1.02 kg by a friction of 0.5, and less while it is lifted."""
+    """10 N a finger hold 1.02 kg by a friction of 0.5, and less while it is lifted. At rest, the
+    grip is 3 x 0.5 / 0.4 times what holds it, and more as the arm accelerates by up to 6.5 m/s2."""
     model = solid(box_set[0], NativeShape("box", (0.06, 0.05, 0.05)), mass, 0.5)
     cell.load(Scene("isolated", 0, (Placement(model, np.array([0.5, 0.0, 0.025]), np.eye(4)[3]),)))
     forces, send = [], cell.robot._send_gripper
@@ -94,7 +95,25 @@ def test_the_grip_follows_the_weight(config, box_set, mass, cell):
     outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.025]), np.pi / 2, 0.07, 1.0))
     assert outcome.reason == "success" and outcome.motion.slid < 0.01
     needed = mass * G / (2 * 0.5)
-    assert max(forces) == 10.0 if mass < 0.5 else needed < max(forces) < 4 * needed
+    assert max(forces) == 10.0 if mass < 0.5 else 3 * needed < max(forces) < 6.5 * needed
+
+
+@pytest.mark.parametrize(("mass", "off", "jams"), [(4.0, 0.008, True), (0.1, 0.008, False)])
+def test_a_hand_that_one_finger_jams_gives_way(config, box_set, mass, off, jams, cell):
+    """A cube of 60 mm, 8 mm beside the hand's middle: one finger comes first. By a friction of 0.8
+    the table holds 4 kg against the 20 N of both motors: the hand moves; 0.1 kg are pushed."""
+    model = solid(box_set[0], NativeShape("box", (0.06, 0.06, 0.06)), mass, 0.8)
+    cell.load(Scene("isolated", 0, (Placement(model, np.array([0.5, 0.0, 0.03]), np.eye(4)[3]),)))
+    grasp = Grasp(np.array([0.5, off, 0.03]), np.pi / 2, 0.08, 1.0)
+    approach = open_loop(cell, grasp)
+    close_fingers(cell, approach.wait)
+    cell.robot.hold()
+    before = cell.robot.tip_pose()[1, 3]
+    assert (cell.held_object() is None) == jams
+    assert give_way(cell) == jams
+    moved = before - cell.robot.tip_pose()[1, 3]
+    assert cell.held_object() == 0
+    assert moved == pytest.approx(off, abs=0.003) if jams else abs(moved) < 1e-3
 
 
 @pytest.mark.parametrize(
