@@ -50,7 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             "--examples", type=Path, default=Path("data/critic"), help="folder of executed grasps"
         )
         parser.add_argument(
-            "--more", type=Path, nargs="+", default=[], help="folders of others to train on, too"
+            "--more",
+            type=Path,
+            action="append",
+            default=[],
+            help="another folder of executed grasps to learn from; may be repeated",
         )
         parser.add_argument("--initial", type=Path, help="critic whose weights to start from")
 
