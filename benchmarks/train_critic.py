@@ -4,8 +4,8 @@ Draws scenes of training objects, has a floating hand execute candidates of gras
 graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
 them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
 folder of `--examples`, where a run that was stopped finds them again; those in folders of `--more`
-are learned from as well, whatever they were played with. Every tenth scene of `--examples` is held
-out; on these it prints how often the candidate that is ranked first succeeds, of those that were
+are learned from as well, whatever they were played with. Every tenth scene is held out; on these it
+prints how often the candidate that is ranked first succeeds, of those that were
 drawn at random, by the search alone, by the critic that it began with, and by the new one, and how
 far the stated chances of all are from frequencies. Written to checkpoints/critic.pt, the critic is
 what graspnet6d and graspnet_direct rank by from then on; their chances of success are then fitted
@@ -26,7 +26,14 @@ import torch
 from torch.nn import functional
 from tqdm import tqdm
 
-from envs.critic_examples import PLANNERS, Examples, examples_of, planner_of
+from envs.critic_examples import (
+    LABEL,
+    PLANNERS,
+    Examples,
+    examples_of,
+    planner_of,
+    usual_sets,
+)
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
@@ -69,7 +76,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if initial is not None:
         before = judged(initial, examples.where(held_out))
         scores |= {f"{name} before": value for name, value in before.items()}
+    # Another folder may have the same scenes with other labels.
     more = [Examples.load(path) for folder in chosen.more for path in shards(folder)]
+    more = [part.where(part.scene % HELD_OUT != 0) for part in more]
     learned = Examples.joined([examples.where(~held_out), *more])
     critic = fit(learned, config.seed, initial=initial)
     scores |= judged(critic, examples.where(held_out))
@@ -126,7 +135,7 @@ def check_same_settings(folder: Path, config: Config) -> None:
     holds examples of something else."""
     sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera")
     settings = {name: getattr(config, name).model_dump(mode="json") for name in sections}
-    settings |= {"seed": config.seed, "object_sets": list(config.data.object_sets)}
+    settings |= {"seed": config.seed, "object_sets": usual_sets(config), "label": LABEL}
     settings["critic"] = hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
     note = folder / "settings.json"
     if not note.exists():

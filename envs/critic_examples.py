@@ -61,6 +61,7 @@ _OWN_SETS = {
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zlib.error)
+LABEL = "carried"  # what counts as a success: see `execute`
 _FIRST_SEED = 3_000_000_000  # no evaluation and no other training uses these seeds
 
 
@@ -209,7 +210,7 @@ def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
 @kept
 def _sets_of(config: Config) -> dict[str, ObjectSet]:
     """Of each name, and those of `_LARGE` once more as NAME, large."""
-    names = dict.fromkeys([*_usual_sets(config), "tall", "flat"])
+    names = dict.fromkeys([*usual_sets(config), "tall", "flat"])
     kinds = {name: (name, config.objects.scale) for name in names}
     kinds |= {_large(name): (name, scale) for name, scale in _LARGE.items() if name in names}
     settings = config.objects.model_dump() | {"split": "train"}
@@ -222,8 +223,9 @@ def _sets_of(config: Config) -> dict[str, ObjectSet]:
     }  # fmt: skip
 
 
-def _usual_sets(config: Config) -> list[str]:
-    return [*config.data.object_sets, "household"]
+def usual_sets(config: Config) -> list[str]:
+    """Names of the sets of most layouts."""
+    return list(dict.fromkeys([*config.data.object_sets, "household"]))
 
 
 def _large(name: str) -> str:
@@ -234,7 +236,7 @@ def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Genera
     """A scene of random layout, object set and number of objects."""
     while True:
         layout = str(rng.choice(list(_LAYOUTS), p=list(_LAYOUTS.values())))
-        name = str(rng.choice(_OWN_SETS.get(layout, _usual_sets(config))))
+        name = str(rng.choice(_OWN_SETS.get(layout, usual_sets(config))))
         if rng.random() < _LARGE_SHARE and _large(name) in sets:
             name = _large(name)
         crowd = with_settings(

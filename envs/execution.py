@@ -48,9 +48,9 @@ _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in t
 _CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
 _LEAST_FRICTION = 0.4  # that a grip counts on
 _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs beside its middle
-# N along the closing line that the arm feels when one finger presses alone (two of the closing
-# force), where a grip of both makes a few; steps in which it feels; and m and number of shifts.
-_ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 8.0, 4, 0.002, 12
+# Times the closing force, along the closing line, that the arm feels when one finger presses alone
+# (it feels 2, and of a grip of both a few tenths); steps in which it feels; m and number of shifts.
+_ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 0.8, 4, 0.002, 12
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _HIGH = 0.2  # m over the table, from which the arm may go home on any way
 _CORNER = 0.04  # m of a vertical line's upper end that may be cut off
@@ -253,26 +253,28 @@ def give_way(cell: Cell) -> bool:
     """
     robot, shift, before = cell.robot, _SHIFT, 0.0
     for _ in range(_MOST_SHIFTS):
+        if robot.latency:
+            cell.step(robot.latency)  # until the last command has arrived
         pushes = []
         for _ in range(_FEELING_STEPS):
             cell.step()
             pushes.append(float(robot.external_push() @ robot.closing_direction()))
         push = float(np.median(pushes[1:]))  # the first time, nothing is felt
-        if abs(push) < _ONE_SIDED:
+        if abs(push) < _ONE_SIDED * robot.grip_force:
             break
         if push * before < 0:  # the last shift was too much, and the other finger presses now
             shift /= 2
         T = forward_kinematics(robot.q)
         T[:3, 3] += np.sign(push) * shift * robot.closing_direction()
-        try:
-            way = line(cell, robot.q, T, cell.config.execution.approach_speed)
-        except UnreachableError:  # it grips as it can
-            break
-        follow(cell, way)
         before = push
+        try:
+            follow(cell, line(cell, robot.q, T, cell.config.execution.approach_speed))
+        except (UnreachableError, ArmStoppedError):  # it grips as it can
+            break
     if before == 0.0:
         return False
-    cell.step(round(_CHECK_SECONDS / cell.dt))  # both fingers come to rest on it
+    # Both fingers come to rest on it.
+    cell.step(robot.latency + round(_CHECK_SECONDS / cell.dt))
     return True
 
 

@@ -66,7 +66,8 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
 
     carry: ask for what an arm has to do (`envs.execution.execute_grasp`) as far as a hand can show
     it. The fingers press as hard as its weight needs, and after the retreat the object is carried
-    CARRY away; it has to be off the table and, unless something hangs over it, lifted."""
+    CARRY away; at the end it has to be off the table and, unless something hangs over it, lifted.
+    """
     cell.check_physics()
     hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
@@ -76,6 +77,7 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
         hand.yield_to_fingers()
         close_fingers(cell, cell.step)
         hand.hold()
+        closed = float(hand.tip_pose()[2, 3])
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         if carry and held is not None:
@@ -83,7 +85,7 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
         _retreat(cell, hand, grasp)
         _judge(cell, held, motion)
         if carry and held is not None:
-            _carry(cell, hand, held, grasp)
+            _carry(cell, hand, held, max(grasp.position[2], closed))
         detail = met
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
@@ -141,14 +143,14 @@ def _weight(cell: Cell, index: int) -> float:
     return cell.scene.placements[index].model.mass * GRAVITY
 
 
-def _carry(cell: Cell, hand: FloatingHand, held: int, grasp: Grasp) -> None:
-    """Lift what is held as high as an arm has to, and carry it aside; below something that hangs,
-    it stays where it is. Raises GraspFailure."""
+def _carry(cell: Cell, hand: FloatingHand, held: int, height: float) -> None:
+    """Lift what was gripped `height` m over the table as high as an arm has to, and carry it aside;
+    below something that hangs, it stays where it is. Raises GraspFailure."""
     least = 0.0
     if not cell.hanging:
         least = cell.config.execution.lift_height
         top = hand.tip_pose()[:3, 3]
-        top[2] = max(top[2], max(grasp.position[2], 0.0) + least + LIFT_MARGIN)
+        top[2] = max(top[2], max(height, 0.0) + least + LIFT_MARGIN)
         _move(cell, hand, top, cell.config.execution.approach_speed)
         _move(cell, hand, top + CARRY, CARRY_SPEED)
     if not cell.is_lifted(held, least):

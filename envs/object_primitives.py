@@ -24,7 +24,7 @@ UNSEEN_FAMILIES = ("frustum", "wedge", "Z", "dumbbell")
 THIN_FAMILIES = ("strap", "cable", "loop", "goggles")
 TALL_FAMILIES = ("bottle", "can", "carton")  # 12 to 25 cm high where they stand
 FLAT_FAMILIES = ("plate", "book", "lid")  # 5 to 15 mm high where they lie, wider than the hand
-# Masses in kg, of household things, which are full or empty, of wood or of steel.
+# Masses in kg, of household things, which are full or empty.
 HOUSEHOLD_MASSES = {
     "package": (0.04, 0.9), "tin": (0.1, 0.6), "fruit": (0.02, 0.25), "basin": (0.1, 0.4),
     "cup": (0.02, 0.35), "cutlery": (0.02, 0.08), "tool": (0.05, 0.8), "board": (0.1, 1.4),
@@ -379,7 +379,7 @@ def _cup(rng) -> list[np.ndarray]:
 
 
 def _cutlery(rng) -> list[np.ndarray]:
-    """A thin handle and a wider, thinner blade, head or bowl."""
+    """A thin handle, and a flat blade or head that is mostly wider."""
     length, width, thick = rng.uniform((0.08, 0.009, 0.004), (0.11, 0.02, 0.011))
     long, wide, thin = rng.uniform((0.05, 0.016, 0.003), (0.11, 0.042, 0.007))
     return [

@@ -3,8 +3,8 @@
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
 the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
 its planner raises an exception. What has failed is not tried again at once, for often nothing has
-moved: grasps elsewhere that are more likely to succeed than not come first, and of the others those
-that are not alike one that has just failed.
+moved: grasps elsewhere that are more likely to succeed than not (whose quality is 0.5 or more) come
+first, and of the others those that are not alike one that has just failed.
 
 Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
 would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
@@ -151,9 +151,8 @@ def run_round(
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
                 break
-            reached: Iterable[Grasp] = within_reach(cell, worth)
-            if missed:
-                reached = elsewhere_first(reached, missed)
+            ordered = elsewhere_first(worth, missed) if missed else worth
+            reached = within_reach(cell, ordered)
             grasp = no_deeper(first_untried(reached, failed), failed, stops)
             approach: Approach = open_loop
             if controller != OPEN_LOOP:

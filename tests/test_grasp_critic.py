@@ -441,7 +441,8 @@ def test_too_few_scenes_are_refused(tmp_path) -> None:
 
 
 def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys) -> None:
-    """20 scenes of 12 grasps, 2 of which are held out, and 3 scenes of another run."""
+    """20 scenes of 12 grasps, 2 of which are held out, and 12 scenes of another run, of which those
+    with the numbers of held-out ones, 0 and 10, are left out, too."""
     monkeypatch.setattr(
         "benchmarks.train_critic.examples_of",
         lambda config, number: made_up(1, number)._replace(scene=np.full(12, number)),
@@ -451,9 +452,10 @@ def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys
     )
     monkeypatch.setattr("benchmarks.train_critic.EPOCHS", 1)
     more = tmp_path / "more"
-    Examples.joined([made_up(1, k) for k in range(3)]).save(more / "scenes-00000-00002.npz")
+    others = [made_up(1, k)._replace(scene=np.full(12, k)) for k in range(12)]
+    Examples.joined(others).save(more / "scenes-00000-00011.npz")
     call = ["--output", str(tmp_path / "c.pt"), "--scenes", "20", "--examples", str(tmp_path / "e")]
     assert train([*call, "--more", str(more), "data.workers=1"]) == 0
-    assert f"learned from {18 * 12 + 3 * 12}\n" in capsys.readouterr().out
+    assert f"learned from {18 * 12 + 10 * 12}\n" in capsys.readouterr().out
     with pytest.raises(UserError, match=r"--more .*nothing: holds no executed grasps"):
         train([*call, "--more", str(tmp_path / "nothing"), "data.workers=1"])

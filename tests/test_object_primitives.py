@@ -214,14 +214,15 @@ def test_flat_things_are_too_wide_for_the_hand_and_too_low_for_it_on_a_table(tmp
     ("package", (0.075, 0.13, 0.2)), ("tin", (0.104, 0.104, 0.13)), ("fruit", (0.078,) * 3),
     ("basin", (0.17, 0.17, 0.075)), ("cup", (0.125, 0.095, 0.11)),
     ("cutlery", (0.22, 0.042, 0.011)), ("board", (0.18, 0.17, 0.09)),
-    ("tool", (0.296, 0.13, 0.036)),
+    ("tool", (0.296, 0.13, 0.036)), ("toy", (0.18, 0.185, 0.08)), ("banana", (0.2, 0.2, 0.04)),
 ])  # fmt: skip
 def test_household_things_are_as_large_as_such_things(family, sides):
     for k in range(5):
         index = HOUSEHOLD_FAMILIES.index(family) + k * len(HOUSEHOLD_FAMILIES)
         shape = make_primitive(index, families=HOUSEHOLD_FAMILIES)
         assert shape.name == f"{family}_{index:04d}"
-        assert (np.ptp(np.concatenate(shape.parts), axis=0) <= np.array(sides) + 1e-9).all()
+        own = np.ptp(np.concatenate(shape.parts), axis=0)
+        assert (own <= np.array(sides) + 1e-9).all() and (own > 0.15 * np.array(sides)).all()
 
 
 def test_a_band_has_the_volume_of_its_line():
