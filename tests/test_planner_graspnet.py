@@ -37,9 +37,14 @@ def plan(frame: RGBDFrame, network: torch.nn.Module, planner: type = GraspNetPla
     return planner(GripperGeometry(), Workspace(), network=saved)(frame)
 
 
+def looked_at(boxes) -> RGBDFrame:
+    """The part of a frame that planners look at, whose pixels are those of a network's maps."""
+    return around_matter(boxes_frame(boxes), Workspace().table_height)
+
+
 @pytest.mark.parametrize("chosen", [0, 1])
 def test_the_network_chooses_between_boxes_that_fit_alike(chosen: int) -> None:
-    frame = boxes_frame(BOXES)
+    frame = looked_at(BOXES)
     middle = np.array([*BOXES[chosen][2], 0.05])
     pixel, _ = project(middle, frame.K, frame.T_WC)
     best = plan(frame, FixedMaps(pixel))[0]
@@ -116,7 +121,7 @@ class FixedCentres(FixedMaps):
 def test_two_objects_that_touch_are_not_grasped_as_one() -> None:
     """Blocks side by side, a piece of 4 cm x 6 cm by height alone: the best grasp of it is in the
     middle, half on one and half on the other."""
-    frame = boxes_frame(TOUCHING)
+    frame = looked_at(TOUCHING)
     as_one = plan(frame, FixedMaps(best=0.9, elsewhere=0.9))[0]
     found = plan(frame, FixedCentres(true_offset(frame)))
     assert abs(as_one.position[1]) < 0.004, "otherwise this test shows nothing"
