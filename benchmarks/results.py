@@ -173,7 +173,7 @@ PARTS = (
         _evaluation("ycb", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=household "
                     "evaluate.object_sets=YCB", noises=NOISY_FIRST, kept=0),
     ), needs=("ycb",)),
-    Part("ycb_sure", "the same, without what is more likely to fail than to succeed", 15, (
+    Part("ycb_sure", "YCB's objects, and no try that is more likely to fail than not", 15, (
         _evaluation("ycb", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=household "
                     "evaluate.object_sets=YCB evaluate.abstain=0.5", noises=NOISY_FIRST, kept=0),
     ), needs=("ycb",)),
