@@ -5,9 +5,9 @@ graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_cri
 them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
 folder of `--examples`, where a run that was stopped finds them again; those in folders of `--more`
 are learned from as well, whatever they were played with. Every tenth scene is held out; on these it
-prints how often the candidate that is ranked first succeeds, of those that were
-drawn at random, by the search alone, by the critic that it began with, and by the new one, and how
-far the stated chances of all are from frequencies. Written to checkpoints/critic.pt, the critic is
+prints how often the candidate that is ranked first succeeds, of those that were drawn at random, by
+the search alone, by the critic that it began with, and by the new one, how far the stated chances
+of all are from frequencies, and their log loss. Written to checkpoints/critic.pt, the critic is
 what graspnet6d and graspnet_direct rank by from then on; their chances of success are then fitted
 again (`benchmarks.calibrate`).
 """
@@ -26,14 +26,7 @@ import torch
 from torch.nn import functional
 from tqdm import tqdm
 
-from envs.critic_examples import (
-    LABEL,
-    PLANNERS,
-    Examples,
-    examples_of,
-    planner_of,
-    usual_sets,
-)
+from envs.critic_examples import LABEL, PLANNERS, Examples, examples_of, planner_of, usual_sets
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
@@ -56,13 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument(
             "--examples", type=Path, default=Path("data/critic"), help="folder of executed grasps"
         )
-        parser.add_argument(
-            "--more",
-            type=Path,
-            action="append",
-            default=[],
-            help="another folder of executed grasps to learn from; may be repeated",
-        )
+        more = "another folder of executed grasps to learn from; may be repeated"
+        parser.add_argument("--more", type=Path, action="append", default=[], help=more)
         parser.add_argument("--initial", type=Path, help="critic whose weights to start from")
 
     config, chosen = parse_args(argv, "Train the grasp critic.", options)
@@ -87,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{100 * examples.success.mean():.0f} % of them succeeded; "
         f"learned from {len(learned.success)}"
     )
-    print(", ".join(f"{name} {value:.3g}" for name, value in scores.items()))
+    print(*(f"{name} {value:.3g}" for name, value in scores.items()), sep="\n")
     save_checkpoint(
         chosen.output, kind=KIND, model_args=critic.model_args, model=critic,
         config=config.model_dump(mode="json"),
@@ -198,7 +186,7 @@ def mirrored(
 def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
     """For each planner, how many of its plans' first candidates succeed, of those that were drawn,
     ranked by the search alone and by the critic, and the half width of that share's 95 % interval;
-    then the calibration error of the critic's chances of all."""
+    then the calibration error of the critic's chances of all, and their mean log loss."""
     chance = critic.chance(examples.inputs)
     preference = JUDGED_FAN.preference(examples.inputs.facts[:, INPUTS.index("tilt")])
     scores = {}
@@ -212,6 +200,8 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
             scores[f"{name} by {kind}"] = float(first.mean())
             scores[f"{name} by {kind} +-"] = 1.96 * float(first.std() / np.sqrt(len(first)))
     scores["calibration error"] = calibration_error(chance, examples.success)
+    likely = np.clip(np.where(examples.success, chance, 1 - chance), 1e-4, 1.0)
+    scores["log loss"] = float(-np.log(likely).mean())
     return scores
 
 

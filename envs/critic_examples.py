@@ -1,10 +1,11 @@
 """Examples for the critic: what the planners see of their candidates, and what becomes of them.
 
-Scenes of training objects, some of them larger than usual, are seen by a camera from above or from
-a side, with one of the depth noises. A floating hand executes some of the candidates
-(`envs.floating_execution`): half of them the ones that the shipped critic likes best, so that the
-next one learns what this one overrates, the others drawn at random. The examples of a scene are a
-pure function of the config, its number and the shipped critic.
+Scenes of training objects, household things and some larger than usual among them, are seen by a
+camera from above or from a side, with one of the depth noises. A floating hand executes some of the
+candidates and carries away what it grips (`envs.floating_execution`): half of them the ones that
+the shipped critic likes best, so that the next one learns what this one overrates, the others drawn
+at random. The examples of a scene are a pure function of the config, its number and the shipped
+critic.
 """
 
 from __future__ import annotations

@@ -40,12 +40,13 @@ from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
-# Numbers of the first object of each kind of `primitives` and of special families, and the end.
-PRIMITIVES = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
-SPECIAL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
-SPECIAL_FAMILIES = {
-    "thin": THIN_FAMILIES, "tall": TALL_FAMILIES, "flat": FLAT_FAMILIES,
-    "household": HOUSEHOLD_FAMILIES,
+# Numbers of the first object of each split, and the end, in large and in small sets.
+LARGE = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
+SMALL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
+# The families and the splits of each procedural set besides `primitives`.
+SPECIAL = {
+    "thin": (THIN_FAMILIES, SMALL), "tall": (TALL_FAMILIES, SMALL), "flat": (FLAT_FAMILIES, SMALL),
+    "household": (HOUSEHOLD_FAMILIES, LARGE),
 }  # fmt: skip
 PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
@@ -289,28 +290,27 @@ class BoxSet(ObjectSet):
 
 
 class PrimitiveSet(ObjectSet):
-    """Procedural solids of `envs.object_primitives`: of eleven families 900 for training and 100
-    for tests, 100 for the published tables alone, and 100 of the families that no training sees.
-    name: of an entry of SPECIAL_FAMILIES instead, 200, 50 and 50; of `household`, with its ten
-    families, as many as of `primitives`."""
+    """Procedural solids of `envs.object_primitives`: of `primitives`, or of an entry of SPECIAL,
+    those for training, for tests, or for the published tables alone; of `primitives` also 100 of
+    the families that no training sees."""
 
     def __init__(self, settings: SetSettings, name: str = "primitives") -> None:
         _refuse_fit(name, settings)
         super().__init__(name)
-        unseen, special = settings.split == "unseen_families", SPECIAL_FAMILIES.get(name)
-        if special and unseen:
+        unseen = settings.split == "unseen_families"
+        families, first = SPECIAL.get(name, (FAMILIES, LARGE))
+        if unseen and name in SPECIAL:
             raise ObjectError(
                 f"objects.split=unseen_families: training may see all families of {name}; use "
                 "primitives, or objects.split=test"
             )
-        first = SPECIAL if special and name != "household" else PRIMITIVES
         self.indices = {
             "train": range(first["train"], first["test"]),
             "test": range(first["test"], first["sealed"]),
             "sealed": range(first["sealed"], first["end"]),
             "unseen_families": range(PRIMITIVES_UNSEEN),
         }[settings.split]
-        self.families = special or (UNSEEN_FAMILIES if unseen else FAMILIES)
+        self.families = UNSEEN_FAMILIES if unseen else families
         self.scale, self.cache_dir = settings.scale or 1.0, settings.cache_dir
 
     def __len__(self) -> int:
@@ -412,5 +412,5 @@ OBJECT_SETS: dict[str, Callable[[SetSettings], ObjectSet]] = {
     "box": BoxSet,
     "primitives": PrimitiveSet,
     "random_urdfs": _random_urdfs,
-    **{name: partial(PrimitiveSet, name=name) for name in SPECIAL_FAMILIES},
+    **{name: partial(PrimitiveSet, name=name) for name in SPECIAL},
 }

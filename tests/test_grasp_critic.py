@@ -1,28 +1,15 @@
-"""The critic of grasps: its inputs in closed form, what is executed for it, and what it learns."""
+"""The critic of grasps: its inputs in closed form, its file, and who ranks by it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.train_critic import TILTS, collect, first_of_plans, fit, judged, mirrored
-from benchmarks.train_critic import main as train
+from benchmarks.train_critic import TILTS, fit, mirrored
 from envs import critic_examples
-from envs.cell_scenes import make_scene
-from envs.critic_examples import (
-    PLANNERS,
-    Examples,
-    at_rest,
-    examples_of,
-    execute,
-    worth_trying,
-)
-from envs.objects import load_object_set
-from envs.simulators import make_cell
 from models.grasp_critic import (
     INPUTS,
     CriticInputs,
@@ -40,12 +27,11 @@ from models.planner_graspnet import (
     GraspNetPlanner,
 )
 from tests.helpers.box_frames import boxes_frame
+from tests.helpers.executed_grasps import column, made_up
 from utils.checkpoint import save_checkpoint
-from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, height_map_from_scene, tilted_view
-from utils.transforms import Grasp
 
 UPWARDS = np.array([0.0, 0.0, 1.0])
 BOX = boxes_frame([((0.04, 0.06, 0.05), 0.0, (0.5, 0.0))])  # 4 cm along x
@@ -58,10 +44,6 @@ def candidates(*angles: float, tip: float = 0.02) -> Candidates:
     return Candidates.rough(
         xy, np.array(angles), np.full(count, tip), np.full(count, 0.07), np.ones(count)
     )
-
-
-def column(inputs: CriticInputs, name: str) -> np.ndarray:
-    return inputs.facts[:, INPUTS.index(name)]
 
 
 def view_of(approach: tuple[float, float, float]) -> HeightMap:
@@ -151,46 +133,6 @@ def test_a_mirrored_patch_is_that_of_the_turned_hand() -> None:
     np.testing.assert_array_equal(facts_after[:, TILTS[0]], facts[:, TILTS[1]])
     others = [k for k in range(len(INPUTS)) if k not in TILTS]
     np.testing.assert_array_equal(facts_after[:, others], facts[:, others])
-
-
-def made_up(scenes: int, seed: int, by_patch: bool = False) -> Examples:
-    """Candidates that succeed where their cover, one of the inputs, is over a half, or where the
-    middle of their patch is high; the search's score says the opposite."""
-    rng = np.random.default_rng(seed)
-    count = 12 * scenes
-    facts = rng.random((count, len(INPUTS))).astype(np.float32)
-    high = rng.random(count)
-    patches = np.zeros((count, 3, 24, 48), np.int8)
-    patches[:, :2, 8:16, 20:28] = np.rint(60 * high).astype(np.int8)[:, None, None, None]
-    merit = high if by_patch else facts[:, INPUTS.index("cover")]
-    number = np.repeat(np.arange(scenes), 12)
-    plan = len(PLANNERS) * number + np.tile(np.arange(12) % len(PLANNERS), scenes)
-    drawn = np.ones(count, bool)
-    return Examples(
-        CriticInputs(facts, patches), merit > 0.5, (1 - merit) ** 4, number, plan, drawn
-    )
-
-
-@pytest.mark.parametrize("by_patch", [False, True])
-def test_a_rule_is_learned(by_patch) -> None:
-    critic = fit(made_up(300, 0, by_patch), seed=0, epochs=25)
-    scores = judged(critic, made_up(100, 1, by_patch))
-    for name in PLANNERS:
-        assert scores[f"{name} by search"] < 0.2  # and as many nothing else
-        assert scores[f"{name} by critic"] > 0.8  # a sixteenth of the plans holds no success
-    assert scores["calibration error"] < 0.05
-
-
-def test_the_first_of_each_plan_is_the_one_of_highest_score() -> None:
-    examples = made_up(2, 0)._replace(plan=np.repeat([4, 9], 12))
-    score = np.arange(24.0) % 12
-    np.testing.assert_array_equal(first_of_plans(examples, score), examples.success[[11, 23]])
-
-
-def test_the_same_examples_give_the_same_critic() -> None:
-    one, other = (fit(made_up(30, 0), seed=3, epochs=2) for _ in range(2))
-    inputs = made_up(5, 1).inputs
-    np.testing.assert_array_equal(one.chance(inputs), other.chance(inputs))
 
 
 def test_beyond_what_was_seen_a_chance_stays() -> None:
@@ -304,158 +246,3 @@ def test_the_ranking_of_a_planar_planner_follows_the_critic(kind) -> None:
         planner.judge = partial(by_width, sign)
         grasp = planner(frame)[0]
         assert np.linalg.norm(grasp.position[:2] - place) < 0.04
-
-
-def test_executed_are_grasps_of_a_scene_at_rest() -> None:
-    """Across a box's narrow side the hand lifts it; 8 cm beside it closes on nothing; a hand that
-    would go into the table is not tried."""
-    config = load_config(None, ["robot.arm=none"])
-    box = load_object_set("box", cache_dir=config.cache_folder)
-    with make_cell(config) as cell:
-        scene = at_rest(cell, make_scene("isolated", box, 3, config))
-        place = scene.placements[0].position
-        T = cell.object_pose(0)
-        axis = T[:3, int(np.argmin(box[0].extents))]
-        good = Grasp(place, float(np.arctan2(axis[1], axis[0])), 0.08, 1.0)
-        assert execute(cell, scene, good)
-        assert not execute(cell, scene, replace(good, position=place + [0.0, 0.08, 0.0]))
-        assert not execute(cell, scene, replace(good, position=place - [0.0, 0.0, 0.05]))
-        assert execute(cell, scene, good)  # each on a fresh scene
-
-
-@pytest.mark.slow
-def test_examples_of_a_scene_are_a_function_of_its_number() -> None:
-    config = load_config(None, ["data.object_sets=primitives"])
-    first, again = examples_of(config, 4), examples_of(config, 4)
-    assert len(first.success) > 20
-    assert 0 < first.success.mean() < 1
-    for one, other in zip((*first.inputs, *first[1:]), (*again.inputs, *again[1:])):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_half_of_what_is_tried_is_what_the_critic_likes_best(monkeypatch) -> None:
-    class Liking(GraspCritic):
-        def chance(self, inputs: CriticInputs) -> np.ndarray:
-            return column(inputs, "cover").astype(float)
-
-    monkeypatch.setattr(critic_examples, "shipped_critic", Liking)
-    facts = np.zeros((30, len(INPUTS)), np.float32)  # all from straight above
-    facts[:, INPUTS.index("cover")] = cover = np.random.default_rng(0).permutation(30) / 30
-    inputs = CriticInputs(facts, np.zeros((30, 3, 24, 48), np.int8))
-    tried, drawn = worth_trying(inputs, 9, np.random.default_rng(1))
-    assert len(tried) == len(set(tried)) == 9
-    assert set(tried[~drawn]) == set(np.argsort(-cover)[:4])
-    others, _ = worth_trying(inputs, 9, np.random.default_rng(2))
-    assert set(tried) != set(others)
-    assert len(worth_trying(inputs.take(np.arange(3)), 9, np.random.default_rng(1))[0]) == 3
-
-
-def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn() -> None:
-    """Of each plan, the candidate of highest cover was chosen by a critic: it does not count."""
-    examples, critic = made_up(60, 1), fit(made_up(300, 0), seed=0, epochs=15)
-    chosen = first_of_plans(
-        examples._replace(success=np.arange(720)), column(examples.inputs, "cover")
-    )
-    examples.drawn[chosen] = False
-    examples.success[:] = False
-    examples.success[chosen] = True
-    assert judged(critic, examples)["graspnet6d by critic"] == 0
-    assert judged(critic, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
-
-
-def test_some_scenes_hold_larger_objects() -> None:
-    config = load_config(None, [])
-    sets = critic_examples._sets_of(config)
-    usual, large = sets["random_urdfs"][0].extents, sets["random_urdfs, large"][0].extents
-    np.testing.assert_allclose(np.divide(large, usual), 1 / 0.65, rtol=0.01)  # as their files say
-    assert "thin, large" not in sets
-
-
-def test_a_third_of_the_scenes_of_a_set_hold_its_larger_objects(monkeypatch) -> None:
-    """Of those sets that have larger ones, and of no others."""
-    drawn = []
-
-    def scene(layout: str, objects: str, seed: int, config) -> str:
-        drawn.append((layout, objects))
-        return objects
-
-    monkeypatch.setattr(critic_examples, "make_scene", scene)
-    config, rng = load_config(None, []), np.random.default_rng(0)
-    sets = {name: name for name in critic_examples._sets_of(config)}
-    for _ in range(2000):
-        critic_examples.draw_scene(config, sets, rng)  # type: ignore[arg-type]
-    names = [name for _, name in drawn]
-    for kind in ("random_urdfs", "primitives"):
-        large, usual = names.count(f"{kind}, large"), names.count(kind)
-        assert large / (large + usual) == pytest.approx(0.35, abs=0.05)
-    layouts = [layout for layout, _ in drawn]
-    assert layouts.count("household") / 2000 == pytest.approx(0.18, abs=0.03)
-    assert {name for layout, name in drawn if layout == "shelf"} == {"tall"}
-
-
-def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
-    """Of 120 scenes in files of 50, the last file is missing: its 20 scenes alone are played."""
-    played = []
-
-    def examples(config, number: int) -> Examples:
-        played.append(number)
-        return made_up(1, number)._replace(scene=np.full(12, number))
-
-    monkeypatch.setattr("benchmarks.train_critic.examples_of", examples)
-    monkeypatch.setattr(
-        "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
-    )
-    config = load_config(None, ["data.workers=1"])
-    whole = collect(config, 120, tmp_path)
-    assert played == list(range(120))
-    (tmp_path / "scenes-00100-00119.npz").unlink()
-    played.clear()
-    again = collect(config, 120, tmp_path)
-    assert played == list(range(100, 120))
-    for one, other in zip((*whole.inputs, *whole[1:]), (*again.inputs, *again[1:])):
-        np.testing.assert_array_equal(one, other)
-    with pytest.raises(UserError, match="holds grasps of another seed; give another folder"):
-        collect(load_config(None, ["seed=1"]), 120, tmp_path)
-    (tmp_path / "scenes-00000-00049.npz").write_bytes(b"no archive")
-    with pytest.raises(UserError, match=r"scenes-00000-00049\.npz: holds no executed grasps"):
-        collect(config, 120, tmp_path)
-    (tmp_path / "settings.json").write_text("{")
-    with pytest.raises(UserError, match=r"settings\.json: cannot be read"):
-        collect(config, 120, tmp_path)
-
-
-def test_a_critic_goes_on_from_another_ones_weights() -> None:
-    """Of a rule that is known already, few examples take nothing away."""
-    known = fit(made_up(300, 0), seed=0, epochs=15)
-    few = made_up(20, 2)
-    again, anew = fit(few, seed=0, epochs=1, initial=known), fit(few, seed=0, epochs=1)
-    torch.testing.assert_close(again.mean, known.mean)
-    tested = made_up(100, 1)
-    assert judged(again, tested)["graspnet6d by critic"] > 0.8
-    assert judged(anew, tested)["graspnet6d by critic"] < 0.7
-
-
-def test_too_few_scenes_are_refused(tmp_path) -> None:
-    with pytest.raises(UserError, match="--scenes 3: give 10 or more"):
-        train(["--scenes", "3", "--output", str(tmp_path / "critic.pt")])
-
-
-def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys) -> None:
-    """20 scenes of 12 grasps, 2 of which are held out, and 12 scenes of another run, of which those
-    with the numbers of held-out ones, 0 and 10, are left out, too."""
-    monkeypatch.setattr(
-        "benchmarks.train_critic.examples_of",
-        lambda config, number: made_up(1, number)._replace(scene=np.full(12, number)),
-    )
-    monkeypatch.setattr(
-        "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
-    )
-    monkeypatch.setattr("benchmarks.train_critic.EPOCHS", 1)
-    more = tmp_path / "more"
-    others = [made_up(1, k)._replace(scene=np.full(12, k)) for k in range(12)]
-    Examples.joined(others).save(more / "scenes-00000-00011.npz")
-    call = ["--output", str(tmp_path / "c.pt"), "--scenes", "20", "--examples", str(tmp_path / "e")]
-    assert train([*call, "--more", str(more), "data.workers=1"]) == 0
-    assert f"learned from {18 * 12 + 10 * 12}\n" in capsys.readouterr().out
-    with pytest.raises(UserError, match=r"--more .*nothing: holds no executed grasps"):
-        train([*call, "--more", str(tmp_path / "nothing"), "data.workers=1"])

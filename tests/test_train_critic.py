@@ -1,0 +1,117 @@
+"""Training the critic: what it learns of executed grasps, and where these are kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.train_critic import collect, first_of_plans, fit, judged
+from benchmarks.train_critic import main as train
+from envs.critic_examples import PLANNERS, Examples
+from tests.helpers.executed_grasps import column, made_up
+from utils.config import load_config
+from utils.errors import UserError
+
+
+@pytest.mark.parametrize("by_patch", [False, True])
+def test_a_rule_is_learned(by_patch) -> None:
+    critic = fit(made_up(300, 0, by_patch), seed=0, epochs=25)
+    scores = judged(critic, made_up(100, 1, by_patch))
+    for name in PLANNERS:
+        assert scores[f"{name} by search"] < 0.2  # and as many nothing else
+        assert scores[f"{name} by critic"] > 0.8  # a sixteenth of the plans holds no success
+    assert scores["calibration error"] < 0.05
+
+
+def test_the_first_of_each_plan_is_the_one_of_highest_score() -> None:
+    examples = made_up(2, 0)._replace(plan=np.repeat([4, 9], 12))
+    score = np.arange(24.0) % 12
+    np.testing.assert_array_equal(first_of_plans(examples, score), examples.success[[11, 23]])
+
+
+def test_the_same_examples_give_the_same_critic() -> None:
+    one, other = (fit(made_up(30, 0), seed=3, epochs=2) for _ in range(2))
+    inputs = made_up(5, 1).inputs
+    np.testing.assert_array_equal(one.chance(inputs), other.chance(inputs))
+
+
+def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn() -> None:
+    """Of each plan, the candidate of highest cover was chosen by a critic: it does not count."""
+    examples, critic = made_up(60, 1), fit(made_up(300, 0), seed=0, epochs=15)
+    chosen = first_of_plans(
+        examples._replace(success=np.arange(720)), column(examples.inputs, "cover")
+    )
+    examples.drawn[chosen] = False
+    examples.success[:] = False
+    examples.success[chosen] = True
+    assert judged(critic, examples)["graspnet6d by critic"] == 0
+    assert judged(critic, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
+
+
+def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
+    """Of 120 scenes in files of 50, the last file is missing: its 20 scenes alone are played."""
+    played = []
+
+    def examples(config, number: int) -> Examples:
+        played.append(number)
+        return made_up(1, number)._replace(scene=np.full(12, number))
+
+    monkeypatch.setattr("benchmarks.train_critic.examples_of", examples)
+    monkeypatch.setattr(
+        "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
+    )
+    config = load_config(None, ["data.workers=1"])
+    whole = collect(config, 120, tmp_path)
+    assert played == list(range(120))
+    (tmp_path / "scenes-00100-00119.npz").unlink()
+    played.clear()
+    again = collect(config, 120, tmp_path)
+    assert played == list(range(100, 120))
+    for one, other in zip((*whole.inputs, *whole[1:]), (*again.inputs, *again[1:])):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(UserError, match="holds grasps of another seed; give another folder"):
+        collect(load_config(None, ["seed=1"]), 120, tmp_path)
+    (tmp_path / "scenes-00000-00049.npz").write_bytes(b"no archive")
+    with pytest.raises(UserError, match=r"scenes-00000-00049\.npz: holds no executed grasps"):
+        collect(config, 120, tmp_path)
+    (tmp_path / "settings.json").write_text("{")
+    with pytest.raises(UserError, match=r"settings\.json: cannot be read"):
+        collect(config, 120, tmp_path)
+
+
+def test_a_critic_goes_on_from_another_ones_weights() -> None:
+    """Of a rule that is known already, few examples take nothing away."""
+    known = fit(made_up(300, 0), seed=0, epochs=15)
+    few = made_up(20, 2)
+    again, anew = fit(few, seed=0, epochs=1, initial=known), fit(few, seed=0, epochs=1)
+    torch.testing.assert_close(again.mean, known.mean)
+    tested = made_up(100, 1)
+    assert judged(again, tested)["graspnet6d by critic"] > 0.8
+    assert judged(anew, tested)["graspnet6d by critic"] < 0.7
+
+
+def test_too_few_scenes_are_refused(tmp_path) -> None:
+    with pytest.raises(UserError, match="--scenes 3: give 10 or more"):
+        train(["--scenes", "3", "--output", str(tmp_path / "critic.pt")])
+
+
+def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys) -> None:
+    """20 scenes of 12 grasps, 2 of which are held out, and 12 scenes of another run, of which those
+    with the numbers of held-out ones, 0 and 10, are left out, too."""
+    monkeypatch.setattr(
+        "benchmarks.train_critic.examples_of",
+        lambda config, number: made_up(1, number)._replace(scene=np.full(12, number)),
+    )
+    monkeypatch.setattr(
+        "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
+    )
+    monkeypatch.setattr("benchmarks.train_critic.EPOCHS", 1)
+    more = tmp_path / "more"
+    others = [made_up(1, k)._replace(scene=np.full(12, k)) for k in range(12)]
+    Examples.joined(others).save(more / "scenes-00000-00011.npz")
+    call = ["--output", str(tmp_path / "c.pt"), "--scenes", "20", "--examples", str(tmp_path / "e")]
+    assert train([*call, "--more", str(more), "data.workers=1"]) == 0
+    assert f"learned from {18 * 12 + 10 * 12}\n" in capsys.readouterr().out
+    with pytest.raises(UserError, match=r"--more .*nothing: holds no executed grasps"):
+        train([*call, "--more", str(tmp_path / "nothing"), "data.workers=1"])
