@@ -88,10 +88,9 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
             f"{run}: its objects.split is {config.objects.split}; what planners state is fitted to "
             "training objects alone: play it with objects.split=train, or omit --output"
         )
-    if output is not None and config.evaluate.abstain > 0:
+    if output is not None and config.evaluate.abstain != 0:
         raise UserError(
-            f"{run}: evaluate.abstain is {config.evaluate.abstain}, so that only the surest grasps "
-            "were tried; play it with evaluate.abstain=0, or omit --output"
+            f"{run}: not all grasps were tried; play it with evaluate.abstain=0, or omit --output"
         )
     return read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
 

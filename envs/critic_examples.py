@@ -203,7 +203,7 @@ def _planners_of(config: Config, opens_fully: bool) -> list[Judged]:
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     return [  # in the order of PLANNERS; these critics are never asked
         GraspNetFanPlanner(gripper, workspace, critic=GraspCritic()),
-        GraspNetPlanner(gripper, workspace),
+        GraspNetPlanner(gripper, workspace, critic=GraspCritic()),
         GraspNetDirectPlanner(gripper, workspace, critic=GraspCritic()),
     ]
 

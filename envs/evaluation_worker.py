@@ -22,7 +22,7 @@ from envs.policy_approach import (
     learned_approach,
     placeholder,
 )
-from envs.rounds import run_round
+from envs.rounds import least_quality, run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
@@ -72,7 +72,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
         for scenario in config.evaluate.scenarios:
             if SCENARIOS[scenario].layout == TARGET_LAYOUT and planner is not None:
                 check_takes_targets(planner, f"{key}: {name}", f"play {scenario!r}")
-        if config.evaluate.abstain > 0 and (planner is None or calibration_of(planner) is None):
+        states_chances = planner is not None and calibration_of(planner) is not None
+        if config.evaluate.abstain and not states_chances:
             raise UserError(
                 f"evaluate.abstain: {name} states no chances of success; allowed with it are "
                 f"{', '.join(calibrations())}, or evaluate.abstain=0"
@@ -148,7 +149,8 @@ def work(config: Config, task: Task) -> TaskResult:
         result.rounds.append(
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
-                max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
+                max_failures=config.evaluate.max_failures,
+                abstain=least_quality(planner, config.evaluate.abstain),
                 second_look=config.evaluate.second_look, scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )

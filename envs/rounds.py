@@ -53,6 +53,7 @@ TRIED_ANGLE = np.deg2rad(30)
 ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
+HOPELESS = 0.1  # chance of success below which a grasp is not tried
 
 
 class GraspFinder(Protocol):
@@ -293,6 +294,14 @@ def _abstained(grasps: Sequence[Grasp], least: float) -> str:
     """Why none of the grasps is tried; empty where there are none."""
     best = max((grasp.quality for grasp in grasps), default=None)
     return "" if best is None else f"abstained: the best quality is {best:.2f}, under {least:g}"
+
+
+def least_quality(planner: Planner, abstain: float | None) -> float:
+    """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
+    out what is hopeless, where the planner states chances of success."""
+    if abstain is not None:
+        return abstain
+    return 0.0 if calibration_of(planner) is None else HOPELESS
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:

@@ -110,14 +110,11 @@ class Judged:
 
 
 class GraspNetPlanner(Judged, SearchPlanner):
-    """Antipodal search ranked by a network, on the RGB-D image alone.
+    """Antipodal search ranked by a network, then by a critic, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. critic: has the last word; without
-    one, planners that rank by a critic have the shipped one, and the others none. Raises UserError
-    if a file cannot be loaded.
+    checkpoint: file of the network, unless `network` is given. critic: has the last word; the
+    shipped one where none is given. Raises UserError if a file cannot be loaded.
     """
-
-    ranks_by_critic = False
 
     def __init__(
         self,
@@ -131,8 +128,7 @@ class GraspNetPlanner(Judged, SearchPlanner):
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
-        if critic is not None or self.ranks_by_critic:
-            self.judge = chances_by(critic or shipped_critic())
+        self.judge = chances_by(critic or shipped_critic())
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
@@ -156,11 +152,9 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
     At each peak of the quality map, and at the angles that the network prefers there, a grasp is
     posed on the height map: centred between its contacts, turned onto the faces, as deep as a label
-    is or a little more or less. Of those whose fingers and palm find room, a critic judges the ones
-    that `graspnet` would rank first.
+    is or a little more or less. Of those whose fingers and palm find room, the critic judges the
+    ones that the search would rank first.
     """
-
-    ranks_by_critic = True
 
     def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
         value = partial(seen.value, heights)

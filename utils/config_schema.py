@@ -214,7 +214,7 @@ class EvaluateConfig(Section):
     randomise: bool
     workers: Count | None
     max_failures: Count
-    abstain: Annotated[float, Field(ge=0, le=1)]
+    abstain: Annotated[float, Field(ge=0, le=1)] | None
     second_look: Annotated[float, Field(ge=0)]
     videos: Annotated[int, Field(ge=0)]
     film_format: Literal["mp4", "gif"]
