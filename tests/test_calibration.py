@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything
-from envs.rounds import run_round
+from envs.rounds import HOPELESS, least_quality, run_round
 from models.graspnet_io import SHIPPED
 from models.planners import (
     CALIBRATIONS,
@@ -246,6 +246,17 @@ def test_grasps_of_less_quality_are_not_tried(bullet_cell, box_set) -> None:
     none = play(0.7)
     assert none.ended == "no_plan" and tried == []
     assert none.attempts[0].detail == "abstained: the best quality is 0.60, under 0.7"
+
+
+def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:
+    """By planners that state chances; a score of 0.05 may be a planner's best."""
+    gripper, workspace = GripperGeometry(), Workspace()
+    stated, scored = (
+        make_planner(name, gripper, workspace, 0) for name in ("heuristic", str(SHIPPED))
+    )
+    assert [least_quality(stated, abstain) for abstain in (None, 0.0, 0.7)] == [HOPELESS, 0.0, 0.7]
+    assert least_quality(scored, None) == 0.0
+    assert load_config(DEFAULTS).evaluate.abstain is None
 
 
 @pytest.mark.parametrize("policy", ["checkpoints/graspnet.pt", "ppo"])
