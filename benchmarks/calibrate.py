@@ -90,7 +90,8 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
         )
     if output is not None and config.evaluate.abstain != 0:
         raise UserError(
-            f"{run}: not all grasps were tried; play it with evaluate.abstain=0, or omit --output"
+            f"{run}: not all grasps may have been tried; play it with evaluate.abstain=0, or omit "
+            "--output"
         )
     return read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
 

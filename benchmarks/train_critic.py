@@ -8,8 +8,8 @@ are learned from as well, whatever they were played with. Every tenth scene is h
 prints how often the candidate that is ranked first succeeds, of those that were drawn at random, by
 the search alone, by the critic that it began with, and by the new one, how far the stated chances
 of all are from frequencies, and their log loss. Written to checkpoints/critic.pt, the critic is
-what graspnet6d and graspnet_direct rank by from then on; their chances of success are then fitted
-again (`benchmarks.calibrate`).
+what graspnet, graspnet_direct and graspnet6d rank by from then on; their chances of success are
+then fitted again (`benchmarks.calibrate`).
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
         if config.evaluate.abstain and not states_chances:
             raise UserError(
                 f"evaluate.abstain: {name} states no chances of success; allowed with it are "
-                f"{', '.join(calibrations())}, or evaluate.abstain=0"
+                f"{', '.join(calibrations())}, or evaluate.abstain=null"
             )
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")
@@ -150,7 +150,7 @@ def work(config: Config, task: Task) -> TaskResult:
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
                 max_failures=config.evaluate.max_failures,
-                abstain=least_quality(planner, config.evaluate.abstain),
+                abstain=least_quality(planner, config.evaluate.abstain, cell.has_arm),
                 second_look=config.evaluate.second_look, scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )

@@ -1,10 +1,11 @@
 """One round of clutter removal: a policy picks until the scene is empty or the policy gives up.
 
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
-the planner finds no grasp, or after `max_failures` failed grasps in a row. A round also ends when
-its planner raises an exception. What has failed is not tried again at once, for often nothing has
-moved: grasps elsewhere that are more likely to succeed than not (whose quality is 0.5 or more) come
-first, and of the others those that are not alike one that has just failed.
+the planner finds no grasp that is likely enough, or after `max_failures` failed grasps in a row. A
+round also ends when its planner raises an exception. What has failed is not tried again at once,
+for often nothing has moved: grasps elsewhere that are more likely to succeed than not (whose
+quality is 0.5 or more) come first, and of the others those that are not alike one that has just
+failed.
 
 Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
 would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
@@ -296,12 +297,12 @@ def _abstained(grasps: Sequence[Grasp], least: float) -> str:
     return "" if best is None else f"abstained: the best quality is {best:.2f}, under {least:g}"
 
 
-def least_quality(planner: Planner, abstain: float | None) -> float:
+def least_quality(planner: Planner, abstain: float | None, has_arm: bool = True) -> float:
     """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
-    out what is hopeless, where the planner states chances of success."""
+    out what is hopeless, where the planner states chances of success, which are an arm's."""
     if abstain is not None:
         return abstain
-    return 0.0 if calibration_of(planner) is None else HOPELESS
+    return HOPELESS if has_arm and calibration_of(planner) is not None else 0.0
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:

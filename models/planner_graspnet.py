@@ -1,11 +1,11 @@
-"""GraspNet as a planner: the antipodal search proposes grasps, the network ranks them.
+"""GraspNet as a planner: the antipodal search proposes grasps, the network and a critic rank them.
 
 A network's maps are exact to a few millimetres; fingers beside an object need better. So the
 antipodal search proposes exact poses, and the network's quality at their places and angles is a
 factor on their scores: before they are measured on the height map, so that few have to be, and
-after. In the holes of the depth image, colours tell which surface is seen (`table_in_holes`,
-`surfaces_in_holes`). Where the network has a centre head, its votes tell the objects apart
-(`models.graspnet_objects`).
+after. Of the best, a critic says how likely they succeed (`models.grasp_critic`). In the holes of
+the depth image, colours tell which surface is seen (`table_in_holes`, `surfaces_in_holes`). Where
+the network has a centre head, its votes tell the objects apart (`models.graspnet_objects`).
 """
 
 from __future__ import annotations
@@ -112,8 +112,9 @@ class Judged:
 class GraspNetPlanner(Judged, SearchPlanner):
     """Antipodal search ranked by a network, then by a critic, on the RGB-D image alone.
 
-    checkpoint: file of the network, unless `network` is given. critic: has the last word; the
-    shipped one where none is given. Raises UserError if a file cannot be loaded.
+    checkpoint: file of the network, unless `network` is given. critic: has the last word; where
+    none is given, the shipped one for the shipped network, with which it was trained, and none for
+    others. Raises UserError if a file cannot be loaded.
     """
 
     def __init__(
@@ -128,7 +129,10 @@ class GraspNetPlanner(Judged, SearchPlanner):
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
-        self.judge = chances_by(critic or shipped_critic())
+        if critic is None and network is None and checkpoint.resolve() == SHIPPED:
+            critic = shipped_critic()
+        if critic is not None:
+            self.judge = chances_by(critic)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
@@ -136,7 +140,8 @@ class GraspNetPlanner(Judged, SearchPlanner):
         heights = only_target(seen.heights, frame)
         if len(heights.centres) == 0:  # table and walls alone
             return []
-        found = self.judged(heights, self.found(heights, seen), seen, PLANAR_JUDGED)
+        count = max(PLANAR_JUDGED, self.settings.returned)
+        found = self.judged(heights, self.found(heights, seen), seen, count)
         return self.grasps(found, frame.roughness)
 
     def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:

@@ -42,8 +42,8 @@ class Planner(Protocol):
 
     needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
     tilts: True if grasps come from any side, and not from straight above alone.
-    calibration: by which qualities are chances of success (`utils.calibration.Calibration`);
-        without the attribute, or with None, they are scores.
+    calibration: by which qualities are chances of success (`utils.calibration.Calibration`), so
+        that hopeless grasps are not tried; without the attribute, or with None, they are scores.
     reset(seed): called before each scene, for planners that draw random numbers.
     segments(frame): (H, W) int32, the number of the object at each pixel, -1 where there is none;
         a planner that has it honours `RGBDFrame.target` and returns grasps of that object alone.
@@ -199,8 +199,8 @@ def make_planner(
     `plugin_planner`. seed: starts the planner's own random generator. key: of the
     config, where the name stands; for errors.
 
-    The qualities of the project's own planners, with the shipped weights, are chances of success
-    (`CALIBRATIONS`); those of others are scores of their own.
+    The qualities of the project's own planners are chances of success (`CALIBRATIONS`); those of
+    others, and of checkpoints, are scores of their own.
 
     Raises UserError for any other name, and for a file or module that cannot be loaded.
     """

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.calibrate import grasps_of, main
-from envs.evaluation_worker import check_everything
+from envs.evaluation_worker import check_everything, work
 from envs.rounds import HOPELESS, least_quality, run_round
 from models.graspnet_io import SHIPPED
 from models.planners import (
@@ -39,6 +39,7 @@ from utils.calibration import (
 from utils.config import DEFAULTS, dump_config, load_config
 from utils.depth_correction import corrected
 from utils.errors import UserError
+from utils.evaluation import Task
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import AttemptRecord, RoundRecord, append_round, read_rounds
 from utils.results import stated_chances, summarise
@@ -255,8 +256,25 @@ def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:
         make_planner(name, gripper, workspace, 0) for name in ("heuristic", str(SHIPPED))
     )
     assert [least_quality(stated, abstain) for abstain in (None, 0.0, 0.7)] == [HOPELESS, 0.0, 0.7]
-    assert least_quality(scored, None) == 0.0
+    assert least_quality(scored, None) == least_quality(stated, None, has_arm=False) == 0.0
     assert load_config(DEFAULTS).evaluate.abstain is None
+
+
+@pytest.mark.parametrize(
+    ("planner", "settings", "tried"),
+    [
+        ("chance", [], False),
+        ("chance", ["evaluate.abstain=0"], True),
+        ("chance", ["robot.arm=none"], True),
+        ("score", [], True),
+    ],
+)
+def test_the_evaluation_does_not_try_hopeless_grasps(planner, settings, tried) -> None:
+    config = load_config(None, settings)
+    name = f"tests.helpers.unlikely:{planner}"
+    policies = ((name, "open_loop", "none"),)
+    (record,) = work(config, Task("box", "isolated", 0, policies)).rounds
+    assert record.attempts[0].executed == tried
 
 
 @pytest.mark.parametrize("policy", ["checkpoints/graspnet.pt", "ppo"])
@@ -319,7 +337,7 @@ def test_runs_that_do_not_tell_how_rough_their_frames_were_are_not_fitted(tmp_pa
 def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path, capsys) -> None:
     for split in ("train", "test"):
         (tmp_path / split).mkdir()
-        config = load_config(None, [f"objects.split={split}"])
+        config = load_config(None, [f"objects.split={split}", "evaluate.abstain=0"])
         (tmp_path / split / "config.yaml").write_text(dump_config(config))
         grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
         append_round(tmp_path / split / "rounds.jsonl", played("heuristic", grasps))
@@ -347,10 +365,11 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
     with pytest.raises(UserError, match="split is test.*training objects alone"):
         main([str(tmp_path / "test"), "--output", str(file)])
     assert main([str(tmp_path / "test")]) == 0
-    surest = load_config(None, ["objects.split=train", "evaluate.abstain=0.5"])
-    (tmp_path / "train" / "config.yaml").write_text(dump_config(surest))
-    with pytest.raises(UserError, match="not all grasps were tried"):
-        main([str(tmp_path / "train"), "--output", str(file)])
+    for abstain in ("0.5", "null"):
+        surest = load_config(None, ["objects.split=train", f"evaluate.abstain={abstain}"])
+        (tmp_path / "train" / "config.yaml").write_text(dump_config(surest))
+        with pytest.raises(UserError, match="not all grasps may have been tried"):
+            main([str(tmp_path / "train"), "--output", str(file)])
     with pytest.raises(UserError, match=r"no rounds.jsonl"):
         main([str(tmp_path / "nothing")])
 
