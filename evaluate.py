@@ -196,6 +196,10 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
     for record in different:
         print(f"different: {record.policy}, {record.scenario}, scene {record.seed}")
     print(f"{len(sample.rounds) - len(different)} of {len(sample.rounds)} rounds are the same")
+    if different:
+        print(
+            f"code that has changed plays other rounds: `git checkout {sample.commit}` has theirs"
+        )
     return 1 if different else 0
 
 

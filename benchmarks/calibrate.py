@@ -1,15 +1,18 @@
 """Chances of success from scores: python -m benchmarks.calibrate RUN... [--output FILE.json]
 
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
-(`utils.calibration`) and prints the expected calibration error before and after, in each scenario
-and with each depth noise. With --output the fits are written: into checkpoints/calibration.json,
-they are what the planners state from then on; planners that the runs do not have keep theirs.
+(`utils.calibration`) and prints the expected calibration error in each scenario and with each depth
+noise, as stated, and as fitted to these same grasps. With --output the fits are written: into
+checkpoints/calibration.json, they are what the planners state from then on; planners that the runs
+do not have keep theirs.
 `make calibration` plays all planners on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
     python evaluate.py --config configs/calibration_household.yaml
+    python evaluate.py --config configs/calibration_flat.yaml
     python -m benchmarks.calibrate runs/evaluate/<time>-calibration \\
-        runs/evaluate/<time>-calibration-household --output checkpoints/calibration.json
+        runs/evaluate/<time>-calibration-household runs/evaluate/<time>-calibration-flat \\
+        --output checkpoints/calibration.json
 """
 
 from __future__ import annotations
@@ -58,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             some = [one for one in own if kind in (None, (one.scenario, one.depth_noise))]
             if len(grasps_of(some).scores) > 0:
                 lines.append([name, *(kind or ("all", "all")), *errors(fitted, some)])
-    header = ["planner", "scenario", "depth", "grasps", "success", "error before", "after"]
+    header = ["planner", "scenario", "depth", "grasps", "success", "error as stated", "as fitted"]
     print(aligned(header, lines, range(3, 7)))
     if options.output is not None:
         write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})

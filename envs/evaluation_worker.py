@@ -75,7 +75,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
         states_chances = planner is not None and calibration_of(planner) is not None
         if config.evaluate.abstain and not states_chances:
             raise UserError(
-                f"evaluate.abstain: {name} states no chances of success; allowed with it are "
+                f"evaluate.abstain: {name} states no chances of success (it has no `calibration`); "
+                "allowed with it are "
                 f"{', '.join(calibrations())}, or evaluate.abstain=null"
             )
     if config.evaluate.second_look > 0:

@@ -294,7 +294,7 @@ def _details(*sentences: str) -> str:
 def _abstained(grasps: Sequence[Grasp], least: float) -> str:
     """Why none of the grasps is tried; empty where there are none."""
     best = max((grasp.quality for grasp in grasps), default=None)
-    return "" if best is None else f"abstained: the best quality is {best:.2f}, under {least:g}"
+    return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
 
 
 def least_quality(planner: Planner, abstain: float | None, has_arm: bool = True) -> float:

@@ -29,12 +29,13 @@ from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.simulators import make_cell
 from utils.errors import UserError
-from utils.runs import parse_args, run_script
+from utils.runs import check_writable, parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
 FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
+PICTURES = (".png", ".jpg", ".jpeg")
 _HOLD = 6  # pictures for which the last one of an episode stays
 
 
@@ -127,12 +128,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
 
 def write_rgbd(frame: RGBDFrame, folder: Path) -> list[str]:
     """Write color.png, depth.png in millimetres, intrinsics.json in pixels and T_WC.txt of a frame
-    into a new folder; returns the arguments with which predict.py reads them.
-
-    Raises UserError if the folder exists.
-    """
-    if folder.exists():
-        raise UserError(f"--rgbd {folder}: this folder exists; give one that does not")
+    into a new folder; returns the arguments with which predict.py reads them."""
     folder.mkdir(parents=True)
     imageio.imwrite(folder / "color.png", frame.rgb)
     imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
@@ -146,6 +142,15 @@ def write_rgbd(frame: RGBDFrame, folder: Path) -> list[str]:
         "--camera-pose": "T_WC.txt", "--out": "grasps",
     }  # fmt: skip
     return [text for option, name in files.items() for text in (option, str(folder / name))]
+
+
+def check_files(picture: Path | None, folder: Path | None) -> None:
+    """Raise UserError where the picture or the new folder could not be written at the end."""
+    check_writable("--output", picture)
+    if picture is not None and picture.suffix.lower() not in PICTURES:
+        raise UserError(f"--output {picture}: expected a file {' or '.join(PICTURES)}")
+    if folder is not None and folder.exists():
+        raise UserError(f"--rgbd {folder}: this name is taken; give a folder that does not exist")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -164,6 +169,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
+    check_files(chosen.output, chosen.rgbd)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )

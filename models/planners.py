@@ -211,7 +211,14 @@ def make_planner(
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
     if is_import_path(name):
-        return plugin_planner(name, gripper, workspace, seed, key)
+        planner = plugin_planner(name, gripper, workspace, seed, key)
+        chances = calibration_of(planner)
+        if not isinstance(chances, Calibration | None):
+            raise UserError(
+                f"{key}: the attribute `calibration` of {name!r} is {chances!r:.40}, expected a "
+                "utils.calibration.Calibration or None"
+            )
+        return planner
     others = ("a GraspNet checkpoint FILE.pt", "module:name", "ppo", "ppo:FILE.pt", "sb3:FILE.zip")
     raise unknown_choice(key, name, [*PLANNERS, *others])
 

@@ -246,7 +246,7 @@ def test_grasps_of_less_quality_are_not_tried(bullet_cell, box_set) -> None:
     assert play(0.5).ended == "failures" and tried == [0.6, 0.6]
     none = play(0.7)
     assert none.ended == "no_plan" and tried == []
-    assert none.attempts[0].detail == "abstained: the best quality is 0.60, under 0.7"
+    assert none.attempts[0].detail == "abstained: the best quality is 0.6, under 0.7"
 
 
 def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:

@@ -127,6 +127,8 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     Raises ConfigError on a missing file, bad YAML, an unknown key, a wrong type or range.
     """
     layers = [] if path is None else [Layer(str(path), read_config(Path(path)))]
+    for layer in layers:
+        _check_sections(layer)
     layers += [Layer("command line", _parse_override(text)) for text in overrides]
     return _over_defaults(layers)
 
@@ -366,6 +368,23 @@ def _without(values: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 
 
 # --- What is wrong with a config -------------------------------------------------------------
+
+
+def _check_sections(layer: Layer) -> None:
+    """Raise ConfigError where a file has a dotted key, or something else than keys as a section:
+    laid over each other, such layers would hide which of them is wrong."""
+    for name, value in layer.values.items():
+        section, _, rest = name.partition(".")
+        if rest and "properties" in (schema_at(section) or {}):
+            raise ConfigError(
+                f"{name}: dots are for the command line ({layer.source}); in a file, write "
+                f"{section}: and below it, indented, {rest}: {_shown(value)}"
+            )
+        schema = schema_at(name) or {}
+        if "properties" in schema and not isinstance(value, dict):
+            raise ConfigError(
+                f"{name}: got {_shown(value)} ({layer.source}); expected {allowed(schema)}"
+            )
 
 
 @cache

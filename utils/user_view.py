@@ -101,6 +101,12 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
             f"at most {MOST_OBLIQUE:g} are allowed; look more from above"
         )
     remarks = []
+    (height, width), (cx, cy) = frame.depth.shape, frame.K[:2, 2]
+    if not (0 <= cx < width and 0 <= cy < height):
+        remarks.append(
+            f"the principal point ({cx:g}, {cy:g}) lies outside the image of {width}x{height} "
+            "pixels: right for a part of an image, wrong for intrinsics of another resolution"
+        )
     if tilt > OBLIQUE:
         remarks.append(
             f"the camera looks {tilt:.0f} degrees off the table's normal; planners are measured up "
