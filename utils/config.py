@@ -374,13 +374,13 @@ def _check_sections(layer: Layer) -> None:
     """Raise ConfigError where a file has a dotted key, or something else than keys as a section:
     laid over each other, such layers would hide which of them is wrong."""
     for name, value in layer.values.items():
-        section, _, rest = name.partition(".")
+        section, _, rest = str(name).partition(".")
         if rest and "properties" in (schema_at(section) or {}):
             raise ConfigError(
                 f"{name}: dots are for the command line ({layer.source}); in a file, write "
                 f"{section}: and below it, indented, {rest}: {_shown(value)}"
             )
-        schema = schema_at(name) or {}
+        schema = schema_at(str(name)) or {}
         if "properties" in schema and not isinstance(value, dict):
             raise ConfigError(
                 f"{name}: got {_shown(value)} ({layer.source}); expected {allowed(schema)}"
