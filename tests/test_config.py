@@ -154,6 +154,7 @@ def test_bad_override(override, parts):
         ("sede: 1\n", ["sede: unknown key", "did you mean seed?"]),
         ("camera:\n  wdith: 3\n", ["camera.wdith", "did you mean camera.width?"]),
         ("camera:\n", ["camera: got null", "a section with the keys"]),
+        ("evaluate.rounds: 2\n", ["evaluate.rounds: dots are for the command line", "rounds: 2"]),
         ("seed: 1\nseed: 2\n", ["stands twice", "line 2"]),
         ("1: 2\n", ["text"]),
         ("seed: -1\n", ["seed: got -1", ">= 0"]),
