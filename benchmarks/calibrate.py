@@ -2,7 +2,8 @@
 
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
 (`utils.calibration`) and prints the expected calibration error in each scenario and with each depth
-noise, as stated, and as fitted to these same grasps. With --output the fits are written: into
+noise, as stated, and as fitted to these same grasps, and how many succeeded of those whose stated
+chance is hopeless (`envs.rounds.HOPELESS`). With --output the fits are written: into
 checkpoints/calibration.json, they are what the planners state from then on; planners that the runs
 do not have keep theirs.
 `make calibration` plays all planners on training objects and fits them all again:
@@ -26,6 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.rounds import HOPELESS
 from models.planners import PLANNERS
 from utils.calibration import Calibration, calibration_error
 from utils.config import load_config
@@ -62,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             if len(grasps_of(some).scores) > 0:
                 lines.append([name, *(kind or ("all", "all")), *errors(fitted, some)])
     header = ["planner", "scenario", "depth", "grasps", "success", "error as stated", "as fitted"]
-    print(aligned(header, lines, range(3, 7)))
+    header.append(f"under {HOPELESS:g}")
+    print(aligned(header, lines, range(3, 8)))
     if options.output is not None:
         write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})
         print(f"wrote {options.output}")
@@ -140,12 +143,15 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
 
 
 def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
-    """Cells: grasps, their share of successes, the calibration error as stated and as fitted."""
+    """Cells: grasps, their share of successes, the calibration error as stated and as fitted, and
+    the successes of the hopeless ones."""
     scores, stated, successes, roughness = grasps_of(rounds)
+    hopeless = successes[stated < HOPELESS]
     return [
         str(len(stated)), f"{100 * successes.mean():.0f} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
         f"{calibration_error(fitted(scores, roughness), successes):.3f}",
+        f"{hopeless.sum()}/{len(hopeless)}",
     ]  # fmt: skip
 
 

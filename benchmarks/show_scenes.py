@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.cell_scenes import make_scene
 from envs.evaluation_worker import load_objects, new_planner
-from envs.rounds import least_quality, run_round
+from envs.rounds import run_round
 from envs.simulators import make_cell
 from envs.studio import Film, write_film
 from utils.config import Config
@@ -47,13 +47,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 def film(config: Config, layout: str, objects: str) -> list[np.ndarray]:
     """Pictures (H, W, 3) uint8 of one round."""
     scene = make_scene(layout, load_objects(objects, config), config.seed, config)
-    planner = new_planner(PLANNER, config)
     with make_cell(config) as cell:
         filming = Film(cell, _RATE, _SIZE)
         record = run_round(
-            cell, scene, planner, policy=PLANNER, objects=objects,
-            max_failures=config.evaluate.max_failures,
-            abstain=least_quality(planner, config.evaluate.abstain),
+            cell, scene, new_planner(PLANNER, config), policy=PLANNER, objects=objects,
+            max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
         )  # fmt: skip
         pictures = filming.stop()
     outcome = f"{layout}: {record.objects_cleared} of {record.objects_total} in the bin"

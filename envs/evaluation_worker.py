@@ -22,7 +22,7 @@ from envs.policy_approach import (
     learned_approach,
     placeholder,
 )
-from envs.rounds import least_quality, run_round
+from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
@@ -150,8 +150,7 @@ def work(config: Config, task: Task) -> TaskResult:
         result.rounds.append(
             run_round(
                 cell, scene, planner, policy=name, objects=task.objects,
-                max_failures=config.evaluate.max_failures,
-                abstain=least_quality(planner, config.evaluate.abstain, cell.has_arm),
+                max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
                 second_look=config.evaluate.second_look, scenario=task.scenario,
                 controller=controller, on_attempt=keep, approach_by=approach,
             )

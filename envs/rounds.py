@@ -83,7 +83,7 @@ def run_round(
     controller: str = OPEN_LOOP,
     on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
     approach_by: GraspFinder | None = None,
-    abstain: float = 0.0,
+    abstain: float | None = 0.0,
     second_look: float = 0.0,
 ) -> RoundRecord:
     """Load a scene, let a planner work on it, and return the record.
@@ -95,13 +95,14 @@ def run_round(
     on_attempt: called after every executed grasp with the frame that it was planned on.
     approach_by: a policy that finds its own grasps on the way; the planned ones are ignored.
     abstain: grasps of less quality are not tried; where there are no others, the round ends as if
-        the planner had found none.
+        the planner had found none. None: see `least_quality`.
     second_look: cm3 of open space that a second frame has to show for the arm to take it before an
         attempt; 0: it takes none. Planners that see the truth need none, nor do learned policies.
     """
     scenario = scenario or scene.layout
     conditions = SCENARIOS[scenario]
     privileged, chances = needs_truth(plan), calibration_of(plan)
+    least = least_quality(plan, abstain, cell.has_arm)
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
     calibration = conditions.calibration(cell)
@@ -146,9 +147,9 @@ def run_round(
                     )
             finally:
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
-            worth = [grasp for grasp in grasps if grasp.quality >= abstain]
+            worth = [grasp for grasp in grasps if grasp.quality >= least]
             if not worth:
-                detail = _details(look_again.remark, _abstained(grasps, abstain))
+                detail = _details(look_again.remark, _abstained(grasps, least))
                 spent = look_again.sim_seconds
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
@@ -297,7 +298,7 @@ def _abstained(grasps: Sequence[Grasp], least: float) -> str:
     return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
 
 
-def least_quality(planner: Planner, abstain: float | None, has_arm: bool = True) -> float:
+def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:
     """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
     out what is hopeless, where the planner states chances of success, which are an arm's."""
     if abstain is not None:

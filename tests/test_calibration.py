@@ -255,8 +255,10 @@ def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:
     stated, scored = (
         make_planner(name, gripper, workspace, 0) for name in ("heuristic", str(SHIPPED))
     )
-    assert [least_quality(stated, abstain) for abstain in (None, 0.0, 0.7)] == [HOPELESS, 0.0, 0.7]
-    assert least_quality(scored, None) == least_quality(stated, None, has_arm=False) == 0.0
+    asked = [least_quality(stated, abstain, has_arm=True) for abstain in (None, 0.0, 0.7)]
+    assert asked == [HOPELESS, 0.0, 0.7]
+    assert least_quality(scored, None, has_arm=True) == 0.0
+    assert least_quality(stated, None, has_arm=False) == 0.0
     assert load_config(DEFAULTS).evaluate.abstain is None
 
 

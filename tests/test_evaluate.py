@@ -154,6 +154,7 @@ def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, caps
     assert "the rounds were played with 1.0" in printed and "python is" not in printed
     assert "different: heuristic, isolated, scene 0" in printed
     assert "1 of 2 rounds are the same" in printed
+    assert f"git checkout {origin['commit']}" in printed
 
 
 MODULE = """

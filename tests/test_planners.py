@@ -87,6 +87,18 @@ def test_a_function_with_the_three_parameters_makes_the_planner() -> None:
         planner("pathlib:PurePath")
 
 
+def sees_nothing(frame):
+    return []
+
+
+sees_nothing.calibration = 3
+
+
+def test_what_is_no_calibration_is_refused_before_any_work() -> None:
+    with pytest.raises(UserError, match=r"`calibration` of .*sees_nothing' is 3, expected a utils"):
+        planner("tests.test_planners:sees_nothing")
+
+
 def test_oracle_without_truth_says_what_is_missing() -> None:
     frame = boxes_frame([((0.04, 0.10, 0.05), 0.0, (0.5, 0.0))])
     with pytest.raises(ValueError, match="frame.truth"):

@@ -41,6 +41,15 @@ def test_the_square_holds_all_matter_with_a_margin() -> None:
     assert workspace.size == pytest.approx(0.74, abs=0.02) and remarks == []
 
 
+def test_a_principal_point_outside_the_image_is_remarked_upon() -> None:
+    frame = scene((0.0, 0.0, 0.06))
+    outside = K.copy()
+    outside[0, 2] = SIDE
+    assert check_view(frame, Workspace((0.0, 0.0))) == []
+    (remark,) = check_view(replace(frame, K=outside), Workspace((-0.8, 0.0)))
+    assert remark.startswith("the principal point (480, 239.5) lies outside the image of 480x480")
+
+
 def test_single_pixels_of_noise_do_not_count() -> None:
     frame = scene((0.3, -0.2, 0.06))
     depth = frame.depth.copy()
