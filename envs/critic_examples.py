@@ -46,11 +46,11 @@ from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 
 # Whose candidates are executed, and how many of each plan's.
-PLANNERS = {"graspnet6d": 20, "graspnet": 7, "graspnet_direct": 7}
+PLANNERS = {"graspnet6d": 14, "graspnet": 10, "graspnet_direct": 10}
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
-    "isolated": 0.05, "packed": 0.15, "pile": 0.22, "bin": 0.10, "household": 0.18, "tall": 0.07,
-    "wall": 0.09, "shelf": 0.05, "flat": 0.09,
+    "isolated": 0.04, "packed": 0.08, "pile": 0.12, "bin": 0.17, "household": 0.34, "tall": 0.03,
+    "wall": 0.04, "shelf": 0.08, "flat": 0.10,
 }  # fmt: skip
 # Scale of larger objects, which stand for household things that the hand hardly spans, and their
 # share among the scenes of these sets.
@@ -60,7 +60,7 @@ _OWN_SETS = {
     "household": ("household",),
 }  # fmt: skip
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
-_FROM_ABOVE = 0.35  # share of cameras within 15 degrees of the vertical; the others up to 65
+_FROM_ABOVE = 0.5  # share of cameras within 15 degrees of the vertical; the others up to 65
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zlib.error)
 LABEL = "carried"  # what counts as a success: see `execute`
 _FIRST_SEED = 3_000_000_000  # no evaluation and no other training uses these seeds

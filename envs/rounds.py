@@ -19,7 +19,7 @@ import itertools
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import partial
 from typing import Protocol
 
@@ -35,6 +35,7 @@ from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
+from utils.calibration import Calibration
 from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
@@ -147,6 +148,7 @@ def run_round(
                     )
             finally:
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
+            grasps = doubted(grasps, chances, len(failed))
             worth = [grasp for grasp in grasps if grasp.quality >= least]
             if not worth:
                 detail = _details(look_again.remark, _abstained(grasps, least))
@@ -220,7 +222,7 @@ def run_round(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
         cell.config.camera.depth_noise,
-        None if chances is None else (chances.slope, chances.offset, chances.penalty),
+        None if chances is None else astuple(chances),
         None if wanted is None else ended == "target",
     )  # fmt: skip
 
@@ -304,6 +306,14 @@ def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> flo
     if abstain is not None:
         return abstain
     return HOPELESS if has_arm and calibration_of(planner) is not None else 0.0
+
+
+def doubted(grasps: Sequence[Grasp], chances: Calibration | None, failures: int) -> Sequence[Grasp]:
+    """The grasps with the chances that they have after so many failures in a row; as they are where
+    their qualities are no chances."""
+    if chances is None or failures == 0:
+        return grasps
+    return [replace(one, quality=chances.after(one.quality, failures)) for one in grasps]
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:

@@ -43,7 +43,6 @@ from utils.height_map import (
     HeightMap,
     height_map_from_frame,
     tilted_height_map,
-    without_bumps,
 )
 from utils.seen_heights import hides, without_holes
 from utils.target import only_target
@@ -264,8 +263,7 @@ class NetworkView:
         self.frame = self._first.frame
         towards = frame.T_WC[:3, 3] - [*workspace.centre, table]
         self.towards = towards / np.linalg.norm(towards)
-        heights = height_map_from_frame(self.frame, workspace, below=below)
-        self.heights = without_bumps(heights, self.frame)
+        self.heights = height_map_from_frame(self.frame, workspace, below=below)
         if network.model.centre_head is not None:
             offset = self._first.maps[3][0].numpy()
             scaling = self._first.scaling

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers.box_frames import CORNERS, boxes_frame
-from utils.depth import GammaNoise
+from utils.depth import GammaNoise, make_depth_noise, measure, table_in_holes
 from utils.depth_correction import (
     COLOUR_NOISE,
     SMOOTHING_RADIUS,
@@ -20,7 +20,8 @@ from utils.depth_correction import (
     smoothed_by_colour,
     table_roughness,
 )
-from utils.geometry import ConvexSolid, intersect_lines
+from utils.geometry import ConvexSolid, Workspace, intersect_lines
+from utils.height_map import height_map_from_frame
 from utils.transforms import RGBDFrame, deproject, look_at
 
 SIZE, FOCAL, EYE = 120, 240.0, 0.8
@@ -142,10 +143,59 @@ def test_a_good_camera_s_frame_stays_as_it_is() -> None:
     frame, rng = scene(0.4), np.random.default_rng(0)
     same = corrected(frame, 0.0)
     assert same.depth is frame.depth and same.roughness < 1e-6
+    depth = frame.depth + rng.normal(0, 0.0002, frame.depth.shape).astype(np.float32)
+    same = corrected(replace(frame, depth=depth), 0.0)
+    assert same.depth is depth and same.roughness == pytest.approx(0.0002, rel=0.03)
+
+
+def test_a_table_gets_flat_and_a_box_stays() -> None:
+    frame, rng = scene(0.4), np.random.default_rng(0)
     depth = frame.depth + rng.normal(0, 0.001, frame.depth.shape).astype(np.float32)
-    frame = replace(frame, depth=depth)
-    same = corrected(frame, 0.0)
-    assert same.depth is depth and same.roughness == pytest.approx(0.001, rel=0.03)
+    flat = corrected(replace(frame, depth=depth), 0.0)
+    assert flat.roughness == pytest.approx(0.001, rel=0.03)
+    table = np.ones(depth.shape, bool)
+    table[BOX] = False
+    np.testing.assert_allclose(flat.depth[table], frame.depth[table], atol=1e-6)
+    np.testing.assert_array_equal(flat.depth[BOX], depth[BOX])
+
+
+def table_frame(boxes=(), noise="realsense", seed=0, colour=(60, 90, 200)) -> RGBDFrame:
+    """Boxes of a colour on a table of another one, measured with this depth noise and corrected."""
+    frame, rng = boxes_frame(boxes), np.random.default_rng(seed)
+    rgb = np.full((*frame.depth.shape, 3), (156, 150, 140), np.uint8)
+    rgb[frame.points()[..., 2] > 0.001] = colour
+    camera = make_depth_noise(noise, float(frame.K[0, 0]))
+    depth = frame.depth if camera is None else measure(camera, frame.depth, rng, rgb)
+    return corrected(replace(frame, depth=depth, rgb=rgb), 0.0)
+
+
+@pytest.mark.parametrize("noise", ["realsense", "gamma", "gaussian"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rough_table_has_no_bumps(noise, seed) -> None:
+    frame = table_in_holes(table_frame(noise=noise, seed=seed), 0.0)
+    assert frame.roughness > 0.0005
+    heights = height_map_from_frame(frame, Workspace())
+    assert (heights.label < 0).all()
+    assert np.mean(heights.height > 0.0005) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "size, colour, noise, stays",
+    [
+        ((0.02, 0.02, 0.008), (60, 90, 200), "realsense", True),  # of a colour of its own
+        ((0.02, 0.02, 0.020), (156, 150, 140), "realsense", True),  # higher than any bump
+        ((0.02, 0.02, 0.008), (156, 150, 140), "none", True),  # seen by a good camera
+        ((0.02, 0.02, 0.008), (156, 150, 140), "realsense", False),
+    ],
+)
+def test_what_is_no_bump_stays(size, colour, noise, stays) -> None:
+    frame = table_in_holes(table_frame([(size, 0.0, (0.5, 0.0))], noise, colour=colour), 0.0)
+    heights = height_map_from_frame(frame, Workspace())
+    number = heights.label[heights.index(np.array([0.5, 0.0]))]
+    assert (number >= 0) == stays
+    assert heights.label.max() + 1 == len(heights.centres) == stays
+    if stays:
+        np.testing.assert_allclose(heights.centres[number, :2], (0.5, 0.0), atol=0.005)
 
 
 def test_a_frame_that_is_corrected_twice_tells_how_rough_it_was() -> None:

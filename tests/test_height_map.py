@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 from models.planners import HeuristicPlanner
 from tests.helpers.box_frames import bin_walls, boxes_frame, shelf_frame
-from utils.depth import make_depth_noise, measure, table_in_holes
-from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     WALL_LABEL,
@@ -24,10 +22,9 @@ from utils.height_map import (
     local_maxima,
     tilted_height_map,
     tilted_view,
-    without_bumps,
 )
 from utils.seen_heights import HOLE_RISE, without_holes
-from utils.transforms import RGBDFrame, inverse_pose, project, transform_points
+from utils.transforms import inverse_pose, project, transform_points
 
 IMAGES = arrays.arrays(
     np.float32,
@@ -249,43 +246,3 @@ def test_a_second_frame_does_not_put_a_board_back() -> None:
     both = height_map_from_frame(replace(frame, second=frame), Workspace(), below=True)
     for heights in (alone, both):
         assert heights.height[heights.label >= 0].max() < 0.13
-
-
-def table_frame(boxes=(), noise="realsense", seed=0, colour=(60, 90, 200)) -> RGBDFrame:
-    """Boxes of a colour on a table of another one, seen by a camera with this depth noise."""
-    frame, rng = boxes_frame(boxes), np.random.default_rng(seed)
-    rgb = np.full((*frame.depth.shape, 3), (156, 150, 140), np.uint8)
-    rgb[frame.points()[..., 2] > 0.001] = colour
-    camera = make_depth_noise(noise, float(frame.K[0, 0]))
-    depth = frame.depth if camera is None else measure(camera, frame.depth, rng, rgb)
-    return corrected(replace(frame, depth=depth, rgb=rgb), 0.0)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_bumps_of_a_rough_table_are_no_objects(seed) -> None:
-    frame = table_in_holes(table_frame(seed=seed), 0.0)
-    heights = height_map_from_frame(frame, Workspace())
-    assert heights.label.max() > 3  # which the noise has made
-    smooth = without_bumps(heights, frame)
-    assert (smooth.label < 0).all() and len(smooth.centres) == 0
-    np.testing.assert_array_equal(smooth.height, heights.height)
-
-
-@pytest.mark.parametrize(
-    "size, colour, noise, stays",
-    [
-        ((0.02, 0.02, 0.008), (60, 90, 200), "realsense", True),  # of a colour of its own
-        ((0.02, 0.02, 0.020), (156, 150, 140), "realsense", True),  # higher than any bump
-        ((0.04, 0.06, 0.008), (156, 150, 140), "realsense", True),  # wider than any bump
-        ((0.02, 0.02, 0.008), (156, 150, 140), "none", True),  # seen by a good camera
-        ((0.02, 0.02, 0.008), (156, 150, 140), "realsense", False),
-    ],
-)
-def test_what_is_no_bump_stays(size, colour, noise, stays) -> None:
-    frame = table_in_holes(table_frame([(size, 0.0, (0.5, 0.0))], noise, colour=colour), 0.0)
-    heights = without_bumps(height_map_from_frame(frame, Workspace()), frame)
-    number = heights.label[heights.index(np.array([0.5, 0.0]))]
-    assert (number >= 0) == stays
-    assert heights.label.max() + 1 == len(heights.centres) == stays
-    if stays:
-        np.testing.assert_allclose(heights.centres[number, :2], (0.5, 0.0), atol=0.005)

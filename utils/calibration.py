@@ -1,10 +1,12 @@
 """From a planner's score to the chance that executing the grasp succeeds, and how good that is.
 
 Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm,
-with a penalty for rough depth: P = 1 / (1 + exp(-(slope log(score) + offset - penalty roughness))),
-fitted to executed grasps. The chance rises with the score, so that a planner's order of grasps
-stays. The roughness is that of the table in the frame (`utils.depth_correction`): scores hardly
-tell a noisy frame, in which more grasps fail. How far chances and frequencies are apart is the
+with a penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
+line = slope log(score) + offset - penalty roughness - doubt failures, fitted to executed grasps.
+The chance rises with the score, so that a planner's order of grasps stays. The roughness is that of
+the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
+grasps fail. The failures are those in a row before: what is left then is often what the planner
+misjudges. How far chances and frequencies are apart is the
 expected calibration error (Guo et al., "On calibration of modern neural networks", ICML 2017).
 
 This module knows neither planners nor simulators.
@@ -30,57 +32,79 @@ LEAST_SCORE = 1e-6  # scores below it count as it
 LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
 # Standard deviation of slopes that are expected: so few grasps do not make a step of the line.
 SLOPE_SPREAD = 10.0
+DOUBT_SPREAD = 2.0  # and of doubts
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 BINS = 10  # of equal width in [0, 1]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chance of success of a score: slope > 0, offset, and penalty >= 0 in 1 / m, of the module's
-    formula."""
+    """Chance of success of a score: slope > 0, offset, penalty >= 0 in 1 / m and doubt >= 0 of the
+    module's formula."""
 
     slope: float
     offset: float
     penalty: float = 0.0
+    doubt: float = 0.0
 
-    def __call__(self, score: ArrayLike, roughness: ArrayLike = 0.0) -> np.ndarray:
-        """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m."""
+    def __call__(
+        self, score: ArrayLike, roughness: ArrayLike = 0.0, failures: ArrayLike = 0
+    ) -> np.ndarray:
+        """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m, after so
+        many failures in a row (...)."""
         logarithm = np.log(np.maximum(score, LEAST_SCORE))
-        return expit(
-            self.slope * logarithm + self.offset - self.penalty * np.asarray(roughness, float)
-        )
+        return expit(self.slope * logarithm + self.offset - self._loss(roughness, failures))
 
-    def scores(self, chances: ArrayLike, roughness: ArrayLike = 0.0) -> np.ndarray:
-        """(...) scores that have these chances (...) in frames of this roughness (...), m."""
+    def _loss(self, roughness: ArrayLike, failures: ArrayLike) -> np.ndarray:
+        rough, failed = np.asarray(roughness, float), np.asarray(failures, float)
+        return self.penalty * rough + self.doubt * failed
+
+    def after(self, chance: float, failures: int) -> float:
+        """The chance, after so many failures in a row, of what has this one after none."""
+        return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) - self.doubt * failures))
+
+    def scores(
+        self, chances: ArrayLike, roughness: ArrayLike = 0.0, failures: ArrayLike = 0
+    ) -> np.ndarray:
+        """(...) scores that have these chances (...) in frames of this roughness (...), m, after so
+        many failures in a row (...)."""
         line = logit(np.clip(chances, _NEVER, _ALWAYS)) - self.offset
-        return np.exp((line + self.penalty * np.asarray(roughness, float)) / self.slope)
+        return np.exp((line + self._loss(roughness, failures)) / self.slope)
 
     def of_share(self, chance: float, share: float) -> float:
         """The chance of a score that is this share of the one with that chance, in one frame."""
         return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) + self.slope * np.log(share)))
 
     @staticmethod
-    def fit(scores: ArrayLike, successes: ArrayLike, roughness: ArrayLike = 0.0) -> Calibration:
-        """The most likely calibration of executed grasps: scores (N,), successes (N,) bool, and the
-        roughness (N,) of their frames, m.
+    def fit(
+        scores: ArrayLike,
+        successes: ArrayLike,
+        roughness: ArrayLike = 0.0,
+        failures: ArrayLike = 0,
+    ) -> Calibration:
+        """The most likely calibration of executed grasps: scores (N,), successes (N,) bool, the
+        roughness (N,) of their frames, m, and the failures in a row before them (N,).
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
-        where there are few grasps, and a Gaussian prior of standard deviation SLOPE_SPREAD on the
-        slope.
+        where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD and
+        DOUBT_SPREAD on slope and doubt.
         """
         x = np.log(np.maximum(scores, LEAST_SCORE))
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
+        failed = np.asarray(failures, dtype=float)
 
         def loss(line: np.ndarray) -> float:
-            z = line[0] * x + line[1] - line[2] * rough
+            z = line[0] * x + line[1] - line[2] * rough - line[3] * failed
             likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
-            return float((line[0] / SLOPE_SPREAD) ** 2 / 2 - likelihood) / len(x)
+            prior = (line[0] / SLOPE_SPREAD) ** 2 / 2 + (line[3] / DOUBT_SPREAD) ** 2 / 2
+            return float(prior - likelihood) / len(x)
 
-        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None))
-        slope, offset, penalty = minimize(loss, (1.0, 0.0, 0.0), method="L-BFGS-B", bounds=bounds).x
-        return Calibration(float(slope), float(offset), 1000 * float(penalty))
+        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, None))
+        start = (1.0, 0.0, 0.0, 0.0)
+        slope, offset, penalty, doubt = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
+        return Calibration(float(slope), float(offset), 1000 * float(penalty), float(doubt))
 
 
 def load_calibrations(path: Path) -> dict[str, Calibration]:
@@ -89,7 +113,9 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
         return {}
     planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
     return {
-        name: Calibration(one["slope"], one["offset"], one.get("penalty", 0.0))
+        name: Calibration(
+            one["slope"], one["offset"], one.get("penalty", 0.0), one.get("doubt", 0.0)
+        )
         for name, one in planners.items()
     }
 

@@ -2,7 +2,8 @@
 
 The table's height is known. So the table shows by which factor the camera measures too far or too
 near, and how rough a flat surface appears. `corrected` takes both errors out of a frame: the first
-by a factor, the second by a filter whose guide is the colour image, so that edges of objects stay.
+by a factor, the second by a filter whose guide is the colour image, so that edges of objects stay,
+and on the table, which its colour tells, altogether.
 Holes are the subject of `utils.depth`. This module knows no simulator and no network.
 """
 
@@ -13,7 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from utils.depth import depth_of_plane
+from utils.depth import LIKE_TABLE, depth_of_plane, middle_depth, reach_in_pixels, sampled
 from utils.transforms import RGBDFrame, inverse_pose, known_depth, transform_points
 
 TRUSTED_SCALE = 0.002  # errors of the scale below this are left alone: 1.6 mm at 0.8 m
@@ -22,19 +23,25 @@ SCALE_REACH = 0.12  # and the largest one
 TRUSTED_ROUGHNESS = 0.003  # m, standard deviation of a table that needs no smoothing
 SMOOTHING_RADIUS = 0.007  # m, half the side of the windows that are smoothed
 COLOUR_NOISE = 0.01  # standard deviation of colours, 0..1, that are one surface
+TRUSTED_FLATNESS = 0.0003  # m, standard deviation of a table that need not be made flat
+TABLE_SPREAD = 5.0  # standard deviations of its roughness, within which the table is measured
 
 
 def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The frame with its depth scaled until the table lies at `table_height` (m in W), and smoothed
-    where the table is rough; as it is where its camera is as good as that already. It tells how
-    rough the table was. So is its second frame."""
+    """The frame with its depth scaled until the table lies at `table_height` (m in W), smoothed
+    where the table is rough, and the table flat; as it is where its camera is as good as that
+    already. It tells how rough the table was. So is its second frame."""
     if frame.second is not None:
         frame = replace(frame, second=corrected(frame.second, table_height))
     scale, roughness = _scale_and_roughness(frame, table_height)
     if scale != 1:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))
+    rest = roughness
     if roughness > TRUSTED_ROUGHNESS:
         frame = replace(frame, depth=smoothed_by_colour(frame))
+        rest = table_roughness(frame, table_height)
+    if rest > TRUSTED_FLATNESS:
+        frame = replace(frame, depth=flattened_by_colour(frame, table_height, rest))
     # A frame that was corrected before is less rough now, but no more certain.
     return replace(frame, roughness=max(frame.roughness, roughness))
 
@@ -79,6 +86,7 @@ _BIN = 0.001  # of the histogram of factors
 _BLUR = 0.005  # standard deviation that is expected among the table's factors
 _REFITS = 3
 _LEAST_SHARE = 0.15  # of the known pixels that have to agree on the table
+_SAMPLE = 20_000  # pixels that are asked
 _NEAREST = 0.01  # m, in front of which a camera sees nothing
 
 
@@ -101,16 +109,18 @@ def _scale_and_roughness(frame: RGBDFrame, table_height: float) -> tuple[float, 
     if len(near) <= _LEAST_SHARE * len(error):
         return scale, 0.0
     spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    return scale, spread * scale * float(np.median(frame.depth[known_depth(frame.depth)]))
+    return scale, spread * scale * middle_depth(frame)
 
 
 def _ratio_to_table(frame: RGBDFrame, table_height: float) -> np.ndarray:
-    """(N,) the table's depth over the measured one, for all known pixels whose ray meets the table
-    and no fixture: the top of a board is as flat as the table, and may cover more of it."""
+    """(N,) the table's depth over the measured one, for a sample of the known pixels whose ray
+    meets the table and no fixture: the top of a board is as flat as the table, and may cover more
+    of it."""
     table = depth_of_plane(frame, table_height)
     on = known_depth(frame.depth) & np.isfinite(table) & (table > 0)
     on &= ~_fixture_pixels(frame)
-    return table[on] / frame.depth[on]
+    pixels = sampled(np.flatnonzero(on), _SAMPLE)
+    return table.take(pixels) / frame.depth.take(pixels)
 
 
 def _fixture_pixels(frame: RGBDFrame) -> np.ndarray:
@@ -139,7 +149,7 @@ def smoothed_by_colour(frame: RGBDFrame) -> np.ndarray:
     known = known_depth(frame.depth)
     if not known.any():
         return frame.depth
-    radius = max(1, round(SMOOTHING_RADIUS * _pixels_a_metre(frame, known)))
+    radius = reach_in_pixels(frame, SMOOTHING_RADIUS)
     weight = known.astype(np.float32)
     share = np.maximum(_window_sum(weight, radius), 1e-6)
 
@@ -147,7 +157,7 @@ def smoothed_by_colour(frame: RGBDFrame) -> np.ndarray:
         """Over the known pixels of each window."""
         return _window_sum(weight * image, radius) / share
 
-    middle = np.float32(np.median(frame.depth[known]))
+    middle = np.float32(middle_depth(frame))
     depth = np.where(known, frame.depth - middle, 0).astype(np.float32)
     colours = np.moveaxis(frame.rgb.astype(np.float32) / 255, -1, 0)
     colour_mean, depth_mean = [mean(c) for c in colours], mean(depth)
@@ -163,8 +173,26 @@ def smoothed_by_colour(frame: RGBDFrame) -> np.ndarray:
     return np.where(known, smooth, 0).astype(np.float32)
 
 
-def _pixels_a_metre(frame: RGBDFrame, known: np.ndarray) -> float:
-    return float((frame.K[0, 0] + frame.K[1, 1]) / 2 / np.median(frame.depth[known]))
+def flattened_by_colour(frame: RGBDFrame, table_height: float, roughness: float) -> np.ndarray:
+    """(H, W) float32 depth with the table's own at those pixels that have its colour and are
+    measured within TABLE_SPREAD times its roughness (m) of it.
+
+    Otherwise the noise of a flat table is as high as a spoon: fingers would keep off its bumps, and
+    so never reach what lies between them.
+    """
+    table = depth_of_plane(frame, table_height)
+    error = np.abs(frame.depth - table)
+    sure = np.flatnonzero(known_depth(frame.depth) & (error < roughness))
+    if not len(sure):
+        return frame.depth
+    colours = frame.rgb.reshape(-1, 3)[sampled(sure, _COLOURS)]
+    unlike = frame.rgb - np.median(colours, axis=0).astype(np.float32)
+    unlike = cv2.transform(unlike * unlike, np.ones((1, 3), np.float32))
+    flat = known_depth(frame.depth) & (error < TABLE_SPREAD * roughness) & (unlike < LIKE_TABLE**2)
+    return np.where(flat, table, frame.depth).astype(np.float32)
+
+
+_COLOURS = 1000  # pixels that tell the table's colour
 
 
 def _window_sum(image: np.ndarray, radius: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth import LIKE_TABLE, depth_of_plane, nearest_values
+from utils.depth import nearest_values
 from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_lines
 from utils.seen_heights import (
     FARTHEST,
@@ -26,7 +26,6 @@ from utils.seen_heights import (
 from utils.transforms import (
     RGBDFrame,
     inverse_pose,
-    project,
     tilt_rotation,
     transform_points,
 )
@@ -36,8 +35,6 @@ OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 _LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
-# Noise of a rough table makes bumps up to so many of its standard deviations high, and m2 large.
-_BUMP, _BUMP_AREA = 5.0, 8e-4
 _HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 _RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
@@ -349,39 +346,6 @@ def label_pieces(
         box = np.s_[y : y + rows, x : x + columns]
         label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2)
     return label
-
-
-def without_bumps(heights: HeightMap, frame: RGBDFrame) -> HeightMap:
-    """The map from above without those pieces that are bumps of a rough table: lower than `_BUMP`
-    times its roughness, smaller than `_BUMP_AREA`, and of the table's colour. A frame that is not
-    rough has none.
-
-    heights: of the frame, which is corrected by its table (`utils.depth_correction`), so that its
-    roughness is known. The heights stay; labels and centres of bumps go.
-    """
-    count, cell = len(heights.centres), heights.cell
-    low = heights.height < heights.table_height + _BUMP * frame.roughness
-    on = np.flatnonzero(heights.label >= 0)
-    label = heights.label.take(on)
-    higher = np.bincount(label, ~low.take(on), count) > 0
-    small = np.bincount(label, minlength=count) * cell**2 < _BUMP_AREA
-    suspect = small & ~higher
-    if not suspect.any():
-        return heights
-    on, label = on[suspect[label]], label[suspect[label]]
-    row, column = np.divmod(on, heights.label.shape[1])
-    place = heights.origin + cell * np.column_stack([column, row])
-    pixels, _ = project(np.column_stack([place, heights.height.take(on)]), frame.K, frame.T_WC)
-    rows, columns = frame.depth.shape
-    u, v = np.clip(np.rint(pixels), 0, (columns - 1, rows - 1)).astype(int).T
-    table = np.abs(frame.depth - depth_of_plane(frame, heights.table_height)) < frame.roughness
-    if not table.any():
-        return heights
-    unlike = np.linalg.norm(frame.rgb[v, u] - np.median(frame.rgb[table], axis=0), axis=-1)
-    alike = np.bincount(label, unlike < LIKE_TABLE, count)
-    bump = suspect & (alike > np.bincount(label, minlength=count) / 2)
-    number = np.append(np.where(bump, -1, np.cumsum(~bump) - 1), (WALL_LABEL, -1))
-    return replace(heights, label=number[heights.label], centres=heights.centres[~bump])
 
 
 def label_walls(
