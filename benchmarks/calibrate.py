@@ -1,11 +1,11 @@
 """Chances of success from scores: python -m benchmarks.calibrate RUN... [--output FILE.json]
 
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
-(`utils.calibration`) and prints the expected calibration error in each scenario and with each depth
-noise, as stated, and as fitted to these same grasps, and how many succeeded of those whose stated
-chance is hopeless (`envs.rounds.HOPELESS`). With --output the fits are written: into
-checkpoints/calibration.json, they are what the planners state from then on; planners that the runs
-do not have keep theirs.
+(`utils.calibration`; it falls with the roughness of the frame and after a failure) and prints the
+expected calibration error in each scenario and with each depth noise, as stated, and as fitted to
+these same grasps, and how many succeeded of those whose stated chance is hopeless
+(`envs.rounds.HOPELESS`). With --output the fits are written: into checkpoints/calibration.json,
+they are what the planners state from then on; planners that the runs do not have keep theirs.
 `make calibration` plays all planners on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
@@ -33,7 +33,7 @@ from utils.calibration import Calibration, calibration_error
 from utils.config import load_config
 from utils.errors import UserError
 from utils.result_formats import aligned
-from utils.result_records import AttemptRecord, RoundRecord, read_rounds
+from utils.result_records import RoundRecord, read_rounds
 from utils.runs import git_state, run_script, write_json_atomic
 
 
@@ -48,14 +48,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     lines, found = [], {}
     for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
         own = [record for record in rounds if record.policy == name]
-        scores, _, successes, roughness, failures = grasps_of(own)
+        scores, _, successes, roughness, failed = grasps_of(own)
         if len(successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
-        fitted = Calibration.fit(scores, successes, roughness, failures)
+        fitted = Calibration.fit(scores, successes, roughness, failed)
         found[name] = {
             **asdict(fitted),
             "grasps": len(successes),
             "successes": int(successes.sum()),
+            "after_failure": int(failed.sum()),
             "runs": [run for run, of in played.items() if any(one.policy == name for one in of)],
             "commit": commit,
         }
@@ -104,13 +105,13 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
 
 class ExecutedGrasps(NamedTuple):
     """N executed grasps: scores, qualities as stated, successes, the roughness in metres of the
-    frames that they were found in, and the failures in a row before them, (N,) each."""
+    frames that they were found in, and whether the attempts before failed, (N,) each."""
 
     scores: np.ndarray
     stated: np.ndarray
     successes: np.ndarray
     roughness: np.ndarray
-    failures: np.ndarray
+    failed: np.ndarray
 
 
 def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
@@ -122,7 +123,7 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
     stated: list[float] = []
     successes: list[bool] = []
     rough: list[float] = []
-    before: list[int] = []
+    before: list[bool] = []
     for record in rounds:
         executed = [one for one in record.attempts if one.executed and one.grasp is not None]
         roughness = [one.roughness for one in executed if one.roughness is not None]
@@ -135,36 +136,27 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
         stated += qualities
         successes += [attempt.success for attempt in executed]
         rough += roughness
-        failures = failures_before(executed)
-        before += failures
+        failed = [False, *(not one.success for one in executed)][: len(executed)]
+        before += failed
         if record.calibration is not None:
             chances = Calibration(*record.calibration)
-            qualities = chances.scores(qualities, roughness, failures).tolist()
+            qualities = chances.scores(qualities, roughness, failed).tolist()
         scores += qualities
     return ExecutedGrasps(
         np.array(scores), np.array(stated), np.array(successes, bool), np.array(rough),
-        np.array(before, int),
+        np.array(before, bool),
     )  # fmt: skip
-
-
-def failures_before(attempts: Iterable[AttemptRecord]) -> list[int]:
-    """How many failures in a row came before each of a round's attempts."""
-    found, in_a_row = [], 0
-    for attempt in attempts:
-        found.append(in_a_row)
-        in_a_row = 0 if attempt.success else in_a_row + 1
-    return found
 
 
 def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
     """Cells: grasps, their share of successes, the calibration error as stated and as fitted, and
     the successes of the hopeless ones."""
-    scores, stated, successes, roughness, failures = grasps_of(rounds)
+    scores, stated, successes, roughness, failed = grasps_of(rounds)
     hopeless = successes[stated < HOPELESS]
     return [
         str(len(stated)), f"{100 * successes.mean():.0f} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
-        f"{calibration_error(fitted(scores, roughness, failures), successes):.3f}",
+        f"{calibration_error(fitted(scores, roughness, failed), successes):.3f}",
         f"{hopeless.sum()}/{len(hopeless)}",
     ]  # fmt: skip
 

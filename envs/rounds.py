@@ -4,8 +4,9 @@ The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every objec
 the planner finds no grasp that is likely enough, or after `max_failures` failed grasps in a row. A
 round also ends when its planner raises an exception. What has failed is not tried again at once,
 for often nothing has moved: grasps elsewhere that are more likely to succeed than not (whose
-quality is 0.5 or more) come first, and of the others those that are not alike one that has just
-failed.
+quality as planned is 0.5 or more) come first, and of the others those that are not alike one that
+has just failed. After a failure, all qualities that are chances count as lower
+(`utils.calibration`): by these it is judged, and recorded, whether a grasp is worth trying.
 
 Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
 would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
@@ -103,6 +104,8 @@ def run_round(
     scenario = scenario or scene.layout
     conditions = SCENARIOS[scenario]
     privileged, chances = needs_truth(plan), calibration_of(plan)
+    if chances is not None and not cell.has_arm:
+        chances = replace(chances, doubt=0.0)  # an arm's
     least = least_quality(plan, abstain, cell.has_arm)
     taught = None if controller == OPEN_LOOP else teach(cell)
     cell.load(scene)
@@ -148,17 +151,17 @@ def run_round(
                     )
             finally:
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
-            grasps = doubted(grasps, chances, len(failed))
-            worth = [grasp for grasp in grasps if grasp.quality >= least]
+            now = partial(after_a_failure, chances=chances if failed else None)
+            worth = [grasp for grasp in grasps if now(grasp).quality >= least]
             if not worth:
-                detail = _details(look_again.remark, _abstained(grasps, least))
+                detail = _details(look_again.remark, _abstained(map(now, grasps), least))
                 spent = look_again.sim_seconds
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
                 break
             ordered = elsewhere_first(worth, missed) if missed else worth
             reached = within_reach(cell, ordered)
-            grasp = no_deeper(first_untried(reached, failed), failed, stops)
+            grasp = now(no_deeper(first_untried(reached, failed), failed, stops))
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -294,7 +297,7 @@ def _details(*sentences: str) -> str:
     return "; ".join(filter(None, sentences))
 
 
-def _abstained(grasps: Sequence[Grasp], least: float) -> str:
+def _abstained(grasps: Iterable[Grasp], least: float) -> str:
     """Why none of the grasps is tried; empty where there are none."""
     best = max((grasp.quality for grasp in grasps), default=None)
     return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
@@ -308,12 +311,12 @@ def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> flo
     return HOPELESS if has_arm and calibration_of(planner) is not None else 0.0
 
 
-def doubted(grasps: Sequence[Grasp], chances: Calibration | None, failures: int) -> Sequence[Grasp]:
-    """The grasps with the chances that they have after so many failures in a row; as they are where
-    their qualities are no chances."""
-    if chances is None or failures == 0:
-        return grasps
-    return [replace(one, quality=chances.after(one.quality, failures)) for one in grasps]
+def after_a_failure(grasp: Grasp, chances: Calibration | None) -> Grasp:
+    """The grasp with the chance that it has after a failure, by its planner's calibration; itself
+    without one."""
+    if chances is None:
+        return grasp
+    return replace(grasp, quality=chances.after_failure(grasp.quality))
 
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:

@@ -194,7 +194,7 @@ def turn_between(first: Grasp, second: Grasp) -> float:
 
 
 class HeuristicFanPlanner(FanPlanner):
-    """The fan on the depth image; colours only smooth a rough one."""
+    """The fan on the depth image; colours tell table and edges in a rough one."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)

@@ -115,7 +115,8 @@ class RandomPlanner:
 
 
 class HeuristicPlanner(SearchPlanner):
-    """Antipodal search on the height map of the depth image; colours only smooth a rough one."""
+    """Antipodal search on the height map of the depth image; colours tell table and edges in a
+    rough one, and nothing else."""
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.calibrate import failures_before, grasps_of, main
+from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything, work
 from envs.rounds import HOPELESS, least_quality, run_round
 from models.graspnet_io import SHIPPED
@@ -129,18 +129,26 @@ def test_no_fit_states_that_noise_helps() -> None:
 def test_a_fit_finds_how_much_a_failure_before_tells() -> None:
     rng = np.random.default_rng(0)
     scores, truth = rng.uniform(0.05, 1.2, 40_000), Calibration(1.5, 2.0, 0.0, 1.8)
-    failures = rng.choice(3, len(scores), p=[0.7, 0.2, 0.1])
-    success = rng.uniform(size=len(scores)) < truth(scores, 0.0, failures)
-    fitted = Calibration.fit(scores, success, 0.0, failures)
+    failed = rng.uniform(size=len(scores)) < 0.3
+    success = rng.uniform(size=len(scores)) < truth(scores, 0.0, failed)
+    fitted = Calibration.fit(scores, success, 0.0, failed)
     assert fitted.slope == pytest.approx(1.5, abs=0.08)
     assert fitted.offset == pytest.approx(2.0, abs=0.08)
     assert fitted.doubt == pytest.approx(1.8, abs=0.1)
-    # By hand: odds of 9 to 1 fall by exp(1.8) = 6.05 with each failure, to 1.488 and 0.246.
-    assert truth.after(0.9, 0) == pytest.approx(0.9)
-    assert truth.after(0.9, 1) == pytest.approx(1.488 / 2.488, abs=1e-3)
-    assert truth.after(0.9, 2) == pytest.approx(0.246 / 1.246, abs=1e-3)
-    assert truth.after(float(truth(0.5)), 2) == pytest.approx(float(truth(0.5, 0.0, 2)))
-    np.testing.assert_allclose(truth.scores(truth(scores, 0.0, failures), 0.0, failures), scores)
+    # By hand: odds of 9 to 1 fall by exp(1.8) = 6.05, to 1.488.
+    assert truth.after_failure(0.9) == pytest.approx(1.488 / 2.488, abs=1e-3)
+    assert truth.after_failure(float(truth(0.5))) == pytest.approx(float(truth(0.5, 0.0, True)))
+    np.testing.assert_allclose(truth.scores(truth(scores, 0.0, failed), 0.0, failed), scores)
+
+
+def test_few_failures_make_no_certainty_and_none_helps() -> None:
+    """Five grasps that all failed after a failure: without a prior, the doubt grows by the end of
+    Platt's targets to 6.2; and where grasps succeed more often after one, there is no doubt."""
+    failed = np.arange(205) >= 200
+    fitted = Calibration.fit(np.full(205, 0.9), ~failed & (np.arange(205) % 20 > 0), 0.0, failed)
+    assert 1 < fitted.doubt < 4.5
+    fitted = Calibration.fit(np.full(205, 0.9), failed | (np.arange(205) % 2 > 0), 0.0, failed)
+    assert fitted.doubt == 0
 
 
 def test_a_share_of_a_score_has_its_own_chance_at_any_roughness() -> None:
@@ -176,8 +184,10 @@ def test_one_failure_of_a_lower_score_makes_no_step_of_the_line() -> None:
 @pytest.mark.parametrize("roughness", [0.0, 0.0025])
 def test_every_shipped_fit_leads_back_to_its_scores(name, roughness) -> None:
     scores = np.array([0.05, 0.2, 0.5, 0.9, 1.0, 1.2])
-    chances = calibrations()[name](scores, roughness)
-    np.testing.assert_allclose(calibrations()[name].scores(chances, roughness), scores, rtol=1e-4)
+    for failed in (False, True):
+        chances = calibrations()[name](scores, roughness, failed)
+        back = calibrations()[name].scores(chances, roughness, failed)
+        np.testing.assert_allclose(back, scores, rtol=1e-4)
 
 
 def test_where_every_grasp_succeeded_the_chance_is_laplaces() -> None:
@@ -266,32 +276,36 @@ def test_grasps_of_less_quality_are_not_tried(bullet_cell, box_set) -> None:
     assert none.attempts[0].detail == "abstained: the best quality is 0.6, under 0.7"
 
 
+class Aside:
+    """Always the same grasp, which closes beside the cube."""
+
+    calibration = Calibration(1.0, 0.0, 0.0, 2.0)
+    grasp = replace(cube_grasp(offset=(0.13, 0, 0)), quality=0.9)
+
+    def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        return [self.grasp]
+
+
 def test_a_planner_is_less_sure_after_a_failure(bullet_cell, box_set) -> None:
-    """By its calibration, in the record as in what is tried; a success ends the doubt."""
-
-    class Plan:
-        calibration = Calibration(1.0, 0.0, 0.0, 2.0)
-        aside = replace(cube_grasp(offset=(0.13, 0, 0)), quality=0.9)
-
-        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
-            return [self.aside]
-
+    """By its calibration, in the record as in what is tried."""
     settings = {"policy": "x", "objects": "box", "max_failures": 3}
-    record = run_round(bullet_cell, cube_scene(box_set), Plan(), **settings)
+    record = run_round(bullet_cell, cube_scene(box_set), Aside(), **settings)
     stated = [attempt.grasp.quality for attempt in record.attempts]
-    # Odds of 9 fall by exp(2) with each failure: to 1.218, then to 0.165.
-    np.testing.assert_allclose(stated, [0.9, 1.218 / 2.218, 0.165 / 1.165], atol=1e-3)
+    low = 1.218 / 2.218  # odds of 9 fall by exp(2), to 1.218
+    np.testing.assert_allclose(stated, [0.9, low, low], atol=1e-3)
     assert record.calibration == (1.0, 0.0, 0.0, 2.0)
     np.testing.assert_allclose(grasps_of([record]).scores, 9.0)  # odds, of slope 1 and offset 0
-    assert grasps_of([record]).failures.tolist() == [0, 1, 2]
-    sure = run_round(bullet_cell, cube_scene(box_set), Plan(), **settings, abstain=0.5)
-    assert sure.ended == "no_plan" and sure.executed == 2
+    assert grasps_of([record]).failed.tolist() == [False, True, True]
+    sure = run_round(bullet_cell, cube_scene(box_set), Aside(), **settings, abstain=0.6)
+    assert sure.ended == "no_plan" and sure.executed == 1
+    assert sure.attempts[1].detail == "abstained: the best quality is 0.5491, under 0.6"
 
 
-def test_failures_are_counted_in_a_row() -> None:
+def test_a_success_ends_the_doubt() -> None:
     won = [False, True, True, False, False, True]
-    record = played("heuristic", [(0.9, one) for one in won])
-    assert failures_before(record.attempts) == [0, 1, 0, 0, 1, 2]
+    assert grasps_of([played("heuristic", [(0.9, one) for one in won])]).failed.tolist() == [
+        False, True, False, False, True, True,
+    ]  # fmt: skip
 
 
 def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:

@@ -2,11 +2,11 @@
 
 Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm,
 with a penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
-line = slope log(score) + offset - penalty roughness - doubt failures, fitted to executed grasps.
+line = slope log(score) + offset - penalty roughness - doubt failed, fitted to executed grasps.
 The chance rises with the score, so that a planner's order of grasps stays. The roughness is that of
 the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
-grasps fail. The failures are those in a row before: what is left then is often what the planner
-misjudges. How far chances and frequencies are apart is the
+grasps fail. `failed` is 1 where the attempt before failed, and 0 otherwise: what is left then is
+often what the planner misjudges. How far chances and frequencies are apart is the
 expected calibration error (Guo et al., "On calibration of modern neural networks", ICML 2017).
 
 This module knows neither planners nor simulators.
@@ -48,28 +48,27 @@ class Calibration:
     doubt: float = 0.0
 
     def __call__(
-        self, score: ArrayLike, roughness: ArrayLike = 0.0, failures: ArrayLike = 0
+        self, score: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False
     ) -> np.ndarray:
-        """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m, after so
-        many failures in a row (...)."""
+        """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m; failed:
+        (...) bool, whether the attempt before failed."""
         logarithm = np.log(np.maximum(score, LEAST_SCORE))
-        return expit(self.slope * logarithm + self.offset - self._loss(roughness, failures))
+        return expit(self.slope * logarithm + self.offset - self._deduction(roughness, failed))
 
-    def _loss(self, roughness: ArrayLike, failures: ArrayLike) -> np.ndarray:
-        rough, failed = np.asarray(roughness, float), np.asarray(failures, float)
-        return self.penalty * rough + self.doubt * failed
+    def _deduction(self, roughness: ArrayLike, failed: ArrayLike) -> np.ndarray:
+        return self.penalty * np.asarray(roughness, float) + self.doubt * np.asarray(failed, float)
 
-    def after(self, chance: float, failures: int) -> float:
-        """The chance, after so many failures in a row, of what has this one after none."""
-        return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) - self.doubt * failures))
+    def after_failure(self, chance: float) -> float:
+        """The chance, where the attempt before failed, of what has this one where it did not."""
+        return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) - self.doubt))
 
     def scores(
-        self, chances: ArrayLike, roughness: ArrayLike = 0.0, failures: ArrayLike = 0
+        self, chances: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False
     ) -> np.ndarray:
-        """(...) scores that have these chances (...) in frames of this roughness (...), m, after so
-        many failures in a row (...)."""
+        """(...) scores that have these chances (...) in frames of this roughness (...), m; failed:
+        (...) bool, whether the attempt before failed."""
         line = logit(np.clip(chances, _NEVER, _ALWAYS)) - self.offset
-        return np.exp((line + self._loss(roughness, failures)) / self.slope)
+        return np.exp((line + self._deduction(roughness, failed)) / self.slope)
 
     def of_share(self, chance: float, share: float) -> float:
         """The chance of a score that is this share of the one with that chance, in one frame."""
@@ -80,10 +79,10 @@ class Calibration:
         scores: ArrayLike,
         successes: ArrayLike,
         roughness: ArrayLike = 0.0,
-        failures: ArrayLike = 0,
+        failed: ArrayLike = False,
     ) -> Calibration:
         """The most likely calibration of executed grasps: scores (N,), successes (N,) bool, the
-        roughness (N,) of their frames, m, and the failures in a row before them (N,).
+        roughness (N,) of their frames, m, and whether the attempts before failed (N,) bool.
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD and
@@ -93,10 +92,10 @@ class Calibration:
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
-        failed = np.asarray(failures, dtype=float)
+        after_failure = np.asarray(failed, dtype=float)
 
         def loss(line: np.ndarray) -> float:
-            z = line[0] * x + line[1] - line[2] * rough - line[3] * failed
+            z = line[0] * x + line[1] - line[2] * rough - line[3] * after_failure
             likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
             prior = (line[0] / SLOPE_SPREAD) ** 2 / 2 + (line[3] / DOUBT_SPREAD) ** 2 / 2
             return float(prior - likelihood) / len(x)

@@ -21,7 +21,6 @@ another purpose. This module knows no simulator, no network and no grasps.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -548,8 +547,10 @@ def at_edges(depth: np.ndarray) -> np.ndarray:
 
 
 def sampled(values: np.ndarray, most: int = 10_000) -> np.ndarray:
-    """Every k-th of values (N, ...), at most so many: enough for a median, and quicker."""
-    return values[:: max(1, math.ceil(len(values) / most))]
+    """At most so many of values (N, ...), evenly spread: enough for statistics, and quicker."""
+    if len(values) <= most:
+        return values
+    return values[np.linspace(0, len(values) - 1, most).astype(int)]
 
 
 def middle_depth(frame: RGBDFrame) -> float:

@@ -3,7 +3,7 @@
 The table's height is known. So the table shows by which factor the camera measures too far or too
 near, and how rough a flat surface appears. `corrected` takes both errors out of a frame: the first
 by a factor, the second by a filter whose guide is the colour image, so that edges of objects stay,
-and on the table, which its colour tells, altogether.
+and by the table's own depth where the colour is the table's.
 Holes are the subject of `utils.depth`. This module knows no simulator and no network.
 """
 
@@ -24,7 +24,9 @@ TRUSTED_ROUGHNESS = 0.003  # m, standard deviation of a table that needs no smoo
 SMOOTHING_RADIUS = 0.007  # m, half the side of the windows that are smoothed
 COLOUR_NOISE = 0.01  # standard deviation of colours, 0..1, that are one surface
 TRUSTED_FLATNESS = 0.0003  # m, standard deviation of a table that need not be made flat
-TABLE_SPREAD = 5.0  # standard deviations of its roughness, within which the table is measured
+# The table is measured within so many standard deviations of its roughness, and within so many m:
+# what is rougher has another reason, as a wrong pose of the camera.
+TABLE_SPREAD, HIGHEST_BUMP = 5.0, 0.015
 
 
 def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
@@ -175,7 +177,7 @@ def smoothed_by_colour(frame: RGBDFrame) -> np.ndarray:
 
 def flattened_by_colour(frame: RGBDFrame, table_height: float, roughness: float) -> np.ndarray:
     """(H, W) float32 depth with the table's own at those pixels that have its colour and are
-    measured within TABLE_SPREAD times its roughness (m) of it.
+    measured within TABLE_SPREAD times its roughness (m), and within HIGHEST_BUMP, of it.
 
     Otherwise the noise of a flat table is as high as a spoon: fingers would keep off its bumps, and
     so never reach what lies between them.
@@ -188,7 +190,8 @@ def flattened_by_colour(frame: RGBDFrame, table_height: float, roughness: float)
     colours = frame.rgb.reshape(-1, 3)[sampled(sure, _COLOURS)]
     unlike = frame.rgb - np.median(colours, axis=0).astype(np.float32)
     unlike = cv2.transform(unlike * unlike, np.ones((1, 3), np.float32))
-    flat = known_depth(frame.depth) & (error < TABLE_SPREAD * roughness) & (unlike < LIKE_TABLE**2)
+    bump = min(TABLE_SPREAD * roughness, HIGHEST_BUMP)
+    flat = known_depth(frame.depth) & (error < bump) & (unlike < LIKE_TABLE**2)
     return np.where(flat, table, frame.depth).astype(np.float32)
 
 
