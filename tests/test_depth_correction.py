@@ -164,6 +164,7 @@ def table_frame(boxes=(), noise="realsense", seed=0, colour=(60, 90, 200)) -> RG
     frame, rng = boxes_frame(boxes), np.random.default_rng(seed)
     rgb = np.full((*frame.depth.shape, 3), (156, 150, 140), np.uint8)
     rgb[frame.points()[..., 2] > 0.001] = colour
+    rgb += rng.integers(0, 7, rgb.shape, np.uint8)  # no surface has one exact colour
     camera = make_depth_noise(noise, float(frame.K[0, 0]))
     depth = frame.depth if camera is None else measure(camera, frame.depth, rng, rgb)
     return corrected(replace(frame, depth=depth, rgb=rgb), 0.0)
@@ -186,6 +187,9 @@ def test_a_rough_table_has_no_bumps(noise, seed) -> None:
         ((0.02, 0.02, 0.020), (156, 150, 140), "realsense", True),  # higher than any bump
         ((0.02, 0.02, 0.008), (156, 150, 140), "none", True),  # seen by a good camera
         ((0.02, 0.02, 0.008), (156, 150, 140), "realsense", False),
+        ((0.04, 0.06, 0.005), (156, 150, 140), "realsense", False),  # however wide it is
+        ((0.04, 0.06, 0.005), (156, 150, 160), "realsense", False),  # 20 from the table's colour
+        ((0.04, 0.06, 0.008), (156, 150, 180), "realsense", True),  # 40 from it
     ],
 )
 def test_what_is_no_bump_stays(size, colour, noise, stays) -> None:
@@ -204,6 +208,28 @@ def test_a_frame_that_is_corrected_twice_tells_how_rough_it_was() -> None:
     once = corrected(replace(frame, depth=depth), 0.0)
     assert table_roughness(once, 0.0) < 0.003  # it was smoothed
     assert once.roughness == corrected(once, 0.0).roughness == pytest.approx(0.005, rel=0.05)
+
+
+@pytest.mark.parametrize("degrees", [20, 45])
+def test_a_tilted_view_and_a_second_frame_get_a_flat_table(degrees: float) -> None:
+    frame, rng = scene(np.deg2rad(degrees)), np.random.default_rng(0)
+    table = np.ones(frame.depth.shape, bool)
+    table[BOX] = False
+    depth = frame.depth + rng.normal(0, 0.001, frame.depth.shape).astype(np.float32)
+    rough = replace(frame, depth=depth)
+    both = corrected(replace(rough, second=rough), 0.0)
+    for seen in (both, both.second):
+        np.testing.assert_allclose(seen.depth[table], frame.depth[table], atol=1e-6)
+
+
+def test_a_hole_stays_a_hole() -> None:
+    frame, rng = scene(), np.random.default_rng(0)
+    depth = frame.depth + rng.normal(0, 0.001, frame.depth.shape).astype(np.float32)
+    depth[:10] = 0
+    flat = corrected(replace(frame, depth=depth), 0.0)
+    assert (flat.depth[:10] == 0).all()
+    nothing = replace(frame, depth=np.zeros_like(frame.depth))
+    assert (corrected(nothing, 0.0).depth == 0).all()
 
 
 def test_smoothing_averages_a_surface_and_keeps_its_edge() -> None:

@@ -10,7 +10,14 @@ import pytest
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, look_at
-from utils.user_view import LARGEST, SMALLEST, check_view, given_workspace, workspace_of
+from utils.user_view import (
+    LARGEST,
+    SMALLEST,
+    check_view,
+    corrected_view,
+    given_workspace,
+    workspace_of,
+)
 
 FOCAL, SIDE, UP = 300.0, 480, 1.5  # a camera 1.5 m over the table, which shows 2.4 m of it
 K = np.array([[FOCAL, 0, (SIDE - 1) / 2], [0, FOCAL, (SIDE - 1) / 2], [0, 0, 1.0]])
@@ -86,6 +93,16 @@ def test_of_a_scene_that_is_too_large_the_middle_or_the_place_of_the_target_is_s
     # The square ends where the matter ends, at 0.85 and 2 cm of margin.
     assert workspace.centre[0] == pytest.approx(0.87 - LARGEST / 2, abs=0.01)
     assert "around the target" in remarks[0]
+
+
+def test_a_rough_table_is_remarked_upon() -> None:
+    """And no further than 15 mm over it is anything taken for it."""
+    frame, rng = scene((0.0, 0.0, 0.3)), np.random.default_rng(0)
+    assert corrected_view(frame, 0.0)[1] == []
+    for sigma, bump in ((0.0024, 12), (0.0035, 15)):
+        noise = rng.normal(0, sigma, frame.depth.shape).astype(np.float32)
+        (remark,) = corrected_view(replace(frame, depth=frame.depth + noise), 0.0)[1]
+        assert f"rough by {1000 * sigma:.1f} mm" in remark and f"height of {bump} mm" in remark
 
 
 def test_a_given_workspace() -> None:

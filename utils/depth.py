@@ -480,8 +480,8 @@ def seeded_noise(
 HOLE_REACH = 0.03  # m from a hole's rim to its middle, up to which it can be filled
 TABLE_FLATNESS = 0.006  # m over the table, up to which a measured point is the table
 SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
-# A hole becomes table if its colour (three channels, 0..255) differs from the table's beside it by
-# less than LIKE_TABLE, and UNLIKE_OBJECT times as much from the nearest object's.
+# What differs from the table's colour by less than LIKE_TABLE (three channels, 0..255) may be it; a
+# hole is, if its colour differs UNLIKE_OBJECT times as much from the nearest object's.
 LIKE_TABLE = 30.0
 UNLIKE_OBJECT = 2.0
 # A hole is at an edge where measured depths within EDGE_REACH pixels differ by EDGE_STEP metres. In

@@ -2,7 +2,7 @@
 
 A planner works on a square of the table. `workspace_of` finds the square that holds what stands on
 the table; `check_view` refuses an image that shows too little for grasps to be more than a guess.
-`corrected_view` says where all of its depths had to be scaled. This module knows no planner and no
+`corrected_view` says what had to be done to its depths. This module knows no planner and no
 file.
 """
 
@@ -13,7 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from utils.depth import depth_of_plane
-from utils.depth_correction import TRUSTED_SCALE, corrected, scale_to_table
+from utils.depth_correction import (
+    HIGHEST_BUMP,
+    TABLE_SPREAD,
+    TRUSTED_SCALE,
+    corrected,
+    scale_to_table,
+)
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth
@@ -21,6 +27,7 @@ from utils.transforms import RGBDFrame, deproject, known_depth
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
 SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
 MARGIN = 0.02  # m around what stands on the table
+ROUGH = 0.002  # m, standard deviation of a table whose bumps are as high as what a hand grasps
 _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
 
 # The network has learned from above, and planners are measured up to 45 degrees off the vertical
@@ -66,17 +73,24 @@ def workspace_of(
 
 
 def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, list[str]]:
-    """The frame as planners correct it by its table (`utils.depth_correction`), and a remark where
-    all depths were scaled: it may be the camera that is wrong, but also its pose or the height."""
-    scale = scale_to_table(frame, table_height)
-    if abs(scale - 1) <= TRUSTED_SCALE:
-        return corrected(frame, table_height), []
-    remark = (
-        f"all depths were multiplied by {scale:.3f}, so that the largest flat surface lies at the "
-        f"table's height of {table_height:g} m; check that height, the camera's pose and the unit "
-        "of the depth image"
-    )
-    return corrected(frame, table_height), [remark]
+    """The frame as planners correct it by its table (`utils.depth_correction`), and remarks where
+    all depths were scaled, or the table is rough: it may be the camera that is wrong, but also its
+    pose or the height."""
+    scale, after, remarks = scale_to_table(frame, table_height), corrected(frame, table_height), []
+    if abs(scale - 1) > TRUSTED_SCALE:
+        remarks.append(
+            f"all depths were multiplied by {scale:.3f}, so that the largest flat surface lies at "
+            f"the table's height of {table_height:g} m; check that height, the camera's pose and "
+            "the unit of the depth image"
+        )
+    if after.roughness > ROUGH:
+        bump = min(TABLE_SPREAD * after.roughness, HIGHEST_BUMP)
+        remarks.append(
+            f"the table is rough by {1000 * after.roughness:.1f} mm in the depth image: what has "
+            f"its colour may be taken for it up to a height of {1000 * bump:.0f} mm; check the "
+            "camera's pose, or lay a cloth of another colour below"
+        )
+    return after, remarks
 
 
 def given_workspace(numbers: Sequence[float], table_height: float) -> Workspace:
