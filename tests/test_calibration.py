@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything, work
 from envs.rounds import HOPELESS, least_quality, run_round
+from envs.simulators import make_cell
 from models.graspnet_io import SHIPPED
 from models.planners import (
     CALIBRATIONS,
@@ -299,6 +300,36 @@ def test_a_planner_is_less_sure_after_a_failure(bullet_cell, box_set) -> None:
     sure = run_round(bullet_cell, cube_scene(box_set), Aside(), **settings, abstain=0.6)
     assert sure.ended == "no_plan" and sure.executed == 1
     assert sure.attempts[1].detail == "abstained: the best quality is 0.5491, under 0.6"
+
+
+def test_a_floating_hand_leaves_an_arm_s_doubt(box_set) -> None:
+    config = load_config(None, ["sim.renderer=tiny", "robot.arm=none"])
+    with make_cell(config) as cell:
+        record = run_round(
+            cell, cube_scene(box_set), Aside(), policy="x", objects="box", max_failures=2
+        )
+    stated = [attempt.grasp.quality for attempt in record.attempts]
+    np.testing.assert_allclose(stated, [0.9, 0.9])
+    assert record.calibration == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_a_doubt_leaves_the_order_of_grasps(bullet_cell, box_set) -> None:
+    """What is likely as planned comes first elsewhere, though it is unlikely after a failure."""
+
+    class Plan(Aside):
+        near, far = (
+            replace(cube_grasp(offset=(x, 0, 0)), quality=quality)
+            for x, quality in ((-0.13, 0.95), (0.13, 0.8))
+        )
+
+        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+            return [self.near, self.far]
+
+    settings = {"policy": "x", "objects": "box", "max_failures": 2}
+    record = run_round(bullet_cell, cube_scene(box_set), Plan(), **settings)
+    # Odds of 4 fall by exp(2), to 0.541.
+    stated = [attempt.grasp.quality for attempt in record.attempts]
+    np.testing.assert_allclose(stated, [0.95, 0.541 / 1.541], atol=1e-3)
 
 
 def test_a_success_ends_the_doubt() -> None:
