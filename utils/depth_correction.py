@@ -190,9 +190,13 @@ def flattened_by_colour(frame: RGBDFrame, table_height: float, roughness: float)
     colours = frame.rgb.reshape(-1, 3)[sampled(sure, _COLOURS)]
     unlike = frame.rgb - np.median(colours, axis=0).astype(np.float32)
     unlike = cv2.transform(unlike * unlike, np.ones((1, 3), np.float32))
-    bump = min(TABLE_SPREAD * roughness, HIGHEST_BUMP)
-    flat = known_depth(frame.depth) & (error < bump) & (unlike < LIKE_TABLE**2)
+    flat = known_depth(frame.depth) & (error < bump_height(roughness)) & (unlike < LIKE_TABLE**2)
     return np.where(flat, table, frame.depth).astype(np.float32)
+
+
+def bump_height(roughness: float) -> float:
+    """Metres up to which what has the table's colour counts as table. roughness: of it, m."""
+    return min(TABLE_SPREAD * roughness, HIGHEST_BUMP)
 
 
 _COLOURS = 1000  # pixels that tell the table's colour

@@ -2,8 +2,7 @@
 
 A planner works on a square of the table. `workspace_of` finds the square that holds what stands on
 the table; `check_view` refuses an image that shows too little for grasps to be more than a guess.
-`corrected_view` says what had to be done to its depths. This module knows no planner and no
-file.
+`corrected_view` says what had to be done to its depths. This module knows no planner and no file.
 """
 
 from __future__ import annotations
@@ -13,13 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from utils.depth import depth_of_plane
-from utils.depth_correction import (
-    HIGHEST_BUMP,
-    TABLE_SPREAD,
-    TRUSTED_SCALE,
-    corrected,
-    scale_to_table,
-)
+from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth
@@ -84,11 +77,11 @@ def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, li
             "the unit of the depth image"
         )
     if after.roughness > ROUGH:
-        bump = min(TABLE_SPREAD * after.roughness, HIGHEST_BUMP)
         remarks.append(
             f"the table is rough by {1000 * after.roughness:.1f} mm in the depth image: what has "
-            f"its colour may be taken for it up to a height of {1000 * bump:.0f} mm; check the "
-            "camera's pose, or lay a cloth of another colour below"
+            "its colour may be taken for it up to a height of "
+            f"{1000 * bump_height(after.roughness):.0f} mm; check the camera's pose, or lay a "
+            "cloth of another colour below"
         )
     return after, remarks
 
