@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from envs.cell_layout import ObjectModel
-from envs.object_files import DEFAULT_DENSITY, Inertial, fine_visual, read_object
+from envs.object_files import DEFAULT_DENSITY, Inertial, colour, fine_visual, read_object
 from envs.object_meshes import ObjectError, decompose, write_parts_obj
 from envs.object_parts import MassProperties
 from envs.object_primitives import NativeShape, Primitive, random_color
@@ -78,7 +78,7 @@ def load_object(
         mass=mass,
         inertia=np.diag(inertial.inertia) * scale**2 * (mass / inertial.mass),
         friction=source.friction,
-        color=source.color or random_color(np.random.default_rng(list(name.encode()))),
+        color=colour(path, source) or random_color(np.random.default_rng(list(name.encode()))),
         collision=write_parts_obj(parts, cache_dir),
         fine_visual=fine_visual(path, source, scale, inertial.centre_of_mass, cache_dir),
         extents=np.ptp(np.concatenate(parts), axis=0),

@@ -25,6 +25,7 @@ from envs.object_meshes import (
     checked_mesh,
     load_mesh,
     parse_xml,
+    surface_colour,
     write_mesh_obj,
 )
 
@@ -155,6 +156,16 @@ def fine_visual(
         position=tuple((scale * (T[:3, 3] - centre)).tolist()),
         quaternion=tuple(Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
     )
+
+
+def colour(path: Path, source: ObjectSource) -> tuple[float, float, float, float] | None:
+    """RGBA in 0..1 of an object: of the one mesh that its picture has, or as its file states; None
+    where neither says. path: the file that `source` was read from."""
+    picture = path if path.suffix.lower() in MESH_SUFFIXES else None
+    if source.visual is not None:
+        picture = source.visual[0]
+    found = None if picture is None else surface_colour(picture)
+    return found or source.color
 
 
 def _resolve_mesh(filename: str, urdf: Path) -> str:

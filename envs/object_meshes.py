@@ -82,6 +82,36 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     return checked_mesh(mesh, str(path))
 
 
+def surface_colour(path: Path) -> tuple[float, float, float, float] | None:
+    """RGBA in 0..1 of a mesh file that `load_mesh` reads: the mean over its surface of its textures
+    or of its faces' and vertices' colours; None where it has none that can be read."""
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        parts = [(mesh.area_faces, _face_colours(mesh)) for mesh in scene.geometry.values()]
+    except Exception:  # of trimesh's readers, on materials: shape and mass do not need them
+        return None
+    parts = [(area, colours) for area, colours in parts if colours is not None]
+    area = sum(area.sum() for area, _ in parts)
+    if not area > 0:
+        return None
+    red, green, blue = sum(area @ colours for area, colours in parts) / (255 * area)
+    return float(red), float(green), float(blue), 1.0
+
+
+def _face_colours(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """(F, 3) in 0..255: a texture's in the middle of each face, or the face's own."""
+    visual = mesh.visual
+    if not isinstance(visual, trimesh.visual.TextureVisuals):
+        return visual.face_colors[:, :3].astype(float) if visual.defined else None
+    if visual.uv is None:
+        return None
+    middle = np.nan_to_num(visual.uv[mesh.faces].mean(axis=1))
+    colours = visual.material.to_color(middle)
+    if colours is None:
+        return None
+    return np.broadcast_to(np.asarray(colours, float)[..., :3], (len(middle), 3))
+
+
 def _check_size(scene: trimesh.Scene) -> None:
     """Raise ValueError for a scene that is too large as one mesh: a small file may say of a shape
     that it stands in many places."""
