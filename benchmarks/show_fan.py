@@ -62,9 +62,9 @@ def main(argv: Sequence[str] | None = None) -> None:
                 iio.imwrite(path, views(planner, frame.without_truth()))
                 print(f"wrote {path}")
             grasps = planner(frame)
-            if not grasps:
-                continue
             grasp = first_untried(within_reach(cell, grasps), [])
+            if grasp is None:
+                continue
             pictures.append(at_grasp(cell, grasp))
             captions.append(f"scene {seed}: {np.degrees(grasp.tilt):.0f} degrees")
     iio.imwrite(chosen.output, contact_sheet(pictures, captions, columns=5))

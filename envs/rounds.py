@@ -16,7 +16,6 @@ in its way, and the round ends when the target is in the bin, or after as many g
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -153,15 +152,16 @@ def run_round(
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
             now = partial(after_a_failure, chances=chances if failed else None)
             worth = [grasp for grasp in grasps if now(grasp).quality >= least]
-            if not worth:
-                detail = _details(look_again.remark, _abstained(map(now, grasps), least))
+            ordered = elsewhere_first(worth, missed) if missed else worth
+            chosen = first_untried(within_reach(cell, ordered), failed)
+            if chosen is None:
+                why = _out_of_reach(worth) if worth else _abstained(map(now, grasps), least)
+                detail = _details(look_again.remark, why)
                 spent = look_again.sim_seconds
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
                 break
-            ordered = elsewhere_first(worth, missed) if missed else worth
-            reached = within_reach(cell, ordered)
-            grasp = now(no_deeper(first_untried(reached, failed), failed, stops))
+            grasp = now(no_deeper(chosen, failed, stops))
             approach: Approach = open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
@@ -303,6 +303,10 @@ def _abstained(grasps: Iterable[Grasp], least: float) -> str:
     return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
 
 
+def _out_of_reach(grasps: Sequence[Grasp]) -> str:
+    return f"none of {len(grasps)} grasps is within reach"
+
+
 def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:
     """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
     out what is hopeless, where the planner states chances of success, which are an arm's."""
@@ -321,25 +325,21 @@ def after_a_failure(grasp: Grasp, chances: Calibration | None) -> Grasp:
 
 def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
     """The grasps that the arm can go to, in their order; those from straight above are not asked
-    where nothing hangs over the table, because nearly all are. The first of all where the arm
-    reaches none. A floating hand reaches all that are above the table."""
+    where nothing hangs over the table, because nearly all are. A floating hand reaches all that are
+    above the table."""
     reachable = reaches if cell.has_arm else clears_table
     least = 0.0 if cell.hanging else PLANAR
-    nothing = True
     for grasp in grasps:
         if grasp.tilt < least or reachable(cell, grasp):
-            nothing = False
             yield grasp
-    if nothing:
-        yield grasps[0]
 
 
-def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp:
-    """The first grasp that is not near one of those that failed; the first of all if there is
-    none."""
-    others = iter(grasps)
-    first = next(others)
-    for grasp in itertools.chain([first], others):
+def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp | None:
+    """The first grasp that is not near one of those that failed; the first of all where each is;
+    None of none."""
+    first = None
+    for grasp in grasps:
+        first = first or grasp
         if not any(_alike(grasp, other) for other in failed):
             return grasp
     return first

@@ -145,6 +145,7 @@ def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
     assert first_untried([again, beside, turned], [first]) is beside
     assert first_untried([again, turned], [first]) is turned
     assert first_untried([again, first], [first]) is again  # nothing else is left
+    assert first_untried([], [first]) is None
 
 
 def test_no_grasp_goes_as_deep_as_the_palm_was_stopped_there() -> None:
@@ -179,7 +180,12 @@ def test_what_the_arm_cannot_reach_is_passed_over(cell, box_set) -> None:
     tilted = replace(cube_grasp(), approach=np.array([0.0, 0.5, -np.sqrt(0.75)]))
     far = cube_grasp(offset=(1.0, 0.0, 0.0))
     assert [*map(id, within_reach(cell, [away, tilted, far]))] == [id(tilted), id(far)]
-    assert [*map(id, within_reach(cell, [away, away]))] == [id(away)]  # its failure has a name
+    record = run_round(
+        cell, cube_scene(box_set), planner_of([away, away]), policy="x", objects="box",
+        max_failures=2,
+    )  # fmt: skip
+    assert (record.ended, record.executed) == ("no_plan", 0)  # nothing moved
+    assert record.attempts[0].detail == "none of 2 grasps is within reach"
 
 
 def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:

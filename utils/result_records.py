@@ -42,7 +42,7 @@ FAILURES = {  # reason: its name in tables, in the order in which a grasp can fa
 }
 ENDINGS = {  # why a round ended
     "cleared": "every object removed",
-    NO_PLAN: "the planner found no grasp that is likely enough",
+    NO_PLAN: "the planner found no grasp that is likely enough and within reach",
     PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
     "lost": "the objects that were left fell off the table",
