@@ -52,10 +52,13 @@ def labelled_by_centres(
     )
     place = scaling.pixels(project(surface, frame.K, frame.T_WC)[0])
     limits = offset.shape[2] - 1, offset.shape[1] - 1
-    u, v = np.clip(np.rint(place).astype(int), 0, limits).T
-    votes = place + offset[:, v, u].T
-    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
+    within = np.clip(place, 0, limits)
+    u, v = np.rint(within).astype(int).T
+    votes = within + offset[:, v, u].T
+    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else. Nor
+    # do those outside the image, which belong to what the border shows.
     seen = heights.ceiling[row, column] <= height
+    seen &= (np.abs(place - within) <= 1).all(axis=1)
     behind = np.zeros(len(row), bool)
     if frame.second is not None:
         behind = hides(frame, surface)

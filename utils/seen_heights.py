@@ -34,6 +34,9 @@ MARGIN = 0.08  # m, by which the grid reaches beyond the workspace
 # What stands as near as this around the workspace is in the way of a hand that comes from a side:
 # the hand is 0.2 m long and starts 0.1 m before the grasp.
 _HAND_REACH, _STANDS = 0.30, 0.02  # m, and m over the table
+# What rises as much over the table is an object that the image may cut off; beyond the border it
+# goes on for more than a hand spans.
+_CUT_OFF, _GOES_ON = 0.008, 0.1  # m
 # A surface this much behind a point is seen through it: more than two cameras disagree, less than
 # the least step that separates objects.
 _SEEN_THROUGH = 0.004  # m
@@ -199,15 +202,50 @@ def table_slope(
 
 def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
     """The frame, its unknown pixels filled with the nearest surface beside them (`near_side`), and
-    which of them (H, W) may hide matter: those that are not `at_edges`. Both without the rows and
-    columns in which nothing lies over the workspace or stands around it."""
+    which of them (H, W) may hide matter: those that are not `at_edges`. Both go on where the image
+    cuts something off (`with_surroundings`), and are without the rows and columns in which nothing
+    lies over the workspace or stands around it."""
     measured = known_depth(frame.depth)
     hiding = ~measured & ~at_edges(frame.depth)
     if not measured.all():
         reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))
+    frame, added = with_surroundings(frame, workspace.table_height)
+    hiding = np.pad(hiding, added)
     rows, columns = _around(frame, workspace)
     return frame.part(rows, columns), hiding[rows, columns]
+
+
+def with_surroundings(
+    frame: RGBDFrame, table_height: float
+) -> tuple[RGBDFrame, tuple[tuple[int, int], tuple[int, int]]]:
+    """The frame with more rows and columns at those borders of its image that cut off what stands
+    on the table, and how many: (before, after) of rows and of columns. Each surface goes on beyond
+    the border at its height in W, in black.
+
+    A camera does not see where an object ends that its image cuts off: it does not end at the
+    border, where fingers would find nothing to close on.
+    """
+    none = ((0, 0), (0, 0))
+    known = known_depth(frame.depth)
+    rise = frame.depth * ray_component(2, known.shape, frame.K, frame.T_WC) + frame.T_WC[2, 3]
+    stands = known & (rise > table_height + _CUT_OFF)
+    cuts = [[stands[0], stands[-1]], [stands[:, 0], stands[:, -1]]]
+    if frame.fixtures or not any(border.any() for ends in cuts for border in ends):
+        return frame, none  # the place of fixtures is known
+    more = reach_in_pixels(frame, _GOES_ON)
+    top, bottom, left, right = (more * int(border.any()) for ends in cuts for border in ends)
+    added = (top, bottom), (left, right)
+    K = frame.K.copy()
+    K[:2, 2] += left, top
+    rise = np.pad(np.where(known, rise, np.nan), added, mode="edge")
+    with np.errstate(divide="ignore"):
+        depth = (rise - frame.T_WC[2, 3]) / ray_component(2, rise.shape, K, frame.T_WC)
+    depth = np.where(known_depth(depth), depth, 0).astype(np.float32)
+    rows, columns = known.shape
+    depth[top : top + rows, left : left + columns] = frame.depth
+    rgb = np.pad(frame.rgb, (*added, (0, 0)))
+    return replace(frame, rgb=rgb, depth=depth, K=K, segmentation=None, target=None), added
 
 
 def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
