@@ -1,7 +1,9 @@
 """Object files: what is wrong with one is named in one sentence."""
 
+import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from envs.object_bodies import load_object
 from envs.object_files import read_object
@@ -36,3 +38,67 @@ def test_a_urdf_with_collision_geometry_alone_is_shown_by_it(tmp_path):
     visual = load_object(tmp_path / "box.urdf", cache_dir=tmp_path).fine_visual
     mesh = trimesh.load_mesh(visual.path)
     assert mesh.extents * visual.scale == pytest.approx([0.04, 0.05, 0.06])
+
+
+TEXTURED = """mtllib box.mtl
+v 0 0 0
+v 0.06 0 0
+v 0.06 0.04 0
+v 0 0.04 0
+v 0.03 0.02 0.05
+vt 0.25 0.5
+vt 0.75 0.5
+usemtl picture
+f 1/1 3/1 2/1
+f 1/1 4/1 3/1
+f 1/2 2/2 5/2
+f 2/2 3/2 5/2
+f 3/2 4/2 5/2
+f 4/2 1/2 5/2
+"""
+
+
+def write_textured(folder, image="map_Kd picture.png"):
+    """A pyramid whose base shows the left half of a picture, red, and whose sides the right one."""
+    (folder / "box.obj").write_text(TEXTURED)
+    (folder / "box.mtl").write_text(f"newmtl picture\n{image}\n")
+    picture = np.zeros((8, 8, 3), np.uint8)
+    picture[:, :4], picture[:, 4:] = (200, 0, 0), (0, 0, 100)
+    Image.fromarray(picture).save(folder / "picture.png")
+    return folder / "box.obj"
+
+
+# Of the base, and of two sides each: their heights are the root of 0.05^2 + 0.02^2 or + 0.03^2.
+BASE = 0.06 * 0.04
+SIDES = 0.06 * np.hypot(0.05, 0.02) + 0.04 * np.hypot(0.05, 0.03)
+
+
+def test_an_object_has_the_mean_colour_of_its_texture(tmp_path):
+    """Weighted by the surface that shows it, by hand."""
+    red, blue = 200 / 255 * BASE / (BASE + SIDES), 100 / 255 * SIDES / (BASE + SIDES)
+    path = write_textured(tmp_path)
+    assert load_object(path, cache_dir=tmp_path).color == pytest.approx((red, 0, blue, 1))
+    urdf = tmp_path / "white.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="l"><visual><geometry><mesh filename="box.obj"/></geometry>'
+        '<material name="m"><color rgba="1 1 1 1"/></material></visual></link></robot>'
+    )
+    assert load_object(urdf, cache_dir=tmp_path).color == pytest.approx((red, 0, blue, 1))
+
+
+def test_an_object_has_the_colour_of_its_faces(tmp_path):
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    mesh.visual.face_colors = (51, 102, 153, 255)
+    mesh.export(tmp_path / "box.ply")
+    colour = load_object(tmp_path / "box.ply", cache_dir=tmp_path).color
+    assert colour == pytest.approx((0.2, 0.4, 0.6, 1))
+
+
+@pytest.mark.parametrize("broken", ["", "map_Kd nowhere.png", "map_Kd box.obj", "Kd red"])
+def test_a_picture_that_cannot_be_read_leaves_the_colour_of_the_name(tmp_path, broken):
+    path = write_textured(tmp_path, broken)
+    plain = tmp_path / "plain" / "box.obj"
+    plain.parent.mkdir()
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(plain)
+    colour = load_object(plain, cache_dir=tmp_path).color
+    assert load_object(path, cache_dir=tmp_path).color == colour

@@ -17,7 +17,7 @@ from utils.height_map import (
     tilted_height_map,
     tilted_view,
 )
-from utils.seen_heights import hides, sees_through, without_holes
+from utils.seen_heights import hides, sees_through, with_surroundings, without_holes
 from utils.transforms import RGBDFrame, look_at
 
 BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))
@@ -125,3 +125,48 @@ def test_planners_take_two_frames(name) -> None:
     best = plan(seen_from(0, 180).without_truth())[0]
     beyond = np.abs(best.position - (0.5, 0, 0.05)) - (0.03, 0.04, 0.05)
     assert (beyond < 0.005).all()  # the point between the fingertips is in the box
+
+
+# Seen from 0.8 m, 0.149 m at the level of the table lie between the optical axis and the border of
+# the image, and 0.139 m at the top of this box, which spans 0.09 to 0.21 m.
+CUT = ((0.10, 0.12, 0.05), 0.0, (0.5, 0.15))
+
+
+def test_a_box_that_the_image_cuts_off_goes_on_beyond_the_border() -> None:
+    """At its own height, beside a table that stays one; the far half of the image is as it was."""
+    frame = boxes_frame([CUT], focal=600)
+    heights = height_map_from_frame(frame, Workspace())
+
+    def height(x: float, y: float) -> float:
+        return float(heights.height[heights.index(np.array([x, y]))])
+
+    for y in (0.10, 0.13, 0.16, 0.20):
+        assert height(0.5, y) == pytest.approx(0.05, abs=1e-3)
+        assert height(0.6, y) == pytest.approx(0.0, abs=1e-3)
+    assert height(0.5, -0.2) == height(0.5, 0.0) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_no_grasp_closes_where_the_image_ends() -> None:
+    """The 49 mm of the box that are seen would fit the hand; it is 120 mm long, and 100 mm wide."""
+    plan = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
+    assert plan(boxes_frame([CUT], focal=600)) == []
+    whole = ((0.10, 0.049, 0.05), 0.0, (0.5, 0.10))
+    assert plan(boxes_frame([whole], focal=600))
+
+
+def test_an_image_that_cuts_nothing_off_stays_as_it_is() -> None:
+    frame = boxes_frame([BOX])
+    same, added = with_surroundings(frame, 0.0)
+    assert same is frame and added == ((0, 0), (0, 0))
+
+
+def test_only_the_borders_that_cut_something_off_are_widened() -> None:
+    """0.1 m at the median depth of 0.8 m and 600 px; its pixels keep their points."""
+    frame = boxes_frame([CUT], focal=600)
+    wider, added = with_surroundings(frame, 0.0)
+    assert sorted(np.ravel(added)) == [0, 0, 0, 75]
+    (top, bottom), (left, right) = added
+    points = wider.points()[top : 224 + top, left : 224 + left]
+    np.testing.assert_allclose(points, frame.points(), atol=1e-6)
+    rise = wider.points()[..., 2]
+    assert rise.min() == pytest.approx(0, abs=1e-5) and rise.max() == pytest.approx(0.05, abs=1e-5)
