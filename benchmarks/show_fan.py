@@ -89,11 +89,12 @@ def views(planner: FanPlanner, frame: RGBDFrame) -> np.ndarray:
 
 def shaded(heights: HeightMap) -> np.ndarray:
     """(H, W, 3) uint8: heights over the middle of the table, in grey, what is hidden in red."""
-    middle = float(np.median(heights.height[heights.label >= 0]))
+    on_objects = heights.label >= 0
+    middle = float(np.median(heights.height[on_objects] if on_objects.any() else heights.height))
     grey = np.clip((heights.height - middle) / _SHOWN + 0.5, 0, 1) * 255
     hidden = heights.ceiling > heights.height + 0.005
-    red = np.where(hidden, 200, grey)
-    image = np.stack([red, grey, grey], axis=-1).astype(np.uint8)[::-1]
+    red, others = np.where(hidden, 200, grey), np.where(hidden, grey / 2, grey)
+    image = np.stack([red, others, others], axis=-1).astype(np.uint8)[::-1]
     return cv2.resize(image, (200, 200), interpolation=cv2.INTER_AREA)
 
 

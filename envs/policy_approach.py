@@ -8,6 +8,7 @@ policies of train_rl.py (`ppo`, `ppo:FILE.pt`) and of Stable-Baselines3 (`sb3:FI
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,8 @@ def load_learned(name: str) -> SavedPolicy | Sb3Policy:
 def check_learned(
     name: str, scenarios: Sequence[str], controllers: Sequence[str], config: Config
 ) -> None:
-    """Raise UserError for a policy that cannot be loaded, or not be scored in this evaluation."""
+    """Raise UserError for a policy that cannot be loaded, or not be scored in this evaluation; warn
+    of objects that it was not trained on."""
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         _check_spaces(policy, config)
@@ -135,6 +137,21 @@ def check_learned(
         raise UserError(
             f"evaluate.controllers: {name} is its own controller; use {OPEN_LOOP} with it"
         )
+    if remark := foreign_objects(name, config.evaluate.object_sets):
+        warnings.warn(remark, stacklevel=2)
+
+
+def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
+    """A sentence about the object sets that a policy of train_rl.py was not trained on; empty where
+    there are none, or where its file does not tell."""
+    policy = load_learned(name)
+    if isinstance(policy, Sb3Policy):
+        return ""
+    trained = policy.config.get("env", {}).get("objects")
+    others = [one for one in object_sets if one != trained]
+    if trained is None or not others:
+        return ""
+    return f"{name} was trained on {trained}, and not on {', '.join(others)}"
 
 
 def _check_knowledge(name: str, policy: SavedPolicy) -> None:

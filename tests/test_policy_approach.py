@@ -15,7 +15,7 @@ from envs.env_actions import ActionDecoder
 from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
-from envs.policy_approach import PolicyApproach, placeholder
+from envs.policy_approach import PolicyApproach, foreign_objects, placeholder
 from envs.simulators import make_cell
 from envs.vector_env import make_env
 from models.grasp_policy import load_policy
@@ -201,3 +201,12 @@ def test_randomised_actions_are_those_of_the_environment():
         env.step(action)
     env.close()
     assert np.array(reached).tolist() == sent.tolist()
+
+
+def test_objects_that_a_policy_was_not_trained_on_are_named():
+    sets = ["box", "primitives", "path/to/mine"]
+    assert (
+        foreign_objects("ppo", sets)
+        == "ppo was trained on box, and not on primitives, path/to/mine"
+    )
+    assert foreign_objects("ppo", ["box"]) == ""
