@@ -250,6 +250,21 @@ def test_votes_at_another_resolution_lead_to_the_same_centres() -> None:
     np.testing.assert_allclose(*(centres_by_place(x, frame) for x in (once, twice)), atol=0.002)
 
 
+def test_what_the_image_cuts_off_is_one_object_with_what_it_shows() -> None:
+    """12 cm of a box, of which the image shows 5: what goes on beyond the border casts no votes."""
+    frame = boxes_frame([((0.10, 0.12, 0.05), 0.0, (0.5, 0.15))], focal=600)
+    heights = height_map_from_frame(frame, Workspace())
+    centre, _ = project([[0.5, 0.15, 0.025]], frame.K, frame.T_WC)
+    v, u = np.mgrid[:224, :224]
+    offset = centre.reshape(2, 1, 1) - np.stack([u, v])
+    found = labelled_by_centres(heights, frame, SAME, offset)
+    matter = heights.label >= 0
+    assert matter.sum() * heights.cell**2 > 0.10 * 0.12
+    assert set(np.unique(found.label[matter])) == {0}
+    assert len(found.centres) == 1 + len(heights.centres)
+    np.testing.assert_allclose(found.centres[0], [0.5, 0.15, 0.025], atol=0.002)
+
+
 def test_a_piece_without_common_votes_keeps_the_height_maps_label() -> None:
     """Two boxes apart; of the second one all votes lead far away and to different places."""
     apart = [TOUCHING[0], ((0.03, 0.03, 0.04), 0.3, (0.42, -0.08))]

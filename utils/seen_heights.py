@@ -224,7 +224,8 @@ def with_surroundings(
     the border at its height in W, in black.
 
     A camera does not see where an object ends that its image cuts off: it does not end at the
-    border, where fingers would find nothing to close on.
+    border, where fingers would find nothing to close on. A frame with fixtures stays as it is:
+    a board or a wall, whose place is known, may be all that stands there.
     """
     none = ((0, 0), (0, 0))
     known = known_depth(frame.depth)
@@ -232,7 +233,7 @@ def with_surroundings(
     stands = known & (rise > table_height + _CUT_OFF)
     cuts = [[stands[0], stands[-1]], [stands[:, 0], stands[:, -1]]]
     if frame.fixtures or not any(border.any() for ends in cuts for border in ends):
-        return frame, none  # the place of fixtures is known
+        return frame, none
     more = reach_in_pixels(frame, _GOES_ON)
     top, bottom, left, right = (more * int(border.any()) for ends in cuts for border in ends)
     added = (top, bottom), (left, right)
