@@ -93,8 +93,9 @@ def _content(config: Config) -> str:
     }
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
     chosen["gripper"] = json.loads(json.dumps(asdict(config.gripper.geometry)))
-    if not config.gripper.opens_fully:  # valid as above
-        chosen["gripper"].pop("opens_fully")
+    for name in ("opens_fully", "least_held"):
+        if not chosen["gripper"][name]:  # valid as above
+            chosen["gripper"].pop(name)
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
 
 

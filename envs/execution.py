@@ -110,9 +110,10 @@ class GraspOutcome:
 
     reason: `success`, or a key of `utils.result_records.FAILURES`: `ik` (the arm cannot reach a
     pose or the line to it), `collision` (a contact stopped the approach), `missed` (the fingers
-    closed on nothing), `slipped` (the object was lost before the lift height), `dropped` (lost
-    after it), `stopped` (by the gate that every command to the arm passes, or because time ran
-    out), and in a closed loop `lost` (the camera no longer saw the object).
+    closed on nothing, or on what is no wider than gripper.least_held), `slipped` (the object was
+    lost before the lift height), `dropped` (lost after it), `stopped` (by the gate that every
+    command to the arm passes, or because time ran out), and in a closed loop `lost` (the camera no
+    longer saw the object).
     sim_seconds: simulated time from home and back to home, at legal joint speeds.
     object_index: the object that the hand held, even if it lost the object or stopped later; None
     if it held nothing.

@@ -22,7 +22,6 @@ from utils.transforms import Grasp
 
 PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
 RETREAT = 0.10  # m, VGN's
-LEAST_WIDTH = 0.1  # of the widest opening: narrower objects do not count as held; VGN's
 SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
 CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's bin
 _HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
@@ -41,11 +40,10 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     moves at execution.approach_speed. A contact where it is put is a `collision`, and so is one on
     its way in, unless execution.on_contact is `grip`: then the hand stops and closes there.
     Success: after a retreat of RETREAT, along the approach or, from a side where nothing hangs over
-    the table, straight up, both fingers grip one object and are more than LEAST_WIDTH of the widest
-    opening apart. `missed`:
-    nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was, and was
-    lost. A picked object is removed. With execution.strict, an object may also not move in the
-    hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
+    the table, straight up, both fingers grip one object and are more than gripper.least_held apart.
+    `missed`: nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was,
+    and was lost. A picked object is removed. With execution.strict, an object may also not move in
+    the hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
     PhysicsError when the simulation blows up.
     """
     start = cell.seconds
@@ -172,7 +170,7 @@ def _judge(cell: Cell, gripped: int | None, motion: InHandMotion | None) -> None
 def _not_empty(cell: Cell, outcome: GraspOutcome) -> GraspOutcome:
     """The outcome of an attempt by VGN's rule: a hand that is nearly closed counts as empty."""
     hand = floating_hand(cell)
-    least = LEAST_WIDTH * hand.max_opening
+    least = hand.gripper.least_held
     if not outcome.success or hand.opening > least:
         return outcome
     thin = (

@@ -157,10 +157,11 @@ class Hand(ABC):
         """Contacts of a finger, LEFT or RIGHT, with a body; their normals point into the body."""
 
     def grips(self) -> bool:
-        """Whether the fingers feel something between them: they are apart, and their motor presses
-        with half of what it was told at least. True contacts are not asked."""
+        """Whether the fingers feel something between them: they are apart, by more than the
+        gripper's `least_held`, and their motor presses with half of what it was told at least. True
+        contacts are not asked."""
         pressing = self.finger_force() >= GRIPPED_SHARE * self._told_force
-        return pressing and self.opening > GRIPPED_OPENING
+        return pressing and self.opening > max(GRIPPED_OPENING, self.gripper.least_held)
 
     @abstractmethod
     def finger_force(self) -> float:

@@ -323,6 +323,11 @@ def measure(
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over &= np.minimum(*ends) > WALL_LABEL
+    if (
+        gripper.least_held
+    ):  # a thing turns between the pads, and looks up to a cell thicker than it is
+        thickness = (low_right - low_left).max(axis=1)
+        left_over &= thickness > gripper.least_held + 1.5 * heights.cell
     if heights.fixed is not None:  # a fixture under an object that leans over it
         between = (u > left[:, None]) & (u < right[:, None])
         fixed = heights.fixed.take(where).max(axis=1)

@@ -89,8 +89,9 @@ def test_data_made_before_there_were_side_views_and_floating_hands_stay_valid():
         content["camera"]
     )
     assert "arm" not in content["robot"] and "on_contact" not in content["execution"]
-    assert "opens_fully" not in content["gripper"]
+    assert {"opens_fully", "least_held"}.isdisjoint(content["gripper"])
     assert folder_of("gripper.opens_fully=true") != folder_of()
+    assert folder_of("gripper.least_held=0.008") != folder_of()
 
 
 def test_a_named_root_is_taken_as_it_is(tmp_path):

@@ -37,7 +37,13 @@ LEVEL = Grasp(np.array([0.5, 0.0, 0.03]), 0.0, 0.08, 1.0, np.array([1.0, 0.0, 0.
 def config_of(simulator: str, *overrides: str):
     return load_config(
         None,
-        [f"simulator={simulator}", "sim.renderer=tiny", "robot.arm=none", *overrides],
+        [
+            f"simulator={simulator}",
+            "sim.renderer=tiny",
+            "robot.arm=none",
+            "gripper.least_held=0.008",
+            *overrides,
+        ],
     )
 
 
@@ -170,7 +176,7 @@ def test_a_hand_that_gives_way_does_not_sink_under_its_own_weight(cell, tilt):
 
 
 def test_an_empty_hand_misses_and_so_does_a_thin_grip(cell, box_set):
-    """A plate of 6 mm is under a tenth of the opening."""
+    """A plate of 6 mm is thinner than gripper.least_held."""
     cell.load(cube_scene(box_set))
     beside = execute_floating(cell, cube_grasp(offset=(0.0, 0.12, 0.0)))
     assert (beside.reason, beside.object_index) == ("missed", None)
@@ -291,3 +297,17 @@ def test_planners_leave_room_for_a_hand_that_opens_fully(make, gap):
     assert grasps and all(grasp.width == HAND.max_opening for grasp in grasps)
     along_x = [grasp for grasp in grasps if abs(grasp.closing_direction[0]) > 0.9]
     assert bool(along_x) == (gap > 0.03)
+
+
+@pytest.mark.parametrize("make", [HeuristicPlanner, HeuristicFanPlanner])
+def test_planners_leave_out_what_counts_as_empty_however_well_it_is_held(make):
+    """A board 6 mm thick on its long edge, 5 cm high, and one of 14 mm."""
+    for thickness, counts in ((0.006, False), (0.014, True)):
+        frame = boxes_frame([((0.1, thickness, 0.05), 0.0, (0.5, 0.0))])
+        assert make(HAND, Workspace())(frame)
+        across = [
+            grasp
+            for grasp in make(replace(HAND, least_held=0.008), Workspace())(frame)
+            if abs(grasp.closing_direction[1]) > 0.95
+        ]
+        assert bool(across) == counts

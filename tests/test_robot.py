@@ -1,6 +1,8 @@
 """What the robot feels: forces on its hand, and whether something is between its fingers, in every
 simulator that is installed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -107,6 +109,14 @@ def test_fingers_that_something_keeps_apart_grip(cell, box_set, thickness):
     grip(cell, solid(box_set[0], NativeShape("box", (0.04, thickness, 0.04)), 0.1, 0.5), 10.0)
     cell.step(120)
     assert cell.robot.grips()
+
+
+@pytest.mark.parametrize("thickness, grips", [(0.006, False), (0.01, True)])
+def test_a_nearly_closed_hand_may_count_as_empty(cell, box_set, monkeypatch, thickness, grips):
+    grip(cell, solid(box_set[0], NativeShape("box", (0.04, thickness, 0.04)), 0.1, 0.5), 10.0)
+    monkeypatch.setattr(cell.robot, "gripper", replace(cell.robot.gripper, least_held=0.008))
+    cell.step(120)
+    assert cell.robot.grips() == grips
 
 
 def test_fingers_that_close_on_nothing_or_move_do_not_grip(cell):

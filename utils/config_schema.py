@@ -65,11 +65,12 @@ class RobotConfig(Section):
 class GripperConfig(Section):
     max_opening: Annotated[float, Field(ge=0.02, le=0.2)]
     opens_fully: bool
+    least_held: Annotated[float, Field(ge=0, le=0.02)]
 
     @property
     def geometry(self) -> GripperGeometry:
-        """The hand: the shapes of its fingers and palm are the Panda's, the opening is its own."""
-        return GripperGeometry(max_opening=self.max_opening, opens_fully=self.opens_fully)
+        """The hand: the shapes of its fingers and palm are the Panda's, the rest is its own."""
+        return GripperGeometry(**self.model_dump())
 
 
 class CameraConfig(Section):
