@@ -125,8 +125,10 @@ def _evaluation(
     return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept, split)
 
 
-def _policy(objects: str, file: str) -> Command:
-    policies = f"evaluate.policies=ppo:checkpoints/{file},heuristic"
+def _policies(objects: str) -> Command:
+    """Three trainings that differ in their seed; the first is the one that users get."""
+    files = [f"ppo:checkpoints/ppo_{objects}{seed}.pt" for seed in ("", "_1", "_2")]
+    policies = f"evaluate.policies={','.join(files)},heuristic"
     where = f"evaluate.scenarios=isolated evaluate.object_sets={objects}"
     return _evaluation(objects, 100, f"{policies} {where}", kept=3)
 
@@ -227,10 +229,8 @@ PARTS = (
                     "evaluate.object_sets=primitives", kept=2)
         for simulator in ("mujoco", "pybullet")
     )),
-    Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
-        _policy("box", "ppo_box.pt"),
-        _policy("random_urdfs", "ppo_random_urdfs.pt"),
-        _policy("primitives", "ppo_primitives.pt"),
+    Part("ppo", "three policies of PPO on unseen single objects each", 20, (
+        *map(_policies, ("box", "random_urdfs", "primitives")),
     )),
     Part("cornell", "Cornell's photographs", 15, (
         Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="

@@ -407,7 +407,8 @@ def _current_config(stored: dict) -> dict:
 
 
 def save_policy(path: Path | str, policy: SavedPolicy) -> None:
-    """Write what `load_policy` reads, without what only a resumed training needs."""
+    """Write what `load_policy` reads, in half precision and without what only a resumed training
+    needs."""
     save_checkpoint(
         path,
         kind=KIND,
@@ -415,4 +416,5 @@ def save_policy(path: Path | str, policy: SavedPolicy) -> None:
         model=policy.network,
         config=policy.config,
         extra={key: policy.extra[key] for key in ("layout", "history") if key in policy.extra},
+        half_precision=True,
     )
