@@ -84,10 +84,12 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 def surface_colour(path: Path) -> tuple[float, float, float, float] | None:
     """RGBA in 0..1 of a mesh file that `load_mesh` reads: the mean over its surface of its textures
-    or of its faces' and vertices' colours; None where it has none that can be read."""
+    or of the colours of its materials, faces or vertices; None where it has none that can be read.
+    """
     try:
         scene = trimesh.load_scene(path, process=False)
-        parts = [(mesh.area_faces, _face_colours(mesh)) for mesh in scene.geometry.values()]
+        _check_size(scene)
+        parts = [(mesh.area_faces, _face_colours(mesh)) for mesh in scene.dump()]
     except Exception:  # of trimesh's readers, on materials: shape and mass do not need them
         return None
     parts = [(area, colours) for area, colours in parts if colours is not None]
@@ -99,17 +101,21 @@ def surface_colour(path: Path) -> tuple[float, float, float, float] | None:
 
 
 def _face_colours(mesh: trimesh.Trimesh) -> np.ndarray | None:
-    """(F, 3) in 0..255: a texture's in the middle of each face, or the face's own."""
+    """(F, 3) in 0..255: a texture's in the middle of each face, its material's or its own; None
+    where nothing is stated."""
     visual = mesh.visual
     if not isinstance(visual, trimesh.visual.TextureVisuals):
         return visual.face_colors[:, :3].astype(float) if visual.defined else None
-    if visual.uv is None:
+    material = visual.material
+    texture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    # Where there is none, trimesh makes a grey one, which is no file's and has no format.
+    if visual.uv is not None and texture is not None and texture.format is not None:
+        colours = material.to_color(np.nan_to_num(visual.uv[mesh.faces].mean(axis=1)))
+        return np.asarray(colours, float)[:, :3]
+    colour = material.main_color
+    if (colour == trimesh.visual.color.to_rgba(None)).all():  # stands for none
         return None
-    middle = np.nan_to_num(visual.uv[mesh.faces].mean(axis=1))
-    colours = visual.material.to_color(middle)
-    if colours is None:
-        return None
-    return np.broadcast_to(np.asarray(colours, float)[..., :3], (len(middle), 3))
+    return np.tile(np.asarray(colour, float)[:3], (len(mesh.faces), 1))
 
 
 def _check_size(scene: trimesh.Scene) -> None:

@@ -7,7 +7,7 @@ from PIL import Image
 
 from envs.object_bodies import load_object
 from envs.object_files import read_object
-from envs.object_meshes import ObjectError
+from envs.object_meshes import ObjectError, surface_colour
 
 MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
 <mesh filename="mesh/box.obj"/></geometry></collision></link></robot>"""
@@ -92,6 +92,36 @@ def test_an_object_has_the_colour_of_its_faces(tmp_path):
     mesh.export(tmp_path / "box.ply")
     colour = load_object(tmp_path / "box.ply", cache_dir=tmp_path).color
     assert colour == pytest.approx((0.2, 0.4, 0.6, 1))
+
+
+def test_an_object_has_the_colour_of_its_material(tmp_path):
+    path = write_textured(tmp_path, "Kd 0.8 0.2 0.4")
+    colour = load_object(path, cache_dir=tmp_path).color
+    assert colour == pytest.approx((0.8, 0.2, 0.4, 1), abs=1 / 255)
+
+
+def test_a_part_counts_as_large_as_it_stands_in_the_scene(tmp_path):
+    """Two cubes alike, a red one scaled to 2 cm and a blue one to 6: nine times the surface."""
+    scene = trimesh.Scene()
+    for colour, side in (((255, 0, 0, 255), 0.02), ((0, 0, 255, 255), 0.06)):
+        cube = trimesh.creation.box((1, 1, 1))
+        cube.visual.face_colors = colour
+        scene.add_geometry(cube, transform=np.diag([side, side, side, 1.0]))
+    scene.export(tmp_path / "cubes.glb")
+    assert surface_colour(tmp_path / "cubes.glb") == pytest.approx((0.1, 0, 0.9, 1))
+
+
+def test_coordinates_of_a_texture_that_is_not_there_say_nothing_of_a_colour(tmp_path):
+    path = write_textured(tmp_path)
+    path.write_text(
+        "\n".join(line for line in TEXTURED.splitlines() if "mtl" not in line), encoding="utf-8"
+    )
+    urdf = tmp_path / "red.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="l"><visual><geometry><mesh filename="box.obj"/></geometry>'
+        '<material name="m"><color rgba="0.9 0.1 0.1 1"/></material></visual></link></robot>'
+    )
+    assert load_object(urdf, cache_dir=tmp_path).color == pytest.approx((0.9, 0.1, 0.1, 1))
 
 
 @pytest.mark.parametrize("broken", ["", "map_Kd nowhere.png", "map_Kd box.obj", "Kd red"])
