@@ -50,7 +50,8 @@ def labelled_by_centres(
     surface = np.column_stack(
         [heights.origin + heights.cell * np.column_stack([column, row]), height]
     )
-    place = scaling.pixels(project(surface, frame.K, frame.T_WC)[0])
+    # NaN, behind the camera, is outside the image, too.
+    place = np.nan_to_num(scaling.pixels(project(surface, frame.K, frame.T_WC)[0]), nan=-2.0)
     limits = offset.shape[2] - 1, offset.shape[1] - 1
     within = np.clip(place, 0, limits)
     u, v = np.rint(within).astype(int).T

@@ -83,9 +83,10 @@ def test_a_second_frame_never_denies_what_is_there(seed: int) -> None:
         for place in rng.uniform((0.4, -0.1), (0.6, 0.1), (rng.integers(1, 5), 2))
     ]
     azimuth, other = rng.uniform(0, 360, 2)
-    one = height_map_from_frame(seen_from(azimuth, boxes=boxes), Workspace())
     frame = seen_from(azimuth, other, boxes=boxes)
     both = height_map_from_frame(frame, Workspace())
+    blind = replace(frame.second, depth=np.zeros_like(frame.second.depth))
+    one = height_map_from_frame(replace(frame, second=blind), Workspace())
     exact = height_map_from_scene(frame.truth, Workspace(), cell=both.cell)
     denied = [(exact.height > heights.ceiling + 0.006).sum() for heights in (both, one)]
     assert denied[0] <= denied[1] + 5  # cells at edges, where a pixel is wider than they are
@@ -152,6 +153,18 @@ def test_no_grasp_closes_where_the_image_ends() -> None:
     assert plan(boxes_frame([CUT], focal=600)) == []
     whole = ((0.10, 0.049, 0.05), 0.0, (0.5, 0.10))
     assert plan(boxes_frame([whole], focal=600))
+
+
+def test_a_second_frame_shows_where_an_object_ends_that_the_first_one_cuts_off() -> None:
+    """The box ends at y = 0.16; the first image at 0.139, as above."""
+    box = [((0.10, 0.06, 0.05), 0.0, (0.5, 0.13))]
+    target = np.array([0.5, 0.13, 0.0])
+    other = boxes_frame(box, T_WC=look_at(target + (0.3, 0.3, 0.6), target, (0, 0, 1)))
+    frame = replace(boxes_frame(box, focal=600), second=other)
+    heights = height_map_from_frame(frame, Workspace())
+    for y, height in ((0.12, 0.05), (0.15, 0.05), (0.17, 0.0), (0.2, 0.0)):
+        at = heights.index(np.array([0.5, y]))
+        assert heights.height[at] == pytest.approx(height, abs=2e-3)
 
 
 def test_an_image_that_cuts_nothing_off_stays_as_it_is() -> None:

@@ -225,14 +225,19 @@ def with_surroundings(
 
     A camera does not see where an object ends that its image cuts off: it does not end at the
     border, where fingers would find nothing to close on. A frame with fixtures stays as it is:
-    a board or a wall, whose place is known, may be all that stands there.
+    a board or a wall, whose place is known, may be all that stands there. So does one with a second
+    frame, which shows where the object ends.
     """
     none = ((0, 0), (0, 0))
     known = known_depth(frame.depth)
     rise = frame.depth * ray_component(2, known.shape, frame.K, frame.T_WC) + frame.T_WC[2, 3]
     stands = known & (rise > table_height + _CUT_OFF)
     cuts = [[stands[0], stands[-1]], [stands[:, 0], stands[:, -1]]]
-    if frame.fixtures or not any(border.any() for ends in cuts for border in ends):
+    if (
+        frame.fixtures
+        or frame.second is not None
+        or not any(border.any() for ends in cuts for border in ends)
+    ):
         return frame, none
     more = reach_in_pixels(frame, _GOES_ON)
     top, bottom, left, right = (more * int(border.any()) for ends in cuts for border in ends)
