@@ -26,6 +26,7 @@ from utils.target import pixel_labels
 from utils.transforms import Grasp, RGBDFrame, transform_points
 
 _NOWHERE = -1e3  # m, under everything
+_UNSURE = 0.001  # m, by which `_thickness` may be wrong
 
 
 class SearchPlanner:
@@ -323,11 +324,9 @@ def measure(
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over &= np.minimum(*ends) > WALL_LABEL
-    if (
-        gripper.least_held
-    ):  # a thing turns between the pads, and looks up to a cell thicker than it is
-        thickness = (low_right - low_left).max(axis=1)
-        left_over &= thickness > gripper.least_held + 1.5 * heights.cell
+    if gripper.least_held:
+        thickness = _thickness(low_left, low_right, along, heights.cell)
+        left_over &= thickness > gripper.least_held + _UNSURE
     if heights.fixed is not None:  # a fixture under an object that leans over it
         between = (u > left[:, None]) & (u < right[:, None])
         fixed = heights.fixed.take(where).max(axis=1)
@@ -390,6 +389,18 @@ def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.
     left = u[matter.argmax(axis=-1)] - cell / 2
     right = u[len(u) - 1 - matter[..., ::-1].argmax(axis=-1)] + cell / 2
     return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
+
+
+def _thickness(left: np.ndarray, right: np.ndarray, along: np.ndarray, cell: float) -> np.ndarray:
+    """(N,) metres between the flat pads once they have turned what they hold onto its faces; -inf
+    where few lines meet matter.
+
+    left, right: (N, V) first contacts of the lines across the pads. along: (N, 2) closing lines.
+    The longest third of the chords counts: those of a board are alike, however it is turned. A cell
+    has matter if any point lies in it, so that a shape is wider by a cell's extent along the line.
+    """
+    chords = np.sort(right - left, axis=1)[:, -(left.shape[1] // 3) :]
+    return chords.mean(axis=1) - cell * np.abs(along).sum(axis=1)
 
 
 def _widest_opening(

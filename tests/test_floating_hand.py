@@ -27,7 +27,7 @@ from tests.helpers.simulators import INSTALLED
 from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
-from utils.transforms import DOWN, Grasp, top_down_pose
+from utils.transforms import DOWN, Grasp, look_at, top_down_pose
 
 SIDE = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])  # 45 degrees from straight above
 HAND = GripperGeometry()
@@ -299,15 +299,30 @@ def test_planners_leave_room_for_a_hand_that_opens_fully(make, gap):
     assert bool(along_x) == (gap > 0.03)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.4, np.pi / 4])
 @pytest.mark.parametrize("make", [HeuristicPlanner, HeuristicFanPlanner])
-def test_planners_leave_out_what_counts_as_empty_however_well_it_is_held(make):
-    """A board 6 mm thick on its long edge, 5 cm high, and one of 14 mm."""
-    for thickness, counts in ((0.006, False), (0.014, True)):
-        frame = boxes_frame([((0.1, thickness, 0.05), 0.0, (0.5, 0.0))])
-        assert make(HAND, Workspace())(frame)
-        across = [
-            grasp
-            for grasp in make(replace(HAND, least_held=0.008), Workspace())(frame)
-            if abs(grasp.closing_direction[1]) > 0.95
-        ]
-        assert bool(across) == counts
+def test_planners_leave_out_what_counts_as_empty_however_well_it_is_held(make, yaw):
+    """Boards on their long edge, 5 cm high: of 8 mm and less they are left out, of 11 not."""
+    across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+
+    def found(thickness, hand):
+        frame = boxes_frame([((0.1, thickness, 0.05), yaw, (0.5, 0.0))])
+        grasps = make(hand, Workspace())(frame)
+        return any(abs(grasp.closing_direction @ across) > 0.98 for grasp in grasps)
+
+    hand = replace(HAND, least_held=0.008)
+    assert found(0.006, HAND) and not found(0.006, hand) and found(0.011, hand)
+
+
+@pytest.mark.parametrize("thickness, counts", [(0.006, False), (0.011, True)])
+def test_from_a_side_a_board_is_as_thick_as_it_looks_along_its_faces(thickness, counts):
+    """52 degrees off the vertical. Across its faces the camera sees one of them alone, and what
+    stands behind it may be as thick as its shadow."""
+    away = np.array([np.sin(np.radians(52)), 0.0, np.cos(np.radians(52))])
+    target = np.array([0.5, 0.0, 0.0])
+    frame = boxes_frame(
+        [((0.1, thickness, 0.05), 0.0, (0.5, 0.0))],
+        focal=540, T_WC=look_at(target + 0.68 * away, target, (0, 0, 1)),
+    )  # fmt: skip
+    grasps = HeuristicPlanner(replace(HAND, least_held=0.008), Workspace())(frame)
+    assert any(abs(grasp.closing_direction[1]) > 0.95 for grasp in grasps) == counts

@@ -151,9 +151,7 @@ class GripperGeometry:
 
     max_opening: float = 0.08  # two finger joints of 0.04 each
     opens_fully: bool = False  # whether the hand comes to every grasp as wide open as it gets
-    least_held: float = (
-        0.0  # of an object: a hand that has closed to this, or more, counts as empty
-    )
+    least_held: float = 0.0  # between the fingers: closed to this, or less, a hand counts as empty
     tip_below_centre: float = 0.0072  # 0.1122 - 0.105: how far the tips reach below E
     finger_half_width: float = 0.0105  # across, at the widest
     pad_half_width: float = 0.0087  # across, the flat face that touches the object
