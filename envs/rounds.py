@@ -304,7 +304,7 @@ def _abstained(grasps: Iterable[Grasp], least: float) -> str:
 
 
 def _out_of_reach(grasps: Sequence[Grasp]) -> str:
-    return f"none of {len(grasps)} grasps is within reach"
+    return f"all planned grasps ({len(grasps)}) are out of reach"
 
 
 def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:

@@ -19,6 +19,7 @@ from models.grasp_policy import (
     load_policy,
     policy_for,
     relief_of,
+    save_policy,
 )
 from models.ppo import KIND
 from models.ppo_observations import (
@@ -192,6 +193,22 @@ def test_a_saved_policy_acts_the_same(tmp_path):
         policy({"state": observation["state"]})
     with pytest.raises(UserError, match=r"'state' has shape \(3,\), the policy needs \(2,\)"):
         policy(observation | {"state": np.zeros(3, np.float32)})
+
+
+def test_a_policy_in_half_precision_acts_nearly_the_same(tmp_path):
+    """Weights are rounded by 2^-11 of themselves at most."""
+    env = gymnasium.make("QuickPoint-v0", images=True, disable_env_checker=True)
+    ppo = ppo_of(layout=ObservationLayout.of(env.observation_space), actions=2)
+    ppo.save(tmp_path / "whole.pt")
+    whole = load_policy(tmp_path / "whole.pt")
+    save_policy(tmp_path / "half.pt", whole)
+    half = load_policy(tmp_path / "half.pt")
+    actions = [
+        (whole(observation), half(observation))
+        for observation in (env.reset(seed=seed)[0] for seed in range(20))
+    ]
+    assert any((one != other).any() for one, other in actions)
+    np.testing.assert_allclose(*np.swapaxes(actions, 0, 1), atol=0.01)
 
 
 def test_a_checkpoint_of_an_older_version_speaks_today_s_names():

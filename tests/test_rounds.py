@@ -185,7 +185,7 @@ def test_what_the_arm_cannot_reach_is_passed_over(cell, box_set) -> None:
         max_failures=2,
     )  # fmt: skip
     assert (record.ended, record.executed) == ("no_plan", 0)  # nothing moved
-    assert record.attempts[0].detail == "none of 2 grasps is within reach"
+    assert record.attempts[0].detail == "all planned grasps (2) are out of reach"
 
 
 def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:
