@@ -125,9 +125,10 @@ def _evaluation(
     return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept, split)
 
 
-def _policies(objects: str) -> Command:
-    """Three trainings that differ in their seed; the first is the one that users get."""
-    files = [f"ppo:checkpoints/ppo_{objects}{seed}.pt" for seed in ("", "_1", "_2")]
+def _policies(objects: str, trainings: int = 1) -> Command:
+    """trainings: how many that differ in their seed, 0 first, which is the one that users get."""
+    endings = ["", *(f"_{seed}" for seed in range(1, trainings))]
+    files = [f"ppo:checkpoints/ppo_{objects}{ending}.pt" for ending in endings]
     policies = f"evaluate.policies={','.join(files)},heuristic"
     where = f"evaluate.scenarios=isolated evaluate.object_sets={objects}"
     return _evaluation(objects, 100, f"{policies} {where}", kept=3)
@@ -229,8 +230,8 @@ PARTS = (
                     "evaluate.object_sets=primitives", kept=2)
         for simulator in ("mujoco", "pybullet")
     )),
-    Part("ppo", "three policies of PPO on unseen single objects each", 20, (
-        *map(_policies, ("box", "random_urdfs", "primitives")),
+    Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
+        _policies("box", 3), _policies("random_urdfs"), _policies("primitives"),
     )),
     Part("cornell", "Cornell's photographs", 15, (
         Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="

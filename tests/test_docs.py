@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.result_tables import PAGES, with_tables
-from benchmarks.results import FIGURES
+from benchmarks.results import FIGURES, PARTS
 from utils.config import load_config
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -151,3 +151,11 @@ def test_recipes_name_files_and_registries_that_exist(page, title):
             assert any(re.search(rf"^{name}\b", one, re.MULTILINE) for one in files), name
         for path in re.findall(r"`(tests/\w+\.py)`", "".join(test)):
             assert (ROOT / path).exists(), path
+
+
+def test_every_checkpoint_that_is_measured_is_there_and_every_one_that_is_there_is_measured() -> (
+    None
+):
+    arguments = " ".join(command.arguments for part in PARTS for command in part.commands)
+    measured = set(re.findall(r"checkpoints/(ppo_\w+\.pt)", arguments))
+    assert measured == {path.name for path in (ROOT / "checkpoints").glob("ppo_*.pt")}
