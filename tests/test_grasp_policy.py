@@ -212,8 +212,8 @@ def test_a_policy_in_half_precision_acts_nearly_the_same(tmp_path):
 
 
 def test_a_checkpoint_of_an_older_version_speaks_today_s_names():
-    """The shipped policy of many objects names an observation `squeeze` and a section `world`."""
-    path = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_random_urdfs.pt"
+    """The shipped policy of primitives names an observation `squeeze` and a section `world`."""
+    path = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_primitives.pt"
     stored = load_checkpoint(path, KIND)
     assert (
         "squeeze" in stored["config"]["rl"]["policy_observations"] and "world" in stored["config"]
