@@ -102,7 +102,9 @@ def test_the_best_policy_alone_acts_as_in_its_run(tmp_path, monkeypatch):
     (run,) = Path("runs/train_rl").iterdir()
     alone, best = load_policy("alone.pt"), load_policy(run / "best.pt")
     seen, _ = make_env(load_config(None, POINT)).reset(seed=0)
-    assert alone(seen).tolist() == best(seen).tolist()
+    for value in best.network.parameters():
+        value.data = value.data.half().float() if value.dim() > 1 else value.data
+    assert alone(seen).tolist() == best(seen).tolist()  # but for half precision
     assert alone.config == best.config
     assert Path("alone.pt").stat().st_size < (run / "best.pt").stat().st_size
     with pytest.raises(UserError, match="existing folder"):
