@@ -70,7 +70,7 @@ from utils.runs import run_script, timed_folder, write_atomic
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
-from utils.user_view import check_view, corrected_view, given_workspace, workspace_of
+from utils.user_view import check_mask, check_view, corrected_view, given_workspace, workspace_of
 
 NETWORK_PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
@@ -102,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     grasps, clearing = planner(frame)[: options.count], None
     if frame.target is not None:
         clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
-        remarks += check_reached(grasps, clearing)
+        remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
     posed, given = options.camera_pose is not None, options.checkpoint
     network = options.planner.startswith("graspnet")
     content = {

@@ -84,6 +84,7 @@ CHINESE = {
     "15 objects: success": "15 个物体:成功率",
     "measured at commit": "测量于提交",
     "seed": "种子",
+    "95 % intervals": "95 % 区间",
     "{} rounds a row": "每行 {} 轮",
     "5 objects": "5 个物体",
     "15 objects": "15 个物体",
@@ -444,7 +445,7 @@ def _short(say: Say, few: Figures, many: Figures) -> str:
         f"{part['seed']}{rounds_in_words(say, next(iter(part['commands'].values())))}"
         for objects, part in (("5 objects", few), ("15 objects", many))
     )
-    return f"<sub>{origins}; 95 % Wilson; [docs/results.md](docs/results.md)</sub>"
+    return f"<sub>{origins}; {say('95 % intervals')}; [docs/results.md](docs/results.md)</sub>"
 
 
 def _pair(part: Figures, first: str, second: str) -> Figures:

@@ -22,6 +22,7 @@ the seeds of the development.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import platform
 import re
@@ -379,7 +380,9 @@ def finished_file(part: Part, command: Command, commit: str, scale: float) -> Pa
 
 
 def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> str:
-    return "-".join(["results", part.name, command.name, str(rounds or "all"), commit[:10]])
+    """Other arguments have another name, so that no run is taken for one of theirs."""
+    digest = hashlib.sha256(command.line(rounds).encode()).hexdigest()[:6]
+    return "-".join(["results", part.name, command.name, str(rounds or "all"), commit[:10], digest])
 
 
 def run_command(

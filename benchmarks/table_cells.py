@@ -18,20 +18,20 @@ Say = Callable[[str], str]  # a word in the page's language
 # --- Cells ------------------------------------------------------------------------------------
 
 
-def rate(successes: int, trials: int) -> str:
-    """'97 % [95, 98] (488/502)', with the 95 % Wilson interval; '-' of nothing."""
+def rate(successes: int, trials: int, interval: Sequence[float] | None = None) -> str:
+    """'97 % [95, 98] (488/502)', with the given 95 % interval, or Wilson's; '-' of nothing."""
     if trials == 0:
         return "-"
-    low, high = (100 * bound for bound in wilson_interval(successes, trials))
+    low, high = (100 * bound for bound in interval or wilson_interval(successes, trials))
     return f"{100 * successes / trials:.0f} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
 
 
 def success(row: Figures) -> str:
-    return rate(row["successes"], row["attempts"])
+    return rate(row["successes"], row["attempts"], row["success_ci95"])
 
 
 def cleared(row: Figures) -> str:
-    return rate(row["objects_cleared"], row["objects_total"])
+    return rate(row["objects_cleared"], row["objects_total"], row["cleared_ci95"])
 
 
 def points(difference: Figures | None) -> str:

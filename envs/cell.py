@@ -352,9 +352,12 @@ class Cell(ABC):
 
     # --- Camera -------------------------------------------------------------------------------
 
-    def camera_pose(self, mount: str | None = None) -> np.ndarray:
-        """(4, 4) T_WC of the overhead or the wrist camera; a scene may place the overhead one."""
-        camera = self.config.camera
+    def camera_pose(
+        self, mount: str | None = None, camera: CameraConfig | None = None
+    ) -> np.ndarray:
+        """(4, 4) T_WC of the overhead or the wrist camera; a scene may place the overhead one.
+        camera: another one than the config's."""
+        camera = camera or self.config.camera
         if (mount or camera.mount) == "overhead":
             if camera.view == "side":
                 if self.scene is None:

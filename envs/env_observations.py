@@ -64,6 +64,7 @@ class Observer:
         self._wrist, self._with_goals = config.env.camera == "wrist", config.env.goal == "grasp"
         self._intrinsics = camera_intrinsics(config.camera)
         self._T_EC = wrist_mount(config.camera)
+        self._camera = config.camera
         self._depth_noise = config.camera.make_noise(float(self._intrinsics.K[0, 0]))
         widest = config.gripper.max_opening + _OPENING_SLACK
         low = np.concatenate([JOINT_LOWER - _JOINT_SLACK, -2 * JOINT_VELOCITY, [-_OPENING_SLACK]])
@@ -157,7 +158,10 @@ class Observer:
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) colours and (H, W, 1) metres. The depth noise is a function of the scene's seed
         and the number of images since the scene began."""
-        T_WC = self.T_WE @ self._T_EC if self._wrist else self._cell.camera_pose()
+        if self._wrist:
+            T_WC = self.T_WE @ self._T_EC
+        else:
+            T_WC = self._cell.camera_pose(camera=self._camera)
         image = self._cell.image(self._intrinsics, T_WC)
         seed, stream = self._cell.scene.seed, NoiseStream.OBSERVATION
         measure = seeded_noise(self._depth_noise, stream, seed, self._frames)

@@ -35,7 +35,7 @@ from envs.arm_paths import (
 )
 from envs.cell import Cell, require_arm
 from envs.panda_model import FINGER_FORCE
-from envs.robot import Robot
+from envs.robot import FINGER_SPEED, Robot
 from envs.robot_kinematics import UnreachableError, forward_kinematics
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError, reaching_down
@@ -45,7 +45,7 @@ from utils.result_records import loose
 from utils.transforms import Grasp
 
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
-_CLOSE_SECONDS = 1.2  # longest wait for the fingers to close
+_CLOSE_SECONDS = 0.4  # longest wait for the fingers to close, beside the time that their way takes
 _LEAST_FRICTION = 0.4  # that a grip counts on
 _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs beside its middle
 # Times the closing force, along the closing line, that the arm feels when one finger presses alone
@@ -320,10 +320,13 @@ def _carry_to_bin(
 
 
 def close_fingers(cell: Cell, wait: Callable[[int], None]) -> None:
-    """Close the fingers until they stop moving."""
+    """Close the fingers until they stop moving, once the command has arrived."""
+    longest = cell.gripper.max_opening / (2 * FINGER_SPEED) + _CLOSE_SECONDS
     cell.robot.command_gripper(0.0)
+    if cell.robot.latency:
+        wait(cell.robot.latency)
     before = cell.robot.opening
-    for _ in range(round(_CLOSE_SECONDS / _CHECK_SECONDS)):
+    for _ in range(round(longest / _CHECK_SECONDS)):
         wait(round(_CHECK_SECONDS / cell.dt))
         opening = cell.robot.opening
         if abs(opening - before) < 2e-4:

@@ -325,6 +325,9 @@ class PrimitiveSet(ObjectSet):
         return compound_object(shape, self.cache_dir)
 
 
+_REASONS = 3  # of files that cannot be used, which an error tells
+
+
 class FileSet(ObjectSet):
     """URDF, MJCF and mesh files, one object each. scale: factor on their lengths, in place of the
     settings' own."""
@@ -345,6 +348,7 @@ class FileSet(ObjectSet):
         return len(self.files)
 
     def _build(self, index: int) -> ObjectModel:
+        reasons = []
         for path in (*self.files[index:], *self.files[:index]):
             try:
                 return self._load(path)
@@ -352,9 +356,11 @@ class FileSet(ObjectSet):
                 if not self.skip_broken:
                     raise
                 self._notes[str(path)] = f"objects.skip_broken leaves out a file: {error}"
+                reasons.append(str(error))
+        more = len(reasons) - _REASONS
         raise ObjectError(
-            f"objects {self.name}: none of {len(self.files)} files can be used; set "
-            "objects.skip_broken=false to read why"
+            f"objects {self.name}: none of {len(self.files)} files can be used: "
+            + "; ".join([*reasons[:_REASONS], *([f"and {more} more"] if more > 0 else [])])
         )
 
     def _load(self, path: Path) -> ObjectModel:

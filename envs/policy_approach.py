@@ -124,8 +124,9 @@ def check_learned(
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         _check_spaces(policy, config)
+        _check_knowledge(name, list(policy.observation_space.spaces))
     else:
-        _check_knowledge(name, policy)
+        _check_knowledge(name, [part.key for part in policy.layout.state])
     for scenario in scenarios:
         if scenario not in LEARNED_SCENARIOS:
             raise UserError(
@@ -154,9 +155,9 @@ def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
     return f"{name} was trained on {trained}, and not on {', '.join(others)}"
 
 
-def _check_knowledge(name: str, policy: SavedPolicy) -> None:
+def _check_knowledge(name: str, observed: Sequence[str]) -> None:
     """Raise UserError for a policy that observes what a robot cannot know."""
-    unknown = [part.key for part in policy.layout.state if part.key not in KNOWN_TO_A_ROBOT]
+    unknown = [key for key in observed if key not in KNOWN_TO_A_ROBOT]
     if unknown:
         raise UserError(
             f"evaluate.policies: {name} was trained to observe {', '.join(unknown)}, which no "

@@ -134,6 +134,8 @@ class GraspNetPlanner(Judged, SearchPlanner):
             self.judge = chances_by(critic)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        if not known_depth(frame.depth).any():  # a blank frame shows nothing to grasp
+            return []
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, crop=True)
         heights = only_target(seen.heights, frame)
@@ -216,6 +218,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         self.judge = chances_by(critic or shipped_critic())
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+        if not known_depth(frame.depth).any():
+            return []
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)

@@ -192,7 +192,7 @@ def make_planner(
     gripper: GripperGeometry,
     workspace: Workspace,
     seed: int,
-    key: str = "evaluate.policies",
+    key: str = "planner",
 ) -> Planner:
     """The planner that `name` stands for.
 
@@ -209,6 +209,11 @@ def make_planner(
         planner = PLANNERS[name](gripper, workspace, seed)
         planner.calibration = calibrations().get(name)
         return planner
+    if name == "ppo" or name.startswith(("ppo:", "sb3:")):
+        raise UserError(
+            f"{key}: {name} is a policy, which acts in turns and plans no grasp; score it by "
+            f"evaluate.py evaluate.policies={name}"
+        )
     if Path(name).suffix == ".pt":
         return GraspNetPlanner(gripper, workspace, seed, Path(name))
     if is_import_path(name):

@@ -54,6 +54,11 @@ def score(row: ProgressRow) -> tuple[float, float]:
     return row.get("success", 0.0), row["return"]
 
 
+def best_of(history: list[ProgressRow]) -> ProgressRow:
+    """The best evaluation, the first of those that are equally good."""
+    return max(history, key=score)
+
+
 def reached(settings: RLConfig, row: ProgressRow) -> bool:
     """Whether an evaluation meets one of the targets of the config's section `rl`."""
     success, total = settings.target_success, settings.target_return
@@ -90,10 +95,11 @@ class Curves:
 def save_evaluation(
     run: Path, config: Config, ppo: GraspPPO, history: list[ProgressRow], curves: Curves
 ) -> None:
-    """Write last.pt, best.pt if the last row of the history is the best, and its curves."""
+    """Write last.pt, best.pt if the last row of the history is the best (the first of several that
+    are equally good), and its curves."""
     if ppo.team.is_main:
         row = history[-1]
-        if score(row) == max(map(score, history)):
+        if row is best_of(history):
             ppo.save(run / "best.pt", config, history=history)
         ppo.save(run / "last.pt", config, history=history)
         means = {name: row[name] for name in ("return", "length", "success") if name in row}
@@ -115,7 +121,7 @@ def save_training(run: Path, history: list[ProgressRow], weights: Path | None) -
     """Write results.json, and the best policy alone to `weights`; returns the best evaluation."""
     if weights is not None:
         save_policy(weights, load_policy(run / "best.pt"))
-    best = max(history, key=score)
+    best = best_of(history)
     save_results(run / "results.json", {"best": best, "history": history})
     return best
 

@@ -121,6 +121,17 @@ def test_a_hand_that_one_finger_jams_gives_way(box_set, mass, jams, latency, cel
     assert moved == pytest.approx(off, abs=0.003) if jams else abs(moved) < 1e-3
 
 
+@pytest.mark.parametrize("latency", [0, 12, 14])
+def test_late_commands_lose_no_grasp(cell, box_set, latency, request):
+    """0.05 s and more after the fingers were told to close they have not yet moved."""
+    request.addfinalizer(lambda: setattr(cell.robot, "latency", 0))
+    model = solid(box_set[0], NativeShape("box", (0.05, 0.05, 0.05)), 0.1, 0.5)
+    cell.load(Scene("isolated", 0, (Placement(model, np.array([0.5, 0.0, 0.025]), np.eye(4)[3]),)))
+    cell.robot.latency = latency
+    outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.025]), np.pi / 2, 0.07, 1.0))
+    assert outcome.reason == "success"
+
+
 @pytest.mark.parametrize(
     ("kind", "force", "off", "holds"),
     [("box", 10.0, 0.02, True), ("box", 30.0, 0.045, True), ("box", 10.0, 0.07, False),

@@ -12,6 +12,7 @@ from models.graspnet_objects import VoteSettings, labelled_by_centres, vote_cent
 from models.planner_graspnet import (
     CROP_MARGIN,
     GraspNetDirectPlanner,
+    GraspNetFanPlanner,
     GraspNetPlanner,
     around_matter,
     quality_between,
@@ -157,6 +158,14 @@ def test_without_a_search_the_peak_is_the_grasp(chosen: int) -> None:
     assert abs((best.position[:2] - middle[:2]) @ closing) < 0.002
     assert np.rad2deg(angle_difference(best.angle, np.deg2rad(25))) < 3
     assert 0.04 < best.width <= 0.08
+
+
+@pytest.mark.parametrize("kind", [GraspNetPlanner, GraspNetDirectPlanner, GraspNetFanPlanner])
+@pytest.mark.parametrize("unknown", [0.0, np.nan, np.inf])
+def test_a_frame_without_any_depth_shows_nothing_to_grasp(kind, unknown: float) -> None:
+    frame = boxes_frame(BOXES)
+    blank = replace(frame, depth=np.full_like(frame.depth, unknown))
+    assert kind(GripperGeometry(), Workspace())(blank) == []
 
 
 def test_a_network_that_sees_no_grasp_plans_none_without_a_search() -> None:

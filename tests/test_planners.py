@@ -32,6 +32,12 @@ def test_unknown_planner_is_refused_with_the_allowed_names() -> None:
         planner("grasp")
 
 
+@pytest.mark.parametrize("name", ["ppo", "ppo:mine.pt", "sb3:mine.zip"])
+def test_a_policy_that_acts_is_no_planner(name: str) -> None:
+    with pytest.raises(UserError, match=f"planner: {name} is a policy.* evaluate.policies={name}"):
+        planner(name)
+
+
 def test_a_candidates_opening_changes_without_its_width() -> None:
     rough = Candidates.rough(
         np.zeros((2, 2)), np.zeros(2), np.zeros(2), np.full(2, 0.04), np.ones(2)

@@ -30,6 +30,19 @@ def box():
     return CHECKPOINTS / "ppo_box.pt"
 
 
+def test_a_policy_sees_through_the_camera_that_it_was_trained_with():
+    """0.8 m above the table; that of the cell looks from a side, and nearer."""
+    trained = load_config(None, ["sim.renderer=tiny", "env.camera=overhead"])
+    other = load_config(None, ["sim.renderer=tiny", "camera.position=[0.5, -0.4, 0.5]"])
+    objects = load_object_set("box", cache_dir=trained.cache_folder)
+    with make_cell(other) as cell:
+        cell.load(make_scene("isolated", objects, 0, other))
+        env = RobotGraspingEnv(config=trained, cell=cell, observations=["depth"])
+        observation, _ = env.take_over()
+        assert np.median(observation["depth"]) == pytest.approx(0.8, abs=1e-3)
+        assert np.median(cell.frame().depth) < 0.7
+
+
 @needs_pybullet  # where the policy has learned; on scenes laid out in MuJoCo it is less certain
 def test_the_policy_of_the_box_lifts_it(box):
     """200 of 200 in docs/ppo.md: by far not each in ten would fail by chance."""

@@ -206,6 +206,15 @@ def test_grasp_that_one(how, number, files, capsys):
         assert np.hypot(*(in_world(grasp)[:2] - xy)) < 0.03
 
 
+def test_a_mask_that_may_be_inverted_is_asked_about(files, capsys):
+    pixels = marked(files, list(CUBES)[0])
+    np.save(files.folder / "mask.npy", ~pixels)
+    found = files.run(capsys, mask=files.folder / "mask.npy")
+    assert any("is it inverted?" in remark for remark in found["remarks"])
+    np.save(files.folder / "mask.npy", pixels)
+    assert files.run(capsys, mask=files.folder / "mask.npy")["remarks"] == []
+
+
 def test_without_a_pose_the_gripper_descends_along_the_tables_normal(files, capsys):
     posed = files.run(capsys)
     bare = files.run(capsys, camera_pose=None)

@@ -13,11 +13,12 @@ import pytest
 from benchmarks import results
 from benchmarks.result_tables import PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import PARTS, chosen_parts, main
-from benchmarks.table_cells import rate
+from benchmarks.table_cells import cleared, rate, success
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError
 from utils.result_records import append_round, read_sample
+from utils.statistics import wilson_interval
 
 
 def row(
@@ -27,6 +28,8 @@ def row(
         "policy": policy, "scenario": "pile", "objects": objects, "controller": "open_loop",
         "successes": successes, "attempts": attempts, "objects_cleared": successes,
         "objects_total": 500, "plan_ms_median": 24.4, "picks_per_hour": 536.2, "rounds": rounds,
+        "success_ci95": wilson_interval(successes, attempts),
+        "cleared_ci95": wilson_interval(successes, 500),
     }  # fmt: skip
 
 
@@ -44,6 +47,13 @@ def test_rate_has_wilsons_interval():
     """Newcombe, Stat. Med. 17 (1998), table I, method 3: 81 of 263 is 0.2553 to 0.3662."""
     assert rate(81, 263) == "31 % [26, 37] (81/263)"
     assert rate(0, 0) == "-"
+
+
+def test_cells_have_the_intervals_of_their_row():
+    """Which know that the attempts of a round hang together."""
+    wide = row("graspnet", 50, 100) | {"success_ci95": [0.3, 0.7], "cleared_ci95": [0.02, 0.25]}
+    assert success(wide) == "50 % [30, 70] (50/100)"
+    assert cleared(wide) == "10 % [2, 25] (50/500)"
 
 
 def test_each_scene_has_the_calibration_error_of_each_planner(tmp_path):

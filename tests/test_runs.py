@@ -157,6 +157,14 @@ def test_only_what_may_change_is_changed_when_a_run_is_resumed(tmp_path):
     check_resume(CONFIG, run, free, ["last.pt", "fold*/last.pt"])
 
 
+def test_a_run_that_another_commit_began_goes_on_with_a_remark(tmp_path):
+    run = new_run_folder("evaluate", None, CONFIG, tmp_path)
+    facts = json.loads((run / "environment.json").read_text())
+    write_json_atomic(run / "environment.json", facts | {"commit": 40 * "a"})
+    with pytest.warns(UserWarning, match="begun at commit aaaaaaaaaa and goes on at"):
+        check_resume(CONFIG, run, [])
+
+
 def test_an_unknown_option_is_told_how_a_setting_is_written(capsys):
     with pytest.raises(SystemExit, match="2"):
         parse_args(["--rounds", "3"], "a script")

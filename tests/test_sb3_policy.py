@@ -83,6 +83,22 @@ def test_a_policy_of_other_spaces_is_refused(files, override, message):
         check_learned(f"sb3:{files / 'SAC.zip'}", ["isolated"], ["open_loop"], config)
 
 
+def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
+    """As one of train_rl.py is: no robot knows where the object is."""
+    knowing = load_config(
+        None,
+        ["env.observations=state,object_position", "env.control=ee_planar", "sim.renderer=tiny"],
+    )
+    env = gymnasium.make(
+        "RobotGrasping-v0", **(SETTINGS | {"observations": ["state", "object_position"]})
+    )
+    model = stable_baselines3.PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    model.save(tmp_path / "knowing.zip")
+    env.close()
+    with pytest.raises(UserError, match="observe object_position, which no robot knows"):
+        check_learned(f"sb3:{tmp_path / 'knowing.zip'}", ["isolated"], ["open_loop"], knowing)
+
+
 def test_images_may_have_their_channels_first(files):
     policy = load_sb3(files / "PPO.zip")
     policy.observation_space = spaces.Dict({"rgb": spaces.Box(0, 255, (3, 64, 48), np.uint8)})

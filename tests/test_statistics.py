@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import binomtest
 
 from utils.statistics import (
+    clustered_interval,
     mean_maximum_rank_violation,
     paired_difference_interval,
     pearson_correlation,
@@ -41,6 +42,51 @@ def test_wilson_edges():
             wilson_interval(*bad)
     with pytest.raises(ValueError, match="confidence"):
         wilson_interval(1, 2, 1.0)
+
+
+def test_clustered_interval_by_hand():
+    """Four rounds of five that are all or nothing: as much as four trials tell, of which two
+    succeeded. Off the rate by 2.5 each: 4/3 * 4 * 6.25 over 20 * 0.25 is an effect of 20/3, so
+    three trials."""
+    rounds = [(5, 5), (0, 5), (5, 5), (0, 5)]
+    z2 = 3.841459
+    spread = np.sqrt(z2 * (0.25 / 3 + z2 / 36)) / (1 + z2 / 3)
+    assert clustered_interval(rounds) == pytest.approx((0.5 - spread, 0.5 + spread), abs=1e-6)
+
+
+def test_clustered_interval_is_wilsons_where_rounds_do_not_matter():
+    alike = [(4, 5)] * 8  # less spread than chance has
+    assert clustered_interval(alike) == pytest.approx(wilson_interval(32, 40))
+    assert clustered_interval([(3, 5)]) == pytest.approx(wilson_interval(3, 5))  # one round alone
+    assert clustered_interval([(5, 5), (3, 3)]) == pytest.approx(wilson_interval(8, 8))
+    assert clustered_interval([(0, 5), (0, 0)])[0] == 0.0
+    assert clustered_interval([(0, 0)]) == (0.0, 1.0)
+    with pytest.raises(ValueError, match="more successes"):
+        clustered_interval([(2, 1)])
+
+
+def test_clustered_interval_holds_the_truth_where_rounds_end_early():
+    """30 rounds of 15 objects that end at the second failure in a row: 95 of 100 intervals hold the
+    true share, and Wilson's, of objects as if they were independent, far fewer."""
+    rng = np.random.default_rng(0)
+
+    def a_round(objects=15, chance=0.75):
+        cleared = failed = 0
+        while cleared < objects and failed < 2:
+            good = rng.random() < chance
+            cleared, failed = cleared + good, 0 if good else failed + 1
+        return cleared, objects
+
+    truth = np.mean([a_round()[0] for _ in range(20_000)]) / 15
+    hits = {"clustered": 0, "wilson": 0}
+    for _ in range(400):
+        rounds = [a_round() for _ in range(30)]
+        low, high = clustered_interval(rounds)
+        hits["clustered"] += low <= truth <= high
+        low, high = wilson_interval(*np.sum(rounds, axis=0).tolist())
+        hits["wilson"] += low <= truth <= high
+    assert 0.92 * 400 <= hits["clustered"] <= 0.99 * 400
+    assert hits["wilson"] < 0.75 * 400
 
 
 def test_paired_binary_approaches_the_normal_interval():

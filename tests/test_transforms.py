@@ -8,6 +8,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from tests.helpers.servo_cases import directions, twists
+from utils.errors import UserError
 from utils.transforms import (
     Grasp,
     ImageGrasp,
@@ -147,6 +148,22 @@ def test_frame_points_and_blinding():
     assert np.isnan(frame.points()[0, 1]).all()
     blind = frame.without_truth()
     assert blind.truth is None and blind.segmentation is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"K": np.eye(4)}, r"K: got an array of shape \(4, 4\)"),
+        ({"T_WC": np.eye(4)[:3]}, r"T_WC: got an array of shape \(3, 4\)"),
+        ({"T_WC": np.diag([1.0, 1.0, -1.0, 1.0])}, "no rotation"),
+        ({"T_WC": np.diag([2.0, 2.0, 2.0, 1.0])}, "no rotation"),
+        ({"T_WC": np.full((4, 4), np.nan)}, "no rotation"),
+    ],
+)
+def test_a_frame_without_a_camera_is_refused(changes, message):
+    image = {"rgb": np.zeros((1, 2, 3), np.uint8), "depth": np.ones((1, 2), np.float32)}
+    with pytest.raises(UserError, match=message):
+        RGBDFrame(**image | {"K": np.eye(3), "T_WC": np.eye(4)} | changes)
 
 
 # Rigid motion

@@ -249,7 +249,10 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
         with (
             progress,
             open_executor(config.compute, config.evaluate.workers) as workers,
-            stop_on_interrupt("interrupted: finishing the tasks under way") as stop,
+            stop_on_interrupt(
+                "interrupted: finishing the scenes under way, each with all of its policies; "
+                f"the rest will go on with --resume {run}"
+            ) as stop,
         ):
             for result in completed(workers, partial(work, config), todo, stop):
                 for record in result.rounds:

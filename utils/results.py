@@ -19,7 +19,12 @@ from utils.calibration import calibration_error
 from utils.config import read_config
 from utils.errors import UserError
 from utils.result_records import CLEAN, FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
-from utils.statistics import Difference, paired_difference_interval, wilson_interval
+from utils.statistics import (
+    Difference,
+    clustered_interval,
+    paired_difference_interval,
+    wilson_interval,
+)
 
 CLUTTER = ("packed", "pile")  # scenarios that are also compared together
 
@@ -30,8 +35,8 @@ _Key = tuple[str, str, str, str]  # of a row: policy, scenario, object set, dept
 class Row:
     """The figures of one policy on one scenario and object set; None where one is undefined.
 
-    attempts: executed grasps. The 95 % intervals are Wilson's and take attempts (objects) as
-        independent.
+    attempts: executed grasps. The 95 % intervals take whole rounds as independent, not their
+        attempts or objects (`utils.statistics.clustered_interval`).
     plan_ms_median: over all calls of the planner, also those that found nothing.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
     turned, slid: successes in which the object moved in the hand by more than 15 degrees or 1 cm.
@@ -115,9 +120,9 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
         objects_total=total,
         objects_cleared=cleared,
         success_rate=successes / attempts if attempts else None,
-        success_ci95=wilson_interval(successes, attempts),
+        success_ci95=clustered_interval([(r.successes, r.executed) for r in rounds]),
         cleared_rate=cleared / total if total else None,
-        cleared_ci95=wilson_interval(cleared, total),
+        cleared_ci95=clustered_interval([(r.objects_cleared, r.objects_total) for r in rounds]),
         plan_ms_median=1000 * median(call.plan_seconds for call in calls) if calls else None,
         sim_seconds_per_pick=per_pick,
         picks_per_hour=3600 / per_pick if per_pick else None,
@@ -284,8 +289,12 @@ def _difference(
 # --- Two runs -----------------------------------------------------------------------------------
 
 # Sections and keys of the config that a scene is made from (`envs.cell_scenes.make_scene`): objects
-# come to rest in PyBullet, so that the steps of the physics count.
-SCENE_KEYS = ("scene", "objects", "workspace", "sim.frequency", "sim.solver_iterations")
+# come to rest in PyBullet, so that the steps of the physics count, and some layouts choose what the
+# hand can span.
+SCENE_KEYS = (
+    "scene", "objects", "workspace", "gripper.max_opening", "sim.frequency",
+    "sim.solver_iterations",
+)  # fmt: skip
 
 
 def compare_runs(first: Path, second: Path) -> list[Comparison]:

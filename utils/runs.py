@@ -295,7 +295,8 @@ def check_resume(
     but for the dotted keys in `free_keys`.
 
     checkpoints: patterns of files such as "last.pt", of which the run must hold at least one.
-    run: None where a new run is started, which is always allowed.
+    run: None where a new run is started, which is always allowed. Warns where the run was begun by
+    another commit, which results.json will not name.
     """
     if run is None:
         return
@@ -310,6 +311,21 @@ def check_resume(
             f"--resume {run}: only {', '.join(sorted(free_keys))} may differ from the run that is "
             "resumed; start a new run for anything else"
         )
+    begun, goes_on = _begun_at(run), git_state().commit
+    if begun is not None and goes_on is not None and begun != goes_on:
+        warnings.warn(
+            f"--resume {run}: it was begun at commit {begun[:10]} and goes on at {goes_on[:10]}; "
+            "where the two compute otherwise, its figures are of neither",
+            stacklevel=2,
+        )
+
+
+def _begun_at(run: Path) -> str | None:
+    """The commit that a run folder was made at; None where that is not known."""
+    try:
+        return json.loads((run / "environment.json").read_text(encoding="utf-8")).get("commit")
+    except (OSError, ValueError):
+        return None
 
 
 def save_results(path: Path, content: Mapping[str, Any]) -> None:

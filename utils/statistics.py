@@ -22,15 +22,43 @@ def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[f
     _check_confidence(confidence)
     if not 0 <= successes <= n:
         raise ValueError(f"wilson_interval: need 0 <= successes <= n, got {successes} of {n}")
+    return _score_interval(successes / n, n, confidence) if n else (0.0, 1.0)
+
+
+def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+    """Interval of the rate sum(successes) / sum(trials) of rounds, (low, high) in [0, 1].
+
+    outcomes: (R, 2) successes and trials of each round, or (R,) 0/1 as in
+        `paired_difference_interval`.
+
+    Trials of one round share a scene, and a round may end early, so that they are not independent:
+    rounds are. Wilson's interval is taken of as many independent trials as tell as much, n divided
+    by the design effect (L. Kish, "Survey Sampling", 1965, section 8.2; for Wilson's interval
+    C. Franco et al., J. Survey Stat. Methodol. 7, 2019): the variance of the rate as a ratio of
+    sums over whole rounds, by that of n independent trials. A design effect below 1 counts as 1, as
+    does that of a single round, or of none or only successes, which show no variance. No trial
+    gives (0, 1). Raises ValueError on shapes and counts that make no sense.
+    """
+    _check_confidence(confidence)
+    counts = _counts(outcomes)
+    successes, n = counts.sum(axis=0)
     if n == 0:
         return 0.0, 1.0
+    rate, rounds, effect = successes / n, len(counts), 1.0
+    if rounds > 1 and 0 < successes < n:
+        off = counts[:, 0] - rate * counts[:, 1]
+        effect = max(rounds / (rounds - 1) * (off @ off) / (n * rate * (1 - rate)), 1.0)
+    return _score_interval(rate, n / effect, confidence)
+
+
+def _score_interval(rate: float, n: float, confidence: float) -> tuple[float, float]:
+    """Wilson's interval of a rate that was seen in n trials, which need not be a whole number."""
     z = float(ndtri(0.5 + confidence / 2))  # the normal distribution's quantile
-    rate = successes / n
     centre = rate + z**2 / (2 * n)
     spread = z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
     low, high = (centre - spread) / (1 + z**2 / n), (centre + spread) / (1 + z**2 / n)
     # At no or only successes the bound is 0 or 1 exactly; rounding must not say otherwise.
-    return (0.0 if successes == 0 else float(low)), (1.0 if successes == n else float(high))
+    return (0.0 if rate == 0 else float(low)), (1.0 if rate == 1 else float(high))
 
 
 @dataclass(frozen=True)

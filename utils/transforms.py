@@ -24,6 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from utils.errors import UserError
+
 DOWN = (0.0, 0.0, -1.0)  # the approach of a planar grasp
 
 
@@ -164,6 +166,19 @@ class RGBDFrame:
     target: np.ndarray | None = None
     second: RGBDFrame | None = None
     roughness: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises UserError where K or T_WC is no camera matrix or pose."""
+        K, T = np.asarray(self.K), np.asarray(self.T_WC)
+        if K.shape != (3, 3):
+            raise UserError(f"K: got an array of shape {K.shape}, expected (3, 3) pixels")
+        if T.shape != (4, 4):
+            raise UserError(f"T_WC: got an array of shape {T.shape}, expected a pose (4, 4)")
+        turn = T[:3, :3]
+        if not (np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0):
+            raise UserError(
+                "T_WC: its upper left (3, 3) is no rotation; give the camera's pose in the world"
+            )
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""

@@ -26,6 +26,7 @@ _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as ma
 # The network has learned from above, and planners are measured up to 45 degrees off the vertical
 # (docs/six_dof.md). At 70 degrees an object hides the table behind it for 2.7 times its height.
 OBLIQUE, MOST_OBLIQUE = 45.0, 70.0  # degrees
+MOST_MARKED = 0.5  # share of an image that one object's mask is expected to mark
 MANY_UNSEEN, MOST_UNSEEN = 0.25, 0.5  # shares of the workspace's pixels whose depth is unknown
 
 
@@ -96,6 +97,14 @@ def given_workspace(numbers: Sequence[float], table_height: float) -> Workspace:
             f"{SMALLEST / 2:g} to {LARGEST:g} m"
         )
     return Workspace((x, y), size, table_height)
+
+
+def check_mask(mask: np.ndarray | None) -> list[str]:
+    """A remark on a mask (H, W) of one object that marks most of the image."""
+    share = 0.0 if mask is None else float(mask.mean())
+    if share <= MOST_MARKED:
+        return []
+    return [f"--mask marks {share:.0%} of the image as the object; is it inverted?"]
 
 
 def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
