@@ -7,6 +7,7 @@ is a demonstration: `python -m envs.grasping_env` lifts a cube and leaves a pict
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 from pathlib import Path
@@ -189,10 +190,9 @@ class RobotGraspingEnv(gymnasium.Env):
         self.observation_space = self._seen.space
         size = len(entries)
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
-        self._hold_steps = max(
-            1,
-            round(self.settings.hold_seconds * self.config.sim.frequency / self.settings.substeps),
-        )
+        # So many observations in a row span hold_seconds: n of them, n - 1 actions.
+        held = self.settings.hold_seconds * self.config.sim.frequency / self.settings.substeps
+        self._hold_steps = math.ceil(held - 1e-9) + 1
         self._actions = ActionDecoder(self.config)
 
     def reset(

@@ -447,6 +447,21 @@ def test_success_needs_the_object_held_up_for_a_while(picked):
         assert not terminated and info["grasped"]
 
 
+@pytest.mark.parametrize(("substeps", "held"), [(20, 4), (24, 3), (40, 3)])
+def test_the_object_is_held_for_as_long_as_hold_seconds(make_env, substeps, held):
+    """0.2 s of 240 steps each are 48 steps: between the first and the last of so many observations,
+    (held - 1) * substeps lie."""
+    env = make_env(control="ee_planar", hold_seconds=0.2, substeps=substeps)
+    _, info = env.reset(seed=0)
+    lifted, terminated = 0, False
+    while not terminated:
+        _, _, terminated, truncated, info = env.step(scripted_pick(env, info)[1])
+        up = info["grasped"] and info["object_position"][2] > env.settings.lift_height
+        lifted = lifted + 1 if up else 0
+        assert not truncated
+    assert info["is_success"] and lifted == held
+
+
 def test_a_flung_object_is_no_success(make_env):
     env = make_env(hold_seconds=0.0)
     env.reset(seed=0)
