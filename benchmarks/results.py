@@ -232,7 +232,7 @@ PARTS = (
         for simulator in ("mujoco", "pybullet")
     )),
     Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
-        _policies("box", 3), _policies("random_urdfs"), _policies("primitives"),
+        _policies("box", 3), _policies("random_urdfs", 3), _policies("primitives", 3),
     )),
     Part("cornell", "Cornell's photographs", 15, (
         Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="

@@ -21,7 +21,6 @@ from models.grasp_policy import (
     relief_of,
     save_policy,
 )
-from models.ppo import KIND
 from models.ppo_observations import (
     ObservationLayout,
 )
@@ -29,7 +28,6 @@ from tests.helpers.ppo_parts import (
     ppo_of,
     settings_of,
 )
-from utils.checkpoint import load_checkpoint
 from utils.distributed import ALONE
 from utils.errors import UserError
 
@@ -211,15 +209,17 @@ def test_a_policy_in_half_precision_acts_nearly_the_same(tmp_path):
     np.testing.assert_allclose(*np.swapaxes(actions, 0, 1), atol=0.01)
 
 
-def test_a_checkpoint_of_an_older_version_speaks_today_s_names():
-    """The shipped policy of primitives names an observation `squeeze` and a section `world`."""
-    path = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_primitives.pt"
-    stored = load_checkpoint(path, KIND)
-    assert (
-        "squeeze" in stored["config"]["rl"]["policy_observations"] and "world" in stored["config"]
-    )
-    policy = load_policy(path)
-    assert policy.layout.state[-1].key == "opening_error"
-    assert policy.config["rl"]["policy_observations"][-1] == "opening_error"
-    assert policy.config["rl"]["pretraining_images"] == stored["config"]["rl"]["looks"]
-    assert policy.config["simulator"] == stored["config"]["world"]
+def test_a_checkpoint_of_an_older_version_speaks_today_s_names(tmp_path):
+    """It named an observation `squeeze`, a key `looks` and a section `world`."""
+    shipped = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_random_urdfs.pt"
+    today = load_policy(shipped)
+    stored = torch.load(shipped, weights_only=True)
+    config = stored["config"]
+    config["world"] = config.pop("simulator")
+    config["rl"]["looks"] = config["rl"].pop("pretraining_images")
+    assert config["rl"]["policy_observations"][-1] == "opening_error"
+    config["rl"]["policy_observations"][-1] = "squeeze"
+    stored["extra"]["layout"]["state"][-1][0] = "squeeze"
+    torch.save(stored, tmp_path / "old.pt")
+    policy = load_policy(tmp_path / "old.pt")
+    assert policy.layout == today.layout and policy.config == today.config
