@@ -46,7 +46,7 @@ from utils.results import compare, stated_chances
 from utils.runs import environment, run_script, write_json_atomic
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-SEALED = REPOSITORY / "configs" / "sealed.yaml"  # scenes and objects that nothing else plays
+SEALED = REPOSITORY / "configs" / "sealed.yaml"  # what is kept for the tables
 SEED = load_config(SEALED).seed
 SPLIT = load_config(SEALED).objects.split
 FIGURES = Path("docs/results")  # what the tables are written from

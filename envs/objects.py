@@ -40,6 +40,8 @@ from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
 from utils.plugins import is_import_path, load_plugin
 
+_REASONS = 3  # of files that cannot be used, which an error tells
+
 # Numbers of the first object of each split, and the end, in large and in small sets.
 LARGE = {"train": 0, "test": 900, "sealed": 1000, "end": 1100}
 SMALL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
@@ -323,9 +325,6 @@ class PrimitiveSet(ObjectSet):
                 shape.name, shape.native, shape.density, shape.friction, shape.color
             )
         return compound_object(shape, self.cache_dir)
-
-
-_REASONS = 3  # of files that cannot be used, which an error tells
 
 
 class FileSet(ObjectSet):

@@ -54,7 +54,7 @@ def test_the_policy_of_the_box_lifts_it(box):
 @pytest.mark.slow
 @pytest.mark.parametrize("objects", ["random_urdfs", "primitives"])
 def test_policies_lift_what_they_have_never_seen(objects):
-    """176 and 171 of 200 in docs/ppo.md: fewer than 6 of 10 would be chance once in a hundred."""
+    """96 and 93 of 100 attempts in docs/ppo.md: fewer than 6 of 10 would not be chance."""
     path = CHECKPOINTS / f"ppo_{objects}.pt"
     config = config_of(path, ["sim.renderer=tiny", "objects.split=test"])
     assert config.env.objects == objects
