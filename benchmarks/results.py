@@ -37,7 +37,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.result_tables import write_tables
-from utils.calibration import calibration_error
+from utils.calibration import calibration_error, error_by_chance
 from utils.config import load_config
 from utils.errors import UserError
 from utils.evaluation import in_order
@@ -484,6 +484,7 @@ def calibration_of(rounds: Sequence[RoundRecord]) -> list[dict[str, Any]]:
                 "policy": policy, "depth_noise": noise, "grasps": len(chances),
                 "chance": sum(chances) / len(chances), "success": sum(successes) / len(successes),
                 "error": calibration_error(chances, successes),
+                "error_by_chance": error_by_chance(chances),
             })  # fmt: skip
     return found
 

@@ -39,6 +39,7 @@ from utils.runs import check_writable, git_state, parse_args, run_script, write_
 HELD_OUT = 10  # every tenth scene
 SHARD = 50  # scenes of a file
 EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
+FURTHER_RATE = 3e-4  # from weights that are given: at the rate above they forget what they know
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
 
@@ -157,7 +158,8 @@ def fit(
         critic.scale.copy_(facts.std(dim=0).clamp_min(1e-3))
     optimizer = torch.optim.AdamW(critic.parameters(), lr=RATE, weight_decay=DECAY)
     steps = epochs * -(-len(success) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
+    rate = RATE if initial is None else FURTHER_RATE
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for _ in tqdm(range(epochs), unit="epoch"):
         order = torch.from_numpy(rng.permutation(len(success)))
         for batch in order.split(BATCH):

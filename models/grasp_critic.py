@@ -5,7 +5,8 @@ look best. The critic has seen on training scenes which of them held. It looks a
 the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN looks at a depth
 image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
 (`models.planner_antipodal.measure`), how the closing line lies to the vertical and to the camera,
-and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This module
+how large the object looks, which tells of a light and of a heavy one, how narrow a hand counts as
+empty, and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This module
 knows neither images nor scenes.
 """
 
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import nn
@@ -31,7 +33,11 @@ VIEW_INPUTS = (
     "tilt", "closing_slope", "closing_to_camera", "approach_to_camera", "camera_height", "value",
     "tip_rise", "log_score", "width", "turn",
 )  # fmt: skip
-INPUTS = (*VIEW_INPUTS, *FACTS)
+# Metres of the grasp's object as the map shows it: extents along and across the closing line, and
+# the edge of a cube of the volume under its surface.
+OBJECT_INPUTS = ("extent_along", "extent_across", "edge")
+# At last the width at which the hand counts as empty (`GripperGeometry.least_held`).
+INPUTS = (*VIEW_INPUTS, *FACTS, *OBJECT_INPUTS, "least_held")
 _LEAST = 1e-6  # of scores and values, in their logarithms
 
 _STEP = 0.004  # m between the cells of a patch
@@ -108,11 +114,16 @@ class GraspCritic(nn.Module):
 
 
 def critic_inputs(
-    found: Candidates, heights: HeightMap, value: np.ndarray, towards: np.ndarray
+    found: Candidates,
+    heights: HeightMap,
+    value: np.ndarray,
+    towards: np.ndarray,
+    least_held: float,
 ) -> CriticInputs:
     """What the critic sees of measured candidates on a height map.
 
     value: (N,) of the grasp network. towards: (3,) unit vector in W from the scene to the camera.
+    least_held: of the gripper, m.
     """
     R, count = heights.T_WV[:3, :3], len(found)
     along, across = found.axes()
@@ -130,7 +141,7 @@ def critic_inputs(
         found.width,
         np.abs(found.turn),
     )
-    facts = np.column_stack([*view, found.facts]).astype(np.float32)
+    facts = [*view, found.facts, *object_size(found, heights), np.full(count, least_held)]
     u, v = (_STEP * (np.arange(cells) - (cells - 1) / 2) for cells in (_ALONG, _ACROSS))
     where = cells_around(found.xy, along, across, u, v, heights)
     tips = found.tip[:, None, None]
@@ -139,7 +150,27 @@ def critic_inputs(
         for surface in (heights.height, heights.ceiling)
     ]
     layers.append(heights.label.take(where) == found.label[:, None, None])
-    return CriticInputs(facts, np.stack(layers, axis=1).astype(np.int8))
+    return CriticInputs(
+        np.column_stack(facts).astype(np.float32), np.stack(layers, axis=1).astype(np.int8)
+    )
+
+
+def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:
+    """(3, N) OBJECT_INPUTS of candidates; 0 for those of no object."""
+    size = np.zeros((len(OBJECT_INPUTS), len(found)))
+    axes = np.stack(found.axes())
+    over_table = np.maximum(heights.height - heights.table(), 0.0)
+    for label in np.unique(found.label[found.label >= 0]):
+        here = heights.label == label
+        if not here.any():
+            continue
+        own = found.label == label
+        cells = np.argwhere(here)[:, ::-1]
+        outline = cv2.convexHull(cells.astype(np.int32))[:, 0]
+        places = axes[:, own] @ (heights.cell * outline.T)  # (2, n, K)
+        size[:2, own] = np.ptp(places, axis=2) + heights.cell
+        size[2, own] = np.cbrt(over_table[here].sum() * heights.cell**2)
+    return size
 
 
 def load_critic(path: Path | str) -> GraspCritic:

@@ -95,6 +95,7 @@ class Judged:
     leaves the search's scores.
     """
 
+    gripper: GripperGeometry
     judge: Judge | None = None
 
     def judged(
@@ -104,7 +105,8 @@ class Judged:
         if self.judge is None or len(found) == 0:
             return found
         found = found.distinct(count, JUDGED_DISTANCE, JUDGED_TURN)
-        inputs = critic_inputs(found, heights, seen.value(heights, found), seen.towards)
+        value, least_held = seen.value(heights, found), self.gripper.least_held
+        inputs = critic_inputs(found, heights, value, seen.towards, least_held)
         return replace(found, score=self.judge(heights, found, inputs)).best(len(found))
 
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binom
 
 from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything, work
@@ -34,6 +35,7 @@ from utils.calibration import (
     Calibration,
     calibration_error,
     draw_reliability,
+    error_by_chance,
     reliability,
     risk_coverage,
 )
@@ -58,6 +60,21 @@ def test_the_error_is_the_mean_distance_of_the_bins() -> None:
     assert [one.count for one in bins] == [2, 1]
     np.testing.assert_allclose(bins, [(2, 0.8, 0.5), (1, 0.95, 1.0)])
     assert calibration_error([1.0, 0.0], [True, False]) == 0  # the ends belong to a bin
+
+
+def test_few_grasps_leave_an_error_to_exact_chances() -> None:
+    """Of N grasps with one chance p, the error is |successes / N - p|: by the binomial
+    distribution its mean and its 95th percentile are known; of sure ones it is 0."""
+    number, chance = 40, 0.9
+    successes = np.arange(number + 1)
+    weights = binom.pmf(successes, number, chance)
+    distance = np.abs(successes / number - chance)
+    mean, most = error_by_chance(np.full(number, chance))
+    assert mean == pytest.approx((weights * distance).sum(), abs=0.002)
+    assert weights[distance <= most + 1e-9].sum() >= 0.95
+    assert weights[distance < most - 1e-9].sum() <= 0.95
+    assert error_by_chance(np.ones(7)) == (0.0, 0.0)
+    assert error_by_chance(np.full(4 * number, chance))[0] < mean
 
 
 def test_risk_grows_with_the_grasps_that_are_tried() -> None:

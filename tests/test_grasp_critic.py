@@ -76,7 +76,7 @@ def test_inputs_of_a_grasp_from_above() -> None:
     y."""
     towards = np.array([0.5, 0.0, 0.75**0.5])
     found = candidates(0.0, np.pi / 2)
-    inputs = critic_inputs(found, view_of((0, 0, -1)), np.array([1.0, np.exp(-2)]), towards)
+    inputs = critic_inputs(found, view_of((0, 0, -1)), np.array([1.0, np.exp(-2)]), towards, 0.0)
     assert inputs.facts.shape == (2, len(INPUTS))
     np.testing.assert_allclose(column(inputs, "tilt"), 0, atol=1e-3)
     np.testing.assert_allclose(column(inputs, "closing_slope"), 0, atol=1e-6)
@@ -84,13 +84,29 @@ def test_inputs_of_a_grasp_from_above() -> None:
     np.testing.assert_allclose(column(inputs, "approach_to_camera"), 0.75**0.5, atol=1e-6)
     np.testing.assert_allclose(column(inputs, "value"), (0, -2), atol=1e-6)
     np.testing.assert_allclose(column(inputs, "tip_rise"), 0.02, atol=1e-6)
+    np.testing.assert_allclose(column(inputs, "least_held"), 0)
+
+
+def test_how_large_the_object_of_a_grasp_looks() -> None:
+    """Along its faces a box of 4 x 6 x 5 cm has these extents, at 45 degrees (4 + 6) / sqrt(2) cm
+    both ways; its volume is that of a cube of 4.93 cm."""
+    found = candidates(0.0, np.pi / 2, np.pi / 4, 0.0)
+    found.label[:3] = 0
+    inputs = critic_inputs(found, view_of((0, 0, -1)), np.ones(4), UPWARDS, 0.0)
+    diagonal = 0.1 / np.sqrt(2)
+    for name, expected in (
+        ("extent_along", (0.04, 0.06, diagonal, 0)),
+        ("extent_across", (0.06, 0.04, diagonal, 0)),
+        ("edge", (0.0493, 0.0493, 0.0493, 0)),
+    ):
+        np.testing.assert_allclose(column(inputs, name), expected, atol=0.004, err_msg=name)
 
 
 def test_inputs_of_a_grasp_that_leans() -> None:
     """The hand leans by 30 degrees: a line that closes in the plane of the lean slopes by as much,
     the one across it is level."""
     found = candidates(0.0, np.pi / 2)
-    inputs = critic_inputs(found, view_of((0.5, 0, -(0.75**0.5))), np.ones(2), UPWARDS)
+    inputs = critic_inputs(found, view_of((0.5, 0, -(0.75**0.5))), np.ones(2), UPWARDS, 0.0)
     np.testing.assert_allclose(column(inputs, "tilt"), np.deg2rad(30), atol=1e-5)
     slopes = np.sort(column(inputs, "closing_slope"))
     np.testing.assert_allclose(slopes, (0, 0.5), atol=1e-5)
@@ -102,7 +118,7 @@ def test_the_patch_of_a_box() -> None:
     heights = view_of((0, 0, -1))
     found = candidates(0.0, np.pi / 2)
     found.label[:] = 0
-    patches = critic_inputs(found, heights, np.ones(2), UPWARDS).patches
+    patches = critic_inputs(found, heights, np.ones(2), UPWARDS, 0.0).patches
     assert patches.shape == (2, 3, 24, 48)
     for patch, half in zip(patches, (20, 30)):  # mm, of the box along the closing line
         place = np.abs(4 * (np.arange(48) - 23.5))
@@ -120,7 +136,7 @@ def test_a_mirrored_patch_is_that_of_the_turned_hand() -> None:
     found = candidates(0.3, 0.3 + np.pi)
     found.xy += (0.013, 0.007)
     found.label[:] = 0
-    one, turned = critic_inputs(found, heights, np.ones(2), UPWARDS).patches
+    one, turned = critic_inputs(found, heights, np.ones(2), UPWARDS, 0.0).patches
     np.testing.assert_allclose(turned, one[:, ::-1, ::-1], atol=60)
     assert np.mean(turned != one[:, ::-1, ::-1]) < 0.01  # rounding to cells
 
@@ -183,7 +199,7 @@ def test_the_shipped_critic_prefers_opposite_faces_and_a_free_hand() -> None:
         found = measure(candidates(angle), alone, GripperGeometry(), SearchSettings())
         found.opening[:] = 0.06
         heights = height_map_from_frame(frame, Workspace())
-        inputs = critic_inputs(found, heights, np.ones(1), UPWARDS)
+        inputs = critic_inputs(found, heights, np.ones(1), UPWARDS, 0.0)
         chances.append(float(shipped_critic().chance(inputs)[0]))
     assert chances[0] > 0.8
     assert chances[1] < chances[0]

@@ -146,6 +146,19 @@ def calibration_error(chances: ArrayLike, successes: ArrayLike, bins: int = BINS
     return sum(one.count * abs(one.success - one.chance) for one in found) / total
 
 
+def error_by_chance(
+    chances: ArrayLike, bins: int = BINS, draws: int = 4000, seed: int = 0
+) -> tuple[float, float]:
+    """The mean and the 95th percentile of the calibration error of a planner that knows its chances
+    (N,) exactly: few grasps leave an error to it, too. By outcomes drawn from these chances."""
+    chances = np.asarray(chances, dtype=float)
+    place = np.minimum((chances * bins).astype(int), bins - 1)
+    belongs = (place[:, None] == np.arange(bins)).astype(float)  # (N, bins)
+    outcomes = np.random.default_rng(seed).random((draws, len(chances))) < chances
+    errors = np.abs((outcomes - chances) @ belongs).sum(axis=1) / len(chances)
+    return float(errors.mean()), float(np.quantile(errors, 0.95))
+
+
 def risk_coverage(chances: ArrayLike, successes: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """(N,) share of the grasps that are tried, and (N,) share of failures among them, when the
     surest 1, 2, ..., N are."""
