@@ -9,7 +9,9 @@ prints how often the candidate that is ranked first succeeds, of those that were
 the search alone, by the critic that it began with, and by the new one, how far the stated chances
 of all are from frequencies, and their log loss. Written to checkpoints/critic.pt, the critic is
 what graspnet, graspnet_direct and graspnet6d rank by from then on; their chances of success are
-then fitted again (`benchmarks.calibrate`).
+then fitted again (`benchmarks.calibrate`). With `--folds K` it writes no weights, and compares for
+kinds of hands and cameras the critic that it begins with and what becomes of it: each Kth of the
+scenes is judged by weights that learned from the others.
 """
 
 from __future__ import annotations
@@ -34,18 +36,21 @@ from utils.checkpoint import save_checkpoint
 from utils.config import Config
 from utils.errors import UserError
 from utils.executor import completed, open_executor
+from utils.result_formats import aligned
 from utils.runs import check_writable, git_state, parse_args, run_script, write_json_atomic
 
 HELD_OUT = 10  # every tenth scene
 SHARD = 50  # scenes of a file
 EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
 FURTHER_RATE = 3e-4  # from weights that are given: at the rate above they forget what they know
+UPRIGHT = np.cos(np.deg2rad(30))  # cosine of a camera's angle to the vertical, from which it counts
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, required=True, help="file for the weights")
+        parser.add_argument("--output", type=Path, help="file for the weights")
+        parser.add_argument("--folds", type=int, help="compare with --initial instead")
         parser.add_argument("--scenes", type=int, default=3000, help="how many, ten or more")
         parser.add_argument(
             "--examples", type=Path, default=Path("data/critic"), help="folder of executed grasps"
@@ -55,11 +60,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument("--initial", type=Path, help="critic whose weights to start from")
 
     config, chosen = parse_args(argv, "Train the grasp critic.", options)
-    check_writable("--output", chosen.output)
+    if (chosen.output is None) == (chosen.folds is None):
+        raise UserError("train_critic: give --output FILE.pt or --folds K")
+    if chosen.output is not None:
+        check_writable("--output", chosen.output)
+    elif chosen.initial is None or not 2 <= chosen.folds <= chosen.scenes:
+        raise UserError("--folds: give --initial, and 2 or more, at most one for each scene")
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
     initial = None if chosen.initial is None else load_critic(chosen.initial)
     examples = collect(config, chosen.scenes, chosen.examples)
+    if chosen.folds is not None:
+        assert initial is not None  # checked above
+        print(compared(initial, examples, config.seed, chosen.folds))
+        return 0
     held_out = examples.scene % HELD_OUT == 0
     scores = {}
     if initial is not None:
@@ -202,9 +216,49 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
             scores[f"{name} by {kind}"] = float(first.mean())
             scores[f"{name} by {kind} +-"] = 1.96 * float(first.std() / np.sqrt(len(first)))
     scores["calibration error"] = calibration_error(chance, examples.success)
-    likely = np.clip(np.where(examples.success, chance, 1 - chance), 1e-4, 1.0)
-    scores["log loss"] = float(-np.log(likely).mean())
+    scores["log loss"] = log_loss(chance, examples.success)
     return scores
+
+
+def compared(initial: GraspCritic, examples: Examples, seed: int, folds: int) -> str:
+    """A table of `initial` and of what it becomes: how many first candidates of plans succeed, the
+    difference with the half width of its 95 % interval, in points, and the mean log loss."""
+    before, after = initial.chance(examples.inputs), np.empty(len(examples.success))
+    for fold in range(folds):
+        own = examples.scene % folds == fold
+        critic = fit(examples.where(~own), seed, initial=initial)
+        after[own] = critic.chance(examples.where(own).inputs)
+    facts = dict(zip(INPUTS, examples.inputs.facts.T))
+    preference, upright = JUDGED_FAN.preference(facts["tilt"]), facts["camera_height"] > UPRIGHT
+    groups = {
+        "all": np.ones(len(after), bool),
+        "the arm's hand": facts["least_held"] == 0,
+        "VGN's hand": facts["least_held"] > 0,
+        "camera upright": upright,
+        "camera at a side": ~upright,
+    }
+    lines = []
+    for name, group in groups.items():
+        own = examples.where(group)
+        if not len(own.success):
+            continue
+        old, new = (
+            first_of_plans(own, (chance * preference)[group]).astype(float)
+            for chance in (before, after)
+        )
+        change = 100 * (new - old)
+        lines.append([
+            name, str(len(old)), f"{100 * old.mean():.1f} %", f"{100 * new.mean():.1f} %",
+            f"{change.mean():+.1f} +- {1.96 * change.std() / np.sqrt(len(change)):.1f}",
+            *(f"{log_loss(chance[group], own.success):.3f}" for chance in (before, after)),
+        ])  # fmt: skip
+    header = ["plans of", "plans", "before", "after", "difference", "log loss", "after"]
+    return aligned(header, lines)
+
+
+def log_loss(chance: np.ndarray, success: np.ndarray) -> float:
+    """The mean over outcomes (N,) of minus the logarithm of what was stated of them."""
+    return float(-np.log(np.clip(np.where(success, chance, 1 - chance), 1e-4, 1.0)).mean())
 
 
 def first_of_plans(examples: Examples, score: np.ndarray) -> np.ndarray:

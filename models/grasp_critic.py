@@ -6,8 +6,8 @@ the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN l
 image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
 (`models.planner_antipodal.measure`), how the closing line lies to the vertical and to the camera,
 how large the object looks, which tells of a light and of a heavy one, how narrow a hand counts as
-empty, and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This module
-knows neither images nor scenes.
+empty, and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This
+module knows neither images nor scenes.
 """
 
 from __future__ import annotations

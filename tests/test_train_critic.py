@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.train_critic import collect, first_of_plans, fit, judged
+from benchmarks.train_critic import collect, compared, first_of_plans, fit, judged
 from benchmarks.train_critic import main as train
 from envs.critic_examples import PLANNERS, Examples
+from models.grasp_critic import INPUTS, GraspCritic
 from tests.helpers.executed_grasps import column, made_up
 from utils.config import load_config
 from utils.errors import UserError
@@ -47,6 +48,35 @@ def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn() -> None:
     examples.success[chosen] = True
     assert judged(critic, examples)["graspnet6d by critic"] == 0
     assert judged(critic, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
+
+
+def test_a_comparison_judges_each_scene_by_what_learned_from_the_others(monkeypatch) -> None:
+    """A critic without training ranks by chance; trained on the rule it finds it in scenes that it
+    has not seen, with either hand: half of the scenes are of VGN's, all cameras upright."""
+    examples = made_up(200, 0)
+    facts = examples.inputs.facts
+    facts[:, INPUTS.index("least_held")] = np.where(examples.scene % 4 < 2, 0.008, 0.0)
+    facts[:, INPUTS.index("camera_height")] = 1.0
+    learned_from = []
+
+    def fitted(own: Examples, seed: int, initial: GraspCritic) -> GraspCritic:
+        learned_from.append({*own.scene})
+        return fit(own, seed, epochs=15)
+
+    monkeypatch.setattr("benchmarks.train_critic.fit", fitted)
+    torch.manual_seed(0)
+    table = compared(GraspCritic(), examples, seed=0, folds=2)
+    assert [len(scenes) for scenes in learned_from] == [100, 100]
+    assert not learned_from[0] & learned_from[1]
+    rows = {line[:16].strip(): line[16:].split() for line in table.splitlines()[2:]}
+    assert {*rows} == {"all", "the arm's hand", "VGN's hand", "camera upright"}
+    assert [int(rows[name][0]) for name in ("all", "the arm's hand", "VGN's hand")] == [
+        len({*examples.plan}), len({*examples.plan}) // 2, len({*examples.plan}) // 2
+    ]  # fmt: skip
+    for row in rows.values():
+        before, after = float(row[1]), float(row[3])
+        assert after > 80 > before + 20  # half of what is drawn by chance succeeds
+        assert float(row[5]) == pytest.approx(after - before, abs=0.11)
 
 
 def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
