@@ -19,8 +19,8 @@ from utils.transforms import Grasp
 
 
 def test_executed_are_grasps_of_a_scene_at_rest() -> None:
-    """Across a box's narrow side the hand lifts it, unless such a width counts as empty; 8 cm beside
-    it closes on nothing; a hand that would go into the table is not tried."""
+    """Across a box's narrow side the hand lifts it, unless so narrow a thing counts as none; 8 cm
+    beside it closes on nothing; a hand that would go into the table is not tried."""
     config = load_config(None, ["robot.arm=none"])
     box = load_object_set("box", cache_dir=config.cache_folder)
     with make_cell(config) as cell:
