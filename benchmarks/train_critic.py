@@ -64,8 +64,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise UserError("train_critic: give --output FILE.pt or --folds K")
     if chosen.output is not None:
         check_writable("--output", chosen.output)
-    elif chosen.initial is None or not 2 <= chosen.folds <= chosen.scenes:
-        raise UserError("--folds: give --initial, and 2 or more, at most one for each scene")
+    elif chosen.initial is None or chosen.more or not 2 <= chosen.folds <= chosen.scenes:
+        raise UserError(
+            f"--folds {chosen.folds}: give 2 or more, at most one for each scene, with "
+            "--initial and without --more"
+        )
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
     initial = None if chosen.initial is None else load_critic(chosen.initial)

@@ -121,9 +121,15 @@ def test_a_critic_goes_on_from_another_ones_weights() -> None:
     assert judged(anew, tested)["graspnet6d by critic"] < 0.7
 
 
-def test_too_few_scenes_are_refused(tmp_path) -> None:
+def test_what_cannot_be_trained_is_refused(tmp_path) -> None:
     with pytest.raises(UserError, match="--scenes 3: give 10 or more"):
         train(["--scenes", "3", "--output", str(tmp_path / "critic.pt")])
+    for both in ([], ["--folds", "2", "--output", str(tmp_path / "critic.pt")]):
+        with pytest.raises(UserError, match=r"give --output FILE\.pt or --folds K"):
+            train(both)
+    for wrong in (["2"], ["1", "--initial", "c.pt"], ["2", "--initial", "c.pt", "--more", "f"]):
+        with pytest.raises(UserError, match=f"--folds {wrong[0]}: give 2 or more"):
+            train(["--folds", *wrong])
 
 
 def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys) -> None:
@@ -143,5 +149,8 @@ def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys
     call = ["--output", str(tmp_path / "c.pt"), "--scenes", "20", "--examples", str(tmp_path / "e")]
     assert train([*call, "--more", str(more), "data.workers=1"]) == 0
     assert f"learned from {18 * 12 + 10 * 12}\n" in capsys.readouterr().out
+    compare = ["--folds", "2", "--initial", call[1], *call[2:], "data.workers=1"]
+    assert train(compare) == 0
+    assert "VGN's hand" in capsys.readouterr().out
     with pytest.raises(UserError, match=r"--more .*nothing: holds no executed grasps"):
         train([*call, "--more", str(tmp_path / "nothing"), "data.workers=1"])
