@@ -130,12 +130,17 @@ class ReliabilityBin(NamedTuple):
 def reliability(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> list[ReliabilityBin]:
     """The bins of [0, 1] that hold grasps, lowest first; a chance of 1 belongs to the last."""
     chances, successes = np.asarray(chances, dtype=float), np.asarray(successes, dtype=float)
-    place = np.minimum((chances * bins).astype(int), bins - 1)
+    place = _bins_of(chances, bins)
     return [
         ReliabilityBin(int(here.sum()), float(chances[here].mean()), float(successes[here].mean()))
         for here in (place == number for number in range(bins))
         if here.any()
     ]
+
+
+def _bins_of(chances: np.ndarray, bins: int) -> np.ndarray:
+    """(N,) numbers of the bins that hold chances (N,)."""
+    return np.minimum((chances * bins).astype(int), bins - 1)
 
 
 def calibration_error(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> float:
@@ -152,8 +157,7 @@ def error_by_chance(
     """The mean and the 95th percentile of the calibration error of a planner that knows its chances
     (N,) exactly: few grasps leave an error to it, too. By outcomes drawn from these chances."""
     chances = np.asarray(chances, dtype=float)
-    place = np.minimum((chances * bins).astype(int), bins - 1)
-    belongs = (place[:, None] == np.arange(bins)).astype(float)  # (N, bins)
+    belongs = (_bins_of(chances, bins)[:, None] == np.arange(bins)).astype(float)  # (N, bins)
     outcomes = np.random.default_rng(seed).random((draws, len(chances))) < chances
     errors = np.abs((outcomes - chances) @ belongs).sum(axis=1) / len(chances)
     return float(errors.mean()), float(np.quantile(errors, 0.95))
