@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import results
+from benchmarks.looks import add_look
 from benchmarks.result_tables import PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import PARTS, chosen_parts, main
 from benchmarks.table_cells import cleared, rate, success
@@ -208,7 +209,8 @@ def test_a_table_that_is_not_measured_says_how_to(tmp_path):
 def test_every_table_stands_on_a_page_and_needs_known_parts():
     marked = "".join((results.REPOSITORY / page).read_text(encoding="utf-8") for page in PAGES)
     assert all(f"<!-- results:{name} -->" in marked for name in TABLES)
-    parts = {part.name for part in PARTS} | {"reliability"}  # which the soak measures
+    # The soak measures the one, every part adds to the other.
+    parts = {part.name for part in PARTS} | {"reliability", "looks"}
     assert {need for needs, _ in TABLES.values() for need in needs} == parts
 
 
@@ -330,6 +332,31 @@ def test_each_part_has_its_own_scale_and_the_date_of_its_measuring(two_parts):
     assert "`cccccccccc` (2026-01-02)" in page
     content = json.loads((results.FIGURES / "clutter15.json").read_text())
     assert (content["scale"], content["date"]) == (0.5, "2026-01-02")
+
+
+def test_every_look_at_sealed_scenes_is_kept(tmp_path):
+    """97 of 100 and 45 of 50 grasps of two noisy rows are 95 %, 142 of 1,000 objects 14 %; clean
+    rows stand beside them where there are no others; another measuring is another look."""
+    noisy = [
+        row("graspnet", 97, 100) | {"depth_noise": "realsense"},
+        row("graspnet", 45, 50, objects="primitives") | {"depth_noise": "realsense"},
+    ]
+    clean = [row("graspnet6d", 3, 4), row("heuristic", 1, 4)]
+    target = [row("graspnet", 8, 10) | {"targets": 5, "targets_in_hand": 4}]
+    for name, commit, rows in [
+        ("scoreboard", "a", noisy + clean), ("scoreboard", "a", noisy), ("mujoco", "b", clean),
+        ("scoreboard", "b", clean), ("retrieve", "b", target), ("servo", "b", clean[1:]),
+    ]:  # fmt: skip
+        part = {"part": name, "commit": 40 * commit, "date": "2026-01-02", "scale": 1.0}
+        first, second = {"rows": rows[:1]}, {"rows": rows[1:]}
+        add_look(tmp_path, part | {"commands": {"one": first, "two": second, "three": {}}})
+    written = with_tables("<!-- results:looks -->\n<!-- /results -->", tmp_path).splitlines()
+    assert [line.split(" | ")[:2] + line.split(" | ")[4:] for line in written[3:-1]] == [
+        ["| `scoreboard`", "1", "`realsense`", "95 %, 14 %", "-", "- |"],
+        ["| `scoreboard`", "2", "`none`", "-", "-", "75 %, 1 % |"],
+        ["| `mujoco`", "1", "`none`", "-", "-", "75 %, 1 % |"],
+        ["| `retrieve`", "1", "`none`", "80 %, 80 %", "-", "- |"],
+    ]
 
 
 def test_what_was_measured_by_an_older_version_is_written(two_parts, tmp_path, capsys):
