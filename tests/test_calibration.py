@@ -138,21 +138,6 @@ def test_a_fit_finds_what_rough_depth_costs() -> None:
     np.testing.assert_allclose(truth.scores(truth(scores, rough), rough), scores)
 
 
-def test_few_noisy_failures_are_no_certain_penalty() -> None:
-    """400 grasps of one score, of which 186 of 200 in clean frames and 178 of 200 in rough ones
-    succeed. Without a prior the penalty would be the difference of the two logits; with it, at the
-    maximum, what the rough frames' grasps lack balances the prior's pull: sum(target - chance) x
-    roughness = -penalty / spread^2."""
-    rough = np.repeat([0.0, 0.0025], 200)
-    success = np.concatenate([np.arange(200) < 186, np.arange(200) < 178])
-    fitted = Calibration.fit(np.full(400, 1.0), success, rough)
-    alone = (np.log(186 / 14) - np.log(178 / 22)) / 0.0025
-    assert alone == pytest.approx(198, abs=1) and 30 < fitted.penalty < alone / 2
-    target = np.where(success, 365 / 366, 1 / 38)
-    lack = np.sum((target - fitted(1.0, rough)) * rough)
-    assert lack == pytest.approx(-fitted.penalty / 100**2, rel=1e-2)
-
-
 def test_no_fit_states_that_noise_helps() -> None:
     rough = np.repeat([0.0, 0.003], 100)
     fitted = Calibration.fit(np.full(200, 0.5), np.arange(200) % 10 < 6 + 3 * (rough > 0), rough)

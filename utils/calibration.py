@@ -33,9 +33,6 @@ LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
 # Standard deviation of slopes that are expected: so few grasps do not make a step of the line.
 SLOPE_SPREAD = 10.0
 DOUBT_SPREAD = 2.0  # and of doubts
-# And of penalties, in 1 / m: a quarter of a logit for a frame of `realsense`, rough by 2.4 mm. Some
-# hundred grasps leave half a logit open.
-PENALTY_SPREAD = 100.0
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 BINS = 10  # of equal width in [0, 1]
 
@@ -88,20 +85,19 @@ class Calibration:
         roughness (N,) of their frames, m, and whether the attempts before failed (N,) bool.
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
-        where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD,
-        PENALTY_SPREAD and DOUBT_SPREAD on slope, penalty and doubt.
+        where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD and
+        DOUBT_SPREAD on slope and doubt.
         """
         x = np.log(np.maximum(scores, LEAST_SCORE))
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
         after_failure = np.asarray(failed, dtype=float)
-        spreads = np.array([SLOPE_SPREAD, np.inf, PENALTY_SPREAD / 1000, DOUBT_SPREAD])
 
         def loss(line: np.ndarray) -> float:
             z = line[0] * x + line[1] - line[2] * rough - line[3] * after_failure
             likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
-            prior = np.sum((line / spreads) ** 2) / 2
+            prior = (line[0] / SLOPE_SPREAD) ** 2 / 2 + (line[3] / DOUBT_SPREAD) ** 2 / 2
             return float(prior - likelihood) / len(x)
 
         bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, None))
