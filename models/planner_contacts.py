@@ -30,15 +30,21 @@ _HOPELESS = 1e-3
 
 
 def scored_by_contacts(
-    found: Candidates, scene: SceneGeometry, gripper: GripperGeometry, buried: np.ndarray
+    found: Candidates,
+    scene: SceneGeometry,
+    gripper: GripperGeometry,
+    buried: np.ndarray,
+    fallback: np.ndarray | None = None,
 ) -> Candidates:
     """The candidates with scores that the exact contacts decide, best first. Antipodal grasps come
-    first, then those that only the height map finds good; hopeless ones are left out.
+    first, then those that something else finds good; hopeless ones are left out.
 
-    scene: in the candidates' frame. buried: (M,) share of each object that others cover.
+    scene: in the candidates' frame. buried: (M,) share of each object that others cover. fallback:
+    (N,) small scores of grasps without antipodal contacts; by default those of the height map.
     """
     quality = exact_quality(found, scene, gripper)
-    score = found.score * (0.01 + quality) * (1 - 0.7 * buried[found.label])
+    fallback = 0.01 * found.score if fallback is None else fallback
+    score = (found.score * quality + fallback) * (1 - 0.7 * buried[found.label])
     found = replace(found, score=np.where(score >= _HOPELESS, score, 0.0))
     return found.best(len(found))
 

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from models.grasp_critic import critic_inputs, shipped_critic
 from models.graspnet_io import SHIPPED
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import SearchSettings, with_chances
@@ -127,8 +128,16 @@ class HeuristicPlanner(SearchPlanner):
         return height_map_from_frame(frame, self.workspace)
 
 
+_FALLBACK = 0.02  # score of a grasp that is sure to hold, without antipodal contacts
+_OVERHEAD = np.array((0.0, 0.0, 1.0))  # towards a camera that hides nothing from an oracle
+
+
 class OraclePlanner(SearchPlanner):
     """The same search on the exact height map, then exact contacts under perturbed poses.
+
+    Grasps without antipodal contacts come last, in the order of the critic's chances
+    (`models.grasp_critic`): the critic has learned which of them hold all the same, as one of a
+    bowl's rim does, which turns until its wall is parallel to the pads.
 
     judged: number of candidates whose contacts are computed.
     """
@@ -155,8 +164,11 @@ class OraclePlanner(SearchPlanner):
         found = self.search(aimed).distinct(self.judged, 0.004, np.deg2rad(8))
         if len(found) == 0:
             return []
+        ones = np.ones(len(found))  # as if a grasp network valued all of them
+        inputs = critic_inputs(found, aimed, ones, _OVERHEAD, self.gripper.least_held)
+        fallback = _FALLBACK * shipped_critic().chance(inputs)
         buried = buried_share(truth, heights)
-        return self.grasps(scored_by_contacts(found, truth, self.gripper, buried))
+        return self.grasps(scored_by_contacts(found, truth, self.gripper, buried, fallback))
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         if frame.truth is None:
