@@ -27,6 +27,7 @@ from benchmarks.table_cells import (
     origin,
     planner_cells,
     points,
+    policy_file,
     rate,
     rounds_in_words,
     rows_of,
@@ -318,7 +319,10 @@ def mujoco(say: Say, part: Figures) -> str:
     ours, theirs = (
         {row["policy"]: row for row in rows_of(part, name)} for name in ("pybullet", "mujoco")
     )
-    lines = [[f"`{name}`", success(row), success(theirs[name])] for name, row in ours.items()]
+    lines = [
+        [f"`{policy_file(name)}`", success(row), success(theirs[name])]
+        for name, row in ours.items()
+    ]
     return "\n\n".join([table(["planner", "PyBullet", "MuJoCo"], lines), origin(say, part)])
 
 
@@ -341,7 +345,7 @@ def ppo(say: Say, part: Figures) -> str:
     lines = []
     for command in part["commands"].values():
         for row in command["rows"]:
-            policy = row["policy"].removeprefix("ppo:checkpoints/")
+            policy = policy_file(row["policy"])
             lines.append([f"`{row['objects']}`", f"`{policy}`", success(row), cleared(row)])
     header = ["objects", "policy", "success", "cleared"]
     return "\n\n".join([table(header, lines), origin(say, part)])
@@ -449,6 +453,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "mujoco": (("mujoco",), mujoco),
     "mujoco_only": (("mujoco_only",), mujoco_only),
     "ppo": (("ppo",), ppo),
+    "ppo_mujoco": (("ppo_mujoco",), mujoco),
     "cornell": (("cornell",), cornell),
     "speed": (("speed",), speed),
     "scaling": (("scaling",), scaling),

@@ -236,6 +236,12 @@ PARTS = (
     Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
         _policies("box", 3), _policies("random_urdfs", 3), _policies("primitives", 3),
     )),
+    Part("ppo_mujoco", "policies of PPO for boxes in both simulators", 6, tuple(
+        _evaluation(simulator, 100, f"simulator={simulator} evaluate.policies=ppo:checkpoints/"
+                    "ppo_box.pt,ppo:checkpoints/ppo_box_varied_looks.pt,heuristic "
+                    "evaluate.scenarios=isolated evaluate.object_sets=box", kept=3)
+        for simulator in ("pybullet", "mujoco")
+    )),
     Part("cornell", "Cornell's photographs", 15, (
         Command("simulated", EVALUATE, "--config configs/sim_to_real.yaml transfer.columns="
                 "cornell,cornell_as_taken transfer.cornell=CORNELL"),

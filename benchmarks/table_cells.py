@@ -61,6 +61,11 @@ def planner_cells(row: Figures) -> list[str]:
     return [f"`{row['policy']}`", success(row), cleared(row), picks]
 
 
+def policy_file(policy: str) -> str:
+    """A policy's name in tables: of a learned one its file, of which the folder is known."""
+    return policy.removeprefix("ppo:checkpoints/")
+
+
 def noise_of(row: Figures) -> str:
     """The depth noise of a row or a pair; older figures do not name it."""
     return row.get("depth_noise", CLEAN)
