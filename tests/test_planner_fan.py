@@ -15,6 +15,7 @@ from envs.evaluation_worker import check_everything
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import load_object_set
 from envs.rounds import checked_grasps
+from models.grasp_critic import INPUTS
 from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
@@ -203,6 +204,23 @@ def test_a_leaning_plate_is_gripped_flat_on_its_faces(lean) -> None:
     assert off_the_normal(best) < 16  # half the step between two rings
     planar = make_planner("oracle", GripperGeometry(), workspace, 0)(frame)
     assert all(off_the_normal(grasp) > 27 for grasp in planar)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_no_contacts_speak_for_has_the_critics_order(monkeypatch, sign) -> None:
+    """Vertical pads have no antipodal contacts on a plate that leans by 45 degrees: an oracle whose
+    critic likes high fingertips prefers high grasps, one whose critic likes low ones low grasps."""
+    place = INPUTS.index("tip_rise")
+
+    class Critic:
+        def chance(self, inputs):
+            return 0.5 + sign * np.clip(inputs.facts[:, place], 0.0, 0.4).astype(float)
+
+    monkeypatch.setattr("models.planners.shipped_critic", Critic)
+    frame = replace(boxes_frame([]), truth=leaning_plate(45))
+    grasps = make_planner("oracle", GripperGeometry(), Workspace(), 0)(frame)
+    heights = [round(sign * grasp.position[2], 4) for grasp in grasps]
+    assert len(set(heights)) > 2 and heights == sorted(heights, reverse=True)
 
 
 def test_the_fan_is_even_and_holds_the_vertical() -> None:
