@@ -41,7 +41,7 @@ from utils.runs import write_atomic
 
 PAGES = (
     "README.md", "README.zh-CN.md", "docs/results.md", "docs/planner.md", "docs/graspnet.md",
-    "docs/six_dof.md", "docs/vgn.md",
+    "docs/six_dof.md", "docs/vgn.md", "docs/ppo.md",
     "docs/scaling.md", "docs/reliability.md", "docs/servo.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
