@@ -1,8 +1,8 @@
 """The bowls of `primitives` as an object set: evaluate.object_sets=benchmarks.bowls:bowls
 
-Their walls lean by 15 to 49 degrees from the vertical, and friction holds to between 22 and 45. So
-a third of them has no antipodal contacts for fingers that come from straight above, but for those of
-a hand that leans.
+Their walls lean by 15 to 49 degrees from the vertical, and friction holds to between 22 and 45. A
+third of them has no antipodal contacts for fingers from straight above; a hand that leans finds
+some.
 """
 
 from __future__ import annotations

@@ -1,9 +1,15 @@
 """How often the sealed scenes of each part were played, and what they gave each time.
 
-`benchmarks.results` adds a look to docs/results/looks.json whenever it publishes the figures of a
-part, so that no table can be measured again until it pleases without a trace. A look holds the
-successes, attempts, removed objects and objects of each planner that learns, summed over the rows
-of a part with the same depth noise; of rows with a target, the targets in hand and the targets.
+Whenever `benchmarks.results` publishes the figures of a part, it adds a look to
+docs/results/looks.json, so that no table can be measured again until it pleases without a trace. A
+look holds the counts of each planner with a network, summed over the rows of a part that have the
+same depth noise:
+
+    {"scoreboard": [{"commit": ..., "date": ..., "scale": 1.0, "noises": {"realsense": {
+        "graspnet": {"successes": 97, "attempts": 100, "cleared": 97, "objects": 100}}}}]}
+
+Of rows with a target, `cleared` counts the targets in hand, and `objects` the targets. Policies of
+PPO and closed loops are not kept; docs/results.md tells how often their scenes were played.
 """
 
 from __future__ import annotations
@@ -11,42 +17,64 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.table_cells import Figures, noise_of
+from benchmarks.table_cells import Figures, Say, noise_of, table
 from utils.result_records import CLEAN
 from utils.runs import write_json_atomic
 
-NAME = "looks"
-LEARNED = ("graspnet", "graspnet_direct", "graspnet6d")
-COUNTS = ("successes", "attempts", "objects_cleared", "objects_total")
-TARGET_COUNTS = ("successes", "attempts", "targets_in_hand", "targets")
-
-
-def look_of(part: Figures) -> Figures:
-    """The look that a part's figures are."""
-    noises: dict[str, dict[str, list[int]]] = {}
-    rows = [row for command in part["commands"].values() for row in command.get("rows", ())]
-    for row in rows:
-        if row.get("policy") in LEARNED:
-            sums = noises.setdefault(noise_of(row), {}).setdefault(row["policy"], [0] * len(COUNTS))
-            for place, name in enumerate(TARGET_COUNTS if row.get("targets") else COUNTS):
-                sums[place] += row[name]
-    return {key: part[key] for key in ("commit", "date", "scale")} | {"noises": noises}
+FILE = "looks.json"
+PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
+_COUNTS = {"successes": "successes", "attempts": "attempts",
+           "cleared": "objects_cleared", "objects": "objects_total"}  # fmt: skip
+_OF_TARGETS = {"cleared": "targets_in_hand", "objects": "targets"}
 
 
 def add_look(folder: Path, part: Figures) -> None:
-    """Add a part's figures to the looks of a folder. The same commit at the same scale, which gives
-    the same figures, is no new look; nor are figures without a planner that learns kept."""
-    look, file = look_of(part), folder / f"{NAME}.json"
+    """Add a part's figures to the looks of a folder. The same commit at the same scale, published
+    again, is no new look; figures without a planner of PLANNERS are none."""
+    look, file = look_of(part), folder / FILE
     if not look["noises"]:
         return
     looks: dict[str, list[Figures]] = json.loads(file.read_text()) if file.exists() else {}
-    own = looks.setdefault(part["part"], [])
-    if all((one["commit"], one["scale"]) != (look["commit"], look["scale"]) for one in own):
-        own.append(look)
+    earlier = looks.setdefault(part["part"], [])
+    if all((one["commit"], one["scale"]) != (look["commit"], look["scale"]) for one in earlier):
+        earlier.append(look)
     write_json_atomic(file, looks)
 
 
-def shown_noises(look: Figures) -> dict[str, dict[str, list[int]]]:
-    """The counts of a look by depth noise: those with noise, where there are any."""
-    noises: dict[str, dict[str, list[int]]] = look["noises"]
-    return {name: of for name, of in noises.items() if name != CLEAN} or noises
+def look_of(part: Figures) -> Figures:
+    """The look that a part's figures are, as the file holds it."""
+    noises: dict[str, dict[str, dict[str, int]]] = {}
+    rows = [row for command in part["commands"].values() for row in command.get("rows", ())]
+    for row in rows:
+        if row.get("policy") in PLANNERS:
+            planners = noises.setdefault(noise_of(row), {})
+            sums = planners.setdefault(row["policy"], dict.fromkeys(_COUNTS, 0))
+            for name, key in (_COUNTS | (_OF_TARGETS if row.get("targets") else {})).items():
+                sums[name] += row[key]
+    return {key: part[key] for key in ("commit", "date", "scale")} | {"noises": noises}
+
+
+def looks_table(say: Say, looks: dict[str, list[Figures]]) -> str:
+    """A line for each look and depth noise: success and cleared of each planner. Clean rows stand
+    there only where a look has no noisy ones."""
+    lines = []
+    for part, own in looks.items():
+        for number, look in enumerate(own, start=1):
+            noisy = {name: of for name, of in look["noises"].items() if name != CLEAN}
+            for noise, planners in (noisy or look["noises"]).items():
+                counts = [planners.get(planner) for planner in PLANNERS]
+                objects = max(one["objects"] for one in planners.values())
+                lines.append([
+                    f"`{part}`", number, look["date"], f"`{look['commit'][:7]}`", f"`{noise}`",
+                    objects, *map(_shares, counts),
+                ])  # fmt: skip
+    header = ["part", "look", "date", "commit", "depth", "objects"]
+    return table(list(map(say, [*header, *(f"`{name}`" for name in PLANNERS)])), lines)
+
+
+def _shares(counts: dict[str, int] | None) -> str:
+    """'97 %, 95 %': success and cleared; '-' without attempts."""
+    if counts is None or counts["attempts"] == 0:
+        return "-"
+    success = counts["successes"] / counts["attempts"]
+    return f"{100 * success:.0f} %, {100 * counts['cleared'] / counts['objects']:.0f} %"

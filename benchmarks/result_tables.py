@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks.looks import LEARNED, shown_noises
+from benchmarks.looks import looks_table
 from benchmarks.table_cells import (
     Figures,
     Say,
@@ -33,7 +33,6 @@ from benchmarks.table_cells import (
     rows_of,
     success,
     table,
-    two_shares,
     with_depths,
 )
 from utils.result_records import CLEAN
@@ -395,20 +394,6 @@ def scaling_model(say: Say, part: Figures) -> str:
     return "\n\n".join([by_workers, metrics_table(model), origin(say, part)])
 
 
-def looks(say: Say, parts: Figures) -> str:
-    """What the planners that learn gave each time the sealed scenes of a part were played: success
-    and cleared (or targets in hand), over all rows with a depth noise together."""
-    lines = []
-    for name, of in parts.items():
-        for number, look in enumerate(of, start=1):
-            for noise, planners in shown_noises(look).items():
-                cells = [two_shares(planners.get(planner)) for planner in LEARNED]
-                commit = f"`{look['commit'][:7]}`"
-                lines.append([f"`{name}`", number, look["date"], commit, f"`{noise}`", *cells])
-    header = ["part", "look", "date", "commit", "depth", *(f"`{name}`" for name in LEARNED)]
-    return table(list(map(say, header)), lines)
-
-
 def reliability(say: Say, parts: Figures) -> str:
     """What `benchmarks.soak` has tried; each of its parts may have been run at another commit."""
     lines = [
@@ -459,7 +444,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "scaling": (("scaling",), scaling),
     "scaling_model": (("scaling",), scaling_model),
     "reliability": (("reliability",), reliability),
-    "looks": (("looks",), looks),
+    "looks": (("looks",), looks_table),
 }
 
 

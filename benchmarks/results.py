@@ -13,8 +13,8 @@ A part is a list of commands that anyone can run alone. The parts that stop earl
 with the next call: finished commands lie in runs/results/<commit>/, unfinished ones are resumed.
 A finished part leaves its figures in docs/results/<part>.json and the first rounds of each row in
 docs/results/<part>-<command>.jsonl; the tables are written from these files alone and say how many
-rounds each row has. Each part has a file of its own, so that parts may have different scales. That
-its scenes were looked at once more is kept in docs/results/looks.json (`benchmarks.looks`).
+rounds each row has. Each part has a file of its own, so that parts may have different scales. Each
+publication adds a look at the sealed scenes to docs/results/looks.json (`benchmarks.looks`).
 
 Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/results.md lists
 the seeds of the development.
@@ -372,11 +372,10 @@ def publish(part: Part, commit: str, scale: float) -> None:
             if command.kept:
                 keep_rounds(part, command, run)
         measured[command.name] = figures
-    content: dict[str, Any] = {
+    content = {
         "part": part.name, "commit": commit, "seed": SEED, "scale": scale,
-        "date": max(figures["date"] for figures in measured.values()),
+        "date": max(figures["date"] for figures in measured.values()), "commands": measured,
     }  # fmt: skip
-    content["commands"] = measured
     write_json_atomic(FIGURES / f"{part.name}.json", content)
     add_look(FIGURES, content)
 

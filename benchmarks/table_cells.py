@@ -34,13 +34,6 @@ def cleared(row: Figures) -> str:
     return rate(row["objects_cleared"], row["objects_total"], row["cleared_ci95"])
 
 
-def two_shares(counts: Sequence[int] | None) -> str:
-    """'97 %, 95 %' of (successes, attempts, objects removed, objects); '-' without attempts."""
-    if counts is None or counts[1] == 0:
-        return "-"
-    return f"{100 * counts[0] / counts[1]:.0f} %, {100 * counts[2] / counts[3]:.0f} %"
-
-
 def points(difference: Figures | None) -> str:
     """'+1.5 [+0.7, +2.2]' percentage points."""
     if difference is None:

@@ -24,8 +24,9 @@ PERTURBATIONS = np.array(
 )
 
 
-# The score of `scored_by_contacts` below which a grasp is left out. On training scenes no executed
-# grasp below it succeeded, such as on plates that lie flat, and nearly all others did.
+# The score of `scored_by_contacts` below which a grasp is left out. By the height map's fallback,
+# no executed grasp below it succeeded on training scenes, such as on plates that lie flat, and
+# nearly all others did; by the critic's, it is a chance of 5 %.
 _HOPELESS = 1e-3
 
 
@@ -36,15 +37,16 @@ def scored_by_contacts(
     buried: np.ndarray,
     fallback: np.ndarray | None = None,
 ) -> Candidates:
-    """The candidates with scores that the exact contacts decide, best first. Antipodal grasps come
-    first, then those that something else finds good; hopeless ones are left out.
+    """The candidates with scores that the exact contacts decide, best first; hopeless ones are left
+    out.
 
     scene: in the candidates' frame. buried: (M,) share of each object that others cover. fallback:
-    (N,) small scores of grasps without antipodal contacts; by default those of the height map.
+    (N,) small scores, which decide where no contacts are antipodal; by default those of the height
+    map.
     """
     quality = exact_quality(found, scene, gripper)
-    fallback = 0.01 * found.score if fallback is None else fallback
-    score = (found.score * quality + fallback) * (1 - 0.7 * buried[found.label])
+    least = 0.01 * found.score if fallback is None else fallback
+    score = (found.score * quality + least) * (1 - 0.7 * buried[found.label])
     found = replace(found, score=np.where(score >= _HOPELESS, score, 0.0))
     return found.best(len(found))
 

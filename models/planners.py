@@ -128,16 +128,17 @@ class HeuristicPlanner(SearchPlanner):
         return height_map_from_frame(frame, self.workspace)
 
 
-_FALLBACK = 0.02  # score of a grasp that is sure to hold, without antipodal contacts
+# Score of a grasp that the critic is sure of, without antipodal contacts: below most with such.
+_FALLBACK = 0.02
 _OVERHEAD = np.array((0.0, 0.0, 1.0))  # towards a camera that hides nothing from an oracle
 
 
 class OraclePlanner(SearchPlanner):
     """The same search on the exact height map, then exact contacts under perturbed poses.
 
-    Grasps without antipodal contacts come last, in the order of the critic's chances
-    (`models.grasp_critic`): the critic has learned which of them hold all the same, as one of a
-    bowl's rim does, which turns until its wall is parallel to the pads.
+    Where no contacts are antipodal, the critic's chances decide (`models.grasp_critic`): it has
+    learned which grasps hold all the same, as one of a bowl's rim does, which turns until its wall
+    is parallel to the pads.
 
     judged: number of candidates whose contacts are computed.
     """

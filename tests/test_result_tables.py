@@ -352,10 +352,10 @@ def test_every_look_at_sealed_scenes_is_kept(tmp_path):
         add_look(tmp_path, part | {"commands": {"one": first, "two": second, "three": {}}})
     written = with_tables("<!-- results:looks -->\n<!-- /results -->", tmp_path).splitlines()
     assert [line.split(" | ")[:2] + line.split(" | ")[4:] for line in written[3:-1]] == [
-        ["| `scoreboard`", "1", "`realsense`", "95 %, 14 %", "-", "- |"],
-        ["| `scoreboard`", "2", "`none`", "-", "-", "75 %, 1 % |"],
-        ["| `mujoco`", "1", "`none`", "-", "-", "75 %, 1 % |"],
-        ["| `retrieve`", "1", "`none`", "80 %, 80 %", "-", "- |"],
+        ["| `scoreboard`", "1", "`realsense`", "1000", "95 %, 14 %", "-", "- |"],
+        ["| `scoreboard`", "2", "`none`", "500", "-", "-", "75 %, 1 % |"],
+        ["| `mujoco`", "1", "`none`", "500", "-", "-", "75 %, 1 % |"],
+        ["| `retrieve`", "1", "`none`", "5", "80 %, 80 %", "-", "- |"],
     ]
 
 

@@ -446,7 +446,9 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
     assert same(dict(first["model"]), dict(load_checkpoint(run / "last.pt", KIND)["model"]))
 
 
-@pytest.mark.parametrize("name", ["ppo", "ppo_state", "ppo_primitives", "ppo_random_urdfs"])
+@pytest.mark.parametrize(
+    "name", ["ppo", "ppo_state", "ppo_primitives", "ppo_random_urdfs", "ppo_varied_looks"]
+)
 def test_shipped_configs_are_valid(name):
     config = load_config(REPOSITORY / "configs" / f"{name}.yaml")
     hidden = {*(config.rl.privileged_observations or ()), *(config.rl.estimated_observations or ())}
