@@ -128,13 +128,15 @@ def _evaluation(
     return Command(name, EVALUATE, f"{arguments} {ending}", rounds, kept, split)
 
 
-def _policies(objects: str, trainings: int = 1) -> Command:
-    """trainings: how many that differ in their seed, 0 first, which is the one that users get."""
+def _policies(name: str, trainings: int = 3) -> str:
+    """Those of PPO that were trained alike but for their seed, 0 first, which is what users get."""
     endings = ["", *(f"_{seed}" for seed in range(1, trainings))]
-    files = [f"ppo:checkpoints/ppo_{objects}{ending}.pt" for ending in endings]
-    policies = f"evaluate.policies={','.join(files)},heuristic"
+    return ",".join(f"ppo:checkpoints/ppo_{name}{ending}.pt" for ending in endings)
+
+
+def _single_objects(name: str, policies: str, objects: str, more: str = "") -> Command:
     where = f"evaluate.scenarios=isolated evaluate.object_sets={objects}"
-    return _evaluation(objects, 100, f"{policies} {where}", kept=3)
+    return _evaluation(name, 100, f"{more}evaluate.policies={policies},heuristic {where}", kept=3)
 
 
 PARTS = (
@@ -234,12 +236,12 @@ PARTS = (
         for simulator in ("mujoco", "pybullet")
     )),
     Part("ppo", "the shipped policies of PPO on unseen single objects", 20, (
-        _policies("box", 3), _policies("random_urdfs", 3), _policies("primitives", 3),
+        *(_single_objects(objects, _policies(objects), objects)
+          for objects in ("box", "random_urdfs", "primitives")),
     )),
     Part("ppo_mujoco", "policies of PPO for boxes in both simulators", 6, tuple(
-        _evaluation(simulator, 100, f"simulator={simulator} evaluate.policies=ppo:checkpoints/"
-                    "ppo_box.pt,ppo:checkpoints/ppo_box_varied_looks.pt,heuristic "
-                    "evaluate.scenarios=isolated evaluate.object_sets=box", kept=3)
+        _single_objects(simulator, f"{_policies('box_varied_looks')},{_policies('box', 1)}", "box",
+                        f"simulator={simulator} ")
         for simulator in ("pybullet", "mujoco")
     )),
     Part("cornell", "Cornell's photographs", 15, (
