@@ -135,6 +135,7 @@ def _policies(name: str, trainings: int = 3) -> str:
 
 
 def _single_objects(name: str, policies: str, objects: str, more: str = "") -> Command:
+    """Policies, and the heuristic beside them, on 100 objects one by one; more: overrides."""
     where = f"evaluate.scenarios=isolated evaluate.object_sets={objects}"
     return _evaluation(name, 100, f"{more}evaluate.policies={policies},heuristic {where}", kept=3)
 

@@ -188,5 +188,7 @@ def test_the_command_from_end_to_end(tmp_path, monkeypatch, capsys, played_here)
         "random",
         "heuristic",
         "PPO (shipped)",
-        *["PPO"] * 4,
+        *["PPO"] * 3,
+        "PPO of other settings",
+        "PPO",
     ]
