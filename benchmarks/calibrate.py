@@ -3,8 +3,8 @@
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
 (`utils.calibration`; it falls with the roughness of the frame and after a failure) and prints the
 expected calibration error in each scenario and with each depth noise, as stated, and as fitted to
-these same grasps, and how many succeeded of those whose stated chance is hopeless
-(`envs.rounds.HOPELESS`). With --output the fits are written: into checkpoints/calibration.json,
+these same grasps, and how many succeeded of those whose stated chance is too low to try them
+(`envs.rounds.LEAST_CHANCE`). With --output the fits are written: into checkpoints/calibration.json,
 they are what the planners state from then on; planners that the runs do not have keep theirs.
 `make calibration` plays all planners on training objects and fits them all again:
 
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.rounds import HOPELESS
+from envs.rounds import LEAST_CHANCE
 from models.planners import PLANNERS
 from utils.calibration import Calibration, calibration_error
 from utils.config import load_config
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if len(grasps_of(some).scores) > 0:
                 lines.append([name, *(kind or ("all", "all")), *errors(fitted, some)])
     header = ["planner", "scenario", "depth", "grasps", "success", "error as stated", "as fitted"]
-    header.append(f"under {HOPELESS:g}")
+    header.append(f"under {LEAST_CHANCE:g}")
     print(aligned(header, lines, range(3, 8)))
     if options.output is not None:
         write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})
@@ -150,14 +150,14 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
 
 def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
     """Cells: grasps, their share of successes, the calibration error as stated and as fitted, and
-    the successes of the hopeless ones."""
+    the successes of those that an evaluation would not try."""
     scores, stated, successes, roughness, failed = grasps_of(rounds)
-    hopeless = successes[stated < HOPELESS]
+    unlikely = successes[stated < LEAST_CHANCE]
     return [
         str(len(stated)), f"{100 * successes.mean():.0f} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
         f"{calibration_error(fitted(scores, roughness, failed), successes):.3f}",
-        f"{hopeless.sum()}/{len(hopeless)}",
+        f"{unlikely.sum()}/{len(unlikely)}",
     ]  # fmt: skip
 
 

@@ -28,7 +28,9 @@ from envs.robot_motion import Trajectory
 from utils.transforms import Grasp, top_down_pose
 
 OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
-LIFT_MARGIN = 0.05  # m over execution.lift_height, to which the lower end of an object is lifted
+# m over execution.lift_height, to which the lower end of an object is lifted: a heavy one that is
+# gripped beside its middle may turn until it hangs, far below the hand.
+LIFT_MARGIN = 0.15
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
 LOOK_EVERY = 12  # references between two at which arm and hand are looked at
 _OFF_TABLE = 0.015  # m by which an object is lifted before it leaves a place below something
@@ -174,7 +176,7 @@ def way_to_bin(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
     way of home, where the hand is high, if something hangs over the table. Raises
     UnreachableError."""
     over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
-    over_bin[2] = max(over_bin[2], top - LIFT_MARGIN)
+    over_bin[2] = max(over_bin[2], top)
     posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
     if not cell.hanging:
         return cell.robot.joint_move(q, posture, **scales(cell))

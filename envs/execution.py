@@ -53,7 +53,8 @@ _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs b
 _ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 0.8, 4, 0.002, 12
 _RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
 _HIGH = 0.2  # m over the table, from which the arm may go home on any way
-_CORNER = 0.04  # m of a vertical line's upper end that may be cut off
+_CORNER = 0.04  # m of the upper end of a straight way down that may be cut off
+_LIFT_CORNER = 0.12  # and of a straight way up
 
 
 class InHandMotion:
@@ -296,7 +297,7 @@ def _carry_to_bin(
     top = raised(cell, closed, height)[2, 3]
     lift = way_up(cell, start, closed, height)
     carry = way_to_bin(cell, lift.positions[-1], top)
-    corner = higher_than(top - _CORNER, lift)
+    corner = higher_than(top - _LIFT_CORNER, lift)
     way = robot.blended_moves(start, lift, carry, corner, **scales(cell))
     grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
     for first in range(0, len(lift), every):

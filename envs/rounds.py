@@ -55,7 +55,7 @@ TRIED_ANGLE = np.deg2rad(30)
 ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
-HOPELESS = 0.1  # chance of success below which a grasp is not tried
+LEAST_CHANCE = 0.5  # of success, below which a grasp is not tried: it is more likely to fail
 
 
 class GraspFinder(Protocol):
@@ -309,10 +309,10 @@ def _out_of_reach(grasps: Sequence[Grasp]) -> str:
 
 def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:
     """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
-    out what is hopeless, where the planner states chances of success, which are an arm's."""
+    out what is more likely to fail, where the planner states chances of success, an arm's."""
     if abstain is not None:
         return abstain
-    return HOPELESS if has_arm and calibration_of(planner) is not None else 0.0
+    return LEAST_CHANCE if has_arm and calibration_of(planner) is not None else 0.0
 
 
 def after_a_failure(grasp: Grasp, chances: Calibration | None) -> Grasp:

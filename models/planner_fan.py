@@ -44,7 +44,7 @@ class FanSettings:
     level: the last ring where something hangs over the table, so that the hand comes from the side
     alone.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
-    room. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
+    room. It decides on the order alone, and no quality falls by it. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
     than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
     m above the fingertips.
     """
@@ -58,7 +58,7 @@ class FanSettings:
     wrist: tuple[float, float] = (0.06, 0.13)
 
     def preference(self, tilt: np.ndarray) -> np.ndarray:
-        """(...) factors on the scores of grasps whose approaches are tilted, in radians."""
+        """(...) factors on the scores, as grasps are ordered, of approaches tilted by radians."""
         return np.exp(-((np.minimum(tilt, _TILTED) / self.tilt_scale) ** 2))
 
     def directions(self, covered: bool = False) -> list[np.ndarray]:
@@ -112,7 +112,7 @@ class FanPlanner(SearchPlanner):
         judge: Judge | None = None,
         covered: bool = False,
     ) -> list[Grasp]:
-        """The grasps of all views with their scores, best first; may be empty.
+        """The grasps of all views with their scores, best first by score and tilt; may be empty.
 
         overhead: the map from above, without what hangs over the table. maps: gives the height map
         in a frame T_WV (4, 4). judge: has the last word on what a view's candidates are worth.
@@ -125,8 +125,11 @@ class FanPlanner(SearchPlanner):
             for heights in views:
                 grasps += self._search_view(heights, settings, value, judge)
             if grasps:
-                return distinct(sorted(grasps, key=lambda grasp: -grasp.quality), self.fan)
+                return distinct(sorted(grasps, key=self._worth, reverse=True), self.fan)
         return []
+
+    def _worth(self, grasp: Grasp) -> float:
+        return grasp.quality * float(self.fan.preference(np.array(grasp.tilt)))
 
     def covered(self, solids: Sequence[ConvexSolid]) -> bool:
         """Whether one of the solids, in W, hangs over the table."""
@@ -160,9 +163,8 @@ class FanPlanner(SearchPlanner):
         found = found.distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
-        factor = float(self.fan.preference(tilt))
         return [
-            Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, factor * grasp.quality)
+            Grasp.from_pose(heights.T_WV @ grasp.pose, grasp.width, grasp.quality)
             for grasp in found.grasps(self.gripper)
         ]
 

@@ -92,17 +92,18 @@ class TargetPlanner:
         `ClearingSettings` in a frame that is not rough, because roughness lowers all chances.
         Chances of a planner that nearly always succeeds may all lie above the least one: they tell
         no grasp from another, but its scores do."""
-        chances, least = self.calibration, self.settings.promising
-        if chances is not None and chances(0.0) < least:
+        chances, least, rough = self.calibration, self.settings.promising, frame.roughness
+        if chances is not None and not self.needs_truth:
             table = self.plan.workspace.table_height  # type: ignore[attr-defined] - calibrated: ours
-            rough = 0.0 if self.needs_truth else table_roughness(frame, table)
-            return float(chances(chances.scores(least), max(rough, frame.roughness)))
+            rough = max(rough, table_roughness(frame, table))
+        if chances is not None and chances(0.0) < least:
+            return float(chances(chances.scores(least), rough))
         best = self.plan(replace(frame, target=None))[:1]
         if not best:
             return 0.0
         if chances is None:
             return self.settings.share * best[0].quality
-        return chances.of_share(best[0].quality, self.settings.share)
+        return chances.of_share(best[0].quality, self.settings.share, rough)
 
     def _clearing(self, objects: _Objects, grasps: list[Grasp]) -> list[Grasp]:
         shown = objects.surface(objects.target)

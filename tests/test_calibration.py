@@ -18,7 +18,7 @@ from scipy.stats import binom
 
 from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything, work
-from envs.rounds import HOPELESS, least_quality, run_round
+from envs.rounds import LEAST_CHANCE, least_quality, run_round
 from envs.simulators import make_cell
 from models.graspnet_io import SHIPPED
 from models.planners import (
@@ -363,7 +363,7 @@ def test_hopeless_grasps_are_left_to_whoever_asks_for_them() -> None:
         make_planner(name, gripper, workspace, 0) for name in ("heuristic", str(SHIPPED))
     )
     asked = [least_quality(stated, abstain, has_arm=True) for abstain in (None, 0.0, 0.7)]
-    assert asked == [HOPELESS, 0.0, 0.7]
+    assert asked == [LEAST_CHANCE, 0.0, 0.7]
     assert least_quality(scored, None, has_arm=True) == 0.0
     assert least_quality(stated, None, has_arm=False) == 0.0
     assert load_config(DEFAULTS).evaluate.abstain is None

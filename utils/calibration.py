@@ -1,9 +1,11 @@
 """From a planner's score to the chance that executing the grasp succeeds, and how good that is.
 
-Platt's method ("Probabilistic outputs for support vector machines", 1999) on the score's logarithm,
-with a penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
-line = slope log(score) + offset - penalty roughness - doubt failed, fitted to executed grasps.
-The chance rises with the score, so that a planner's order of grasps stays. The roughness is that of
+Beta calibration (Kull, Silva Filho and Flach, AISTATS 2017) of scores between 0 and 1, with a
+penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
+line = slope log(score) - upper log(1 - score) + offset - penalty roughness - doubt failed, fitted
+to executed grasps. With slope = upper = 1 and no offset, a score is its own chance; with upper = 0
+it is Platt's method (1999) on the score's logarithm, which tells scores near 1 hardly apart.
+The chance rises with the score, so that the order of grasps stays. The roughness is that of
 the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
 grasps fail. `failed` is 1 where the attempt before failed, and 0 otherwise: what is left then is
 often what the planner misjudges. How far chances and frequencies are apart is the
@@ -29,31 +31,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEAST_SCORE = 1e-6  # scores below it count as it
+MOST_SCORE = 0.999  # in log(1 - score), scores above it count as it
 LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
 # Standard deviation of slopes that are expected: so few grasps do not make a step of the line.
 SLOPE_SPREAD = 10.0
 DOUBT_SPREAD = 2.0  # and of doubts
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
+_LONGEST = 700.0  # logarithm of a number that floats hold
+_HALVINGS = 60
 BINS = 10  # of equal width in [0, 1]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chance of success of a score: slope > 0, offset, penalty >= 0 in 1 / m and doubt >= 0 of the
-    module's formula."""
+    """Chance of success of a score: slope > 0, offset, penalty >= 0 in 1 / m, doubt >= 0 and
+    upper >= 0 of the module's formula."""
 
     slope: float
     offset: float
     penalty: float = 0.0
     doubt: float = 0.0
+    upper: float = 0.0
 
     def __call__(
         self, score: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False
     ) -> np.ndarray:
         """(...) chances in (0, 1) of scores (...) in frames of this roughness (...), m; failed:
         (...) bool, whether the attempt before failed."""
-        logarithm = np.log(np.maximum(score, LEAST_SCORE))
-        return expit(self.slope * logarithm + self.offset - self._deduction(roughness, failed))
+        return expit(self._line(score) - self._deduction(roughness, failed))
+
+    def _line(self, score: ArrayLike) -> np.ndarray:
+        return self.slope * _low(score) + self.upper * _high(score) + self.offset
 
     def _deduction(self, roughness: ArrayLike, failed: ArrayLike) -> np.ndarray:
         return self.penalty * np.asarray(roughness, float) + self.doubt * np.asarray(failed, float)
@@ -67,12 +75,24 @@ class Calibration:
     ) -> np.ndarray:
         """(...) scores that have these chances (...) in frames of this roughness (...), m; failed:
         (...) bool, whether the attempt before failed."""
-        line = logit(np.clip(chances, _NEVER, _ALWAYS)) - self.offset
-        return np.exp((line + self._deduction(roughness, failed)) / self.slope)
+        line = logit(np.clip(chances, _NEVER, _ALWAYS)) + self._deduction(roughness, failed)
+        # Above MOST_SCORE the line is straight in log(score); below, it is found by bisection.
+        straight = self.offset + self.upper * _high(1.0)
+        above = np.exp(np.minimum((line - straight) / self.slope, _LONGEST))
+        if self.upper == 0.0:
+            return above
+        low, high = np.full(np.shape(line), LEAST_SCORE), np.full(np.shape(line), MOST_SCORE)
+        for _ in range(_HALVINGS):
+            # In steps of the odds, so that scores near both ends are as exact as others.
+            middle = expit((logit(low) + logit(high)) / 2)
+            under = self._line(middle) < line
+            low, high = np.where(under, middle, low), np.where(under, high, middle)
+        return np.where(line > self._line(MOST_SCORE), above, high)
 
-    def of_share(self, chance: float, share: float) -> float:
-        """The chance of a score that is this share of the one with that chance, in one frame."""
-        return float(expit(logit(np.clip(chance, _NEVER, _ALWAYS)) + self.slope * np.log(share)))
+    def of_share(self, chance: float, share: float, roughness: float = 0.0) -> float:
+        """The chance of a score that is this share of the one with that chance, both in a frame of
+        this roughness, m."""
+        return float(self(share * self.scores(chance, roughness), roughness))
 
     @staticmethod
     def fit(
@@ -85,25 +105,37 @@ class Calibration:
         roughness (N,) of their frames, m, and whether the attempts before failed (N,) bool.
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
-        where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD and
-        DOUBT_SPREAD on slope and doubt.
+        where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
+        slopes and DOUBT_SPREAD on the doubt.
         """
-        x = np.log(np.maximum(scores, LEAST_SCORE))
+        low, high = _low(scores), _high(scores)
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
         after_failure = np.asarray(failed, dtype=float)
 
         def loss(line: np.ndarray) -> float:
-            z = line[0] * x + line[1] - line[2] * rough - line[3] * after_failure
+            slope, offset, penalty, doubt, upper = line
+            z = slope * low + upper * high + offset - penalty * rough - doubt * after_failure
             likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
-            prior = (line[0] / SLOPE_SPREAD) ** 2 / 2 + (line[3] / DOUBT_SPREAD) ** 2 / 2
-            return float(prior - likelihood) / len(x)
+            slopes = (slope**2 + upper**2) / SLOPE_SPREAD**2
+            return float((slopes + (doubt / DOUBT_SPREAD) ** 2) / 2 - likelihood) / len(low)
 
-        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, None))
-        start = (1.0, 0.0, 0.0, 0.0)
-        slope, offset, penalty, doubt = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
-        return Calibration(float(slope), float(offset), 1000 * float(penalty), float(doubt))
+        bounds = ((LEAST_SLOPE, None), (None, None), *[(0.0, None)] * 3)
+        start = (1.0, 0.0, 0.0, 0.0, 0.0)
+        best = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
+        slope, offset, penalty, doubt, upper = best
+        return Calibration(slope, offset, 1000 * penalty, doubt, upper)
+
+
+def _low(scores: ArrayLike) -> np.ndarray:
+    """What tells poor scores (...) apart."""
+    return np.log(np.maximum(scores, LEAST_SCORE))
+
+
+def _high(scores: ArrayLike) -> np.ndarray:
+    """What tells scores (...) near 1 apart."""
+    return -np.log1p(-np.clip(scores, 0.0, MOST_SCORE))
 
 
 def load_calibrations(path: Path) -> dict[str, Calibration]:
@@ -113,8 +145,9 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
     planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
     return {
         name: Calibration(
-            one["slope"], one["offset"], one.get("penalty", 0.0), one.get("doubt", 0.0)
-        )
+            one["slope"], one["offset"], one.get("penalty", 0.0), one.get("doubt", 0.0),
+            one.get("upper", 0.0),
+        )  # fmt: skip
         for name, one in planners.items()
     }
 

@@ -126,8 +126,8 @@ class RoundRecord:
     randomization: the sample of the scene (`utils.domain_randomization`), None in a nominal cell.
     ungraspable: how many of the scene's objects do not fit the gripper.
     depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
-    calibration: slope, offset, penalty and doubt by which the grasps' qualities are chances of
-        success (`utils.calibration`); None where they are scores.
+    calibration: slope, offset, penalty, doubt and upper slope by which the grasps' qualities are
+        chances of success (`utils.calibration`); None where they are scores.
     target_in_hand: whether the one object that was wanted ended in the bin; None where all were.
     """
 
@@ -143,7 +143,7 @@ class RoundRecord:
     randomization: dict[str, Any] | None = None
     ungraspable: int = 0
     depth_noise: str = CLEAN
-    calibration: tuple[float, float, float, float] | None = None
+    calibration: tuple[float, float, float, float, float] | None = None
     target_in_hand: bool | None = None
 
     def __post_init__(self) -> None:
@@ -250,11 +250,11 @@ def _round(content: dict[str, Any]) -> RoundRecord:
             attempt["grasp"] = ImageGrasp(**grasp)
     if content.get("calibration") is not None:
         numbers = content["calibration"]
-        if len(numbers) not in (2, 3, 4) or not all(map(_is_number, numbers)):
-            raise ValueError("a calibration does not consist of four numbers")
-        # Older files have no doubt, and the oldest no penalty.
-        slope, offset, penalty, doubt = [*numbers, 0.0, 0.0][:4]
-        content["calibration"] = (slope, offset, penalty, doubt)
+        if not 2 <= len(numbers) <= 5 or not all(map(_is_number, numbers)):
+            raise ValueError("a calibration does not consist of five numbers")
+        # Older files have no upper slope, still older ones no doubt, and the oldest no penalty.
+        slope, offset, penalty, doubt, upper = [*numbers, 0.0, 0.0, 0.0][:5]
+        content["calibration"] = (slope, offset, penalty, doubt, upper)
     return RoundRecord(**content, attempts=tuple(AttemptRecord(**one) for one in attempts))
 
 
