@@ -425,7 +425,6 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "unseen": (("unseen",), variants),
     "household": (("household",), variants),
     "ycb": (("ycb",), variants),
-    "ycb_sure": (("ycb_sure",), variants),
     "clutter": (("clutter",), variants),
     "retrieve": (("retrieve",), retrieve),
     "vgn": (("vgn",), variants),

@@ -4,7 +4,7 @@
     make results PARTS=scoreboard,servo           # some of them
     make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
     make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
-    make results PARTS=cornell,ycb,ycb_sure,clutter CORNELL=path/to/cornell YCB=... CLUTTER=...
+    make results PARTS=cornell,ycb,clutter CORNELL=path/to/cornell YCB=... CLUTTER=...
     python -m benchmarks.results --list           # the parts, their commands and how long they take
     python -m benchmarks.results --write          # only write the tables from docs/results/*.json
     python -m benchmarks.results --commit HASH    # what was measured at another commit, from runs/
@@ -181,10 +181,6 @@ PARTS = (
     Part("ycb", "YCB's objects, as large and as heavy as they are", 15, (
         _evaluation("ycb", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=household "
                     "evaluate.object_sets=YCB", noises=NOISY_FIRST, kept=0),
-    ), needs=("ycb",)),
-    Part("ycb_sure", "YCB's objects, and no try that is more likely to fail than not", 15, (
-        _evaluation("ycb", 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios=household "
-                    "evaluate.object_sets=YCB evaluate.abstain=0.5", noises=NOISY_FIRST, kept=0),
     ), needs=("ycb",)),
     Part("clutter", "VGN's objects, with the whole arm", 20, tuple(
         _evaluation(layout, 20, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={layout} "

@@ -128,6 +128,18 @@ def test_a_bottle_is_carried_over_the_bin_and_not_into_its_wall(cell, config):
     assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
 
 
+def test_what_turns_until_it_hangs_is_lifted_off_the_table(cell):
+    """A bar of 0.5 kg and 30 cm, gripped 8 cm beside its middle, hangs 23 cm below the fingers in
+    the end: lifted to 22 cm, its lower end would still rest on the table."""
+    mass, size = 0.5, (0.024, 0.3, 0.03)
+    bar = native_object("bar", NativeShape("box", size), mass / np.prod(size), 0.5, (1, 0, 0, 1))
+    lying = Placement(bar, np.array([0.5, 0.0, 0.015]), np.array([0.0, 0.0, 0.0, 1.0]))
+    cell.load(Scene("isolated", 0, (lying,)))
+    outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.08, 0.02]), 0.0, 0.05, 1.0))
+    assert outcome.success, outcome.detail
+    assert outcome.motion.turned > np.deg2rad(45)
+
+
 @needs_pybullet
 def test_a_frictionless_object_slips(cell, box_set):
     cell.load(cube_scene(box_set))
