@@ -324,6 +324,8 @@ def measure(
     # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
     left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
     left_over &= np.minimum(*ends) > WALL_LABEL
+    if heights.beyond is not None:
+        left_over &= ~heights.beyond[heights.index(xy)]
     if gripper.least_held:
         thickness = _thickness(low_left, low_right, along, heights.cell)
         left_over &= thickness > gripper.least_held + _UNSURE

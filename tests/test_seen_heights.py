@@ -18,7 +18,7 @@ from utils.height_map import (
     tilted_view,
 )
 from utils.seen_heights import hides, sees_through, with_surroundings, without_holes
-from utils.transforms import RGBDFrame, look_at
+from utils.transforms import RGBDFrame, look_at, project
 
 BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))
 MIDDLE = np.array([0.5, 0.0, 0.0])
@@ -153,6 +153,16 @@ def test_no_grasp_closes_where_the_image_ends() -> None:
     assert plan(boxes_frame([CUT], focal=600)) == []
     whole = ((0.10, 0.049, 0.05), 0.0, (0.5, 0.10))
     assert plan(boxes_frame([whole], focal=600))
+
+
+@pytest.mark.parametrize("name", ["heuristic", "heuristic6d", "graspnet", "graspnet_direct"])
+def test_no_grasp_has_its_middle_where_the_image_shows_nothing(name: str) -> None:
+    """A bar of 12 cm, 5 cm wide, of which 49 mm are seen: it may end at the border."""
+    frame = boxes_frame([((0.05, 0.12, 0.05), 0.0, (0.5, 0.15))], focal=600)
+    grasps = make_planner(name, GripperGeometry(), Workspace(), 0)(frame)
+    assert grasps
+    pixels, _ = project([grasp.position for grasp in grasps], frame.K, frame.T_WC)
+    assert (pixels > -1).all() and (pixels < 224).all()
 
 
 def test_a_second_frame_shows_where_an_object_ends_that_the_first_one_cuts_off() -> None:

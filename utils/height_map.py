@@ -19,6 +19,7 @@ from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_line
 from utils.seen_heights import (
     FARTHEST,
     MARGIN,
+    outside,
     seen_heights,
     table_slope,
     without_holes,
@@ -56,6 +57,9 @@ class HeightMap:
     T_WV: (4, 4) the map's frame in W; the identity for a map from above.
     fixed: (R, C) metres in V, the tops of fixtures (`RGBDFrame.fixtures`) or true walls, -inf
         beside them; None where nothing is known of any.
+    beyond: (R, C) bool, cells that the image does not show: what its border cuts off is thought to
+        go on there (`with_surroundings`), and no grasp has its middle there; None where nothing is
+        cut off.
     """
 
     height: np.ndarray
@@ -67,6 +71,7 @@ class HeightMap:
     table_height: float
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
     fixed: np.ndarray | None = None
+    beyond: np.ndarray | None = None
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,9 +99,13 @@ class HeightMap:
             np.ascontiguousarray(part[::stride, ::stride])
             for part in (self.height, self.ceiling, self.label)
         )
-        fixed = None if self.fixed is None else self.fixed[::stride, ::stride]
-        cell = stride * self.cell
-        return replace(self, height=height, ceiling=ceiling, label=label, cell=cell, fixed=fixed)
+        fixed, beyond = (
+            None if part is None else part[::stride, ::stride] for part in (self.fixed, self.beyond)
+        )
+        return replace(
+            self, height=height, ceiling=ceiling, label=label, cell=stride * self.cell, fixed=fixed,
+            beyond=beyond,
+        )  # fmt: skip
 
     def highest_around(self, surface: str, radius: int, shape: int) -> np.ndarray:
         """(R, C) highest `surface` (height or ceiling) within `radius` cells of each one, in a
@@ -156,7 +165,11 @@ def height_map_from_frame(
     if not filled.fixtures:
         label = label_walls(label_pieces(surface, table, cell), grid, workspace, cell)
         centres = _column_centroids(seen.height - table, label, grid, table)
-        return HeightMap(*seen.walled(), label, centres, origin, cell, table)
+        beyond = None
+        if _goes_on(filled, frame):
+            points = np.concatenate([grid, seen.height[..., None]], axis=-1)
+            beyond = outside(frame, points)
+        return HeightMap(*seen.walled(), label, centres, origin, cell, table, beyond=beyond)
     fixed = _tops(filled.fixtures, grid, origin, cell)
     bare = _bare(seen.height, fixed)
     label = label_pieces(np.where(bare, table, surface), table, cell)
@@ -167,6 +180,13 @@ def height_map_from_frame(
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
     return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
+
+
+def _goes_on(filled: RGBDFrame, frame: RGBDFrame) -> bool:
+    """Whether a frame `without_holes` has pixels beyond the border of what was taken."""
+    before = filled.K[:2, 2] - frame.K[:2, 2]
+    rows, columns = np.subtract(filled.depth.shape, frame.depth.shape)
+    return bool((before > 0).any() or columns > before[0] or rows > before[1])
 
 
 def _uncovered(filled: RGBDFrame, hiding: np.ndarray, table: float) -> tuple[RGBDFrame, np.ndarray]:
@@ -262,6 +282,9 @@ def tilted_height_map(
         label = np.where(rim, nearest_values(label, known), label)
     centres = transform_points(inverse_pose(T_WV), overhead.centres)
     height, ceiling = seen.walled()
+    beyond = overhead.beyond
+    if beyond is not None:
+        beyond = beyond[overhead.index(points[..., :2])]
     if filled.fixtures:
         grid = np.stack(surface[:2], axis=-1)
         turned = [solid.transformed(inverse_pose(T_WV)) for solid in filled.fixtures]
@@ -271,7 +294,7 @@ def tilted_height_map(
     else:
         fixed = None
     table = overhead.table_height
-    return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed)
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond)
 
 
 def height_map_from_scene(

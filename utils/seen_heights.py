@@ -146,13 +146,24 @@ def hides(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
     return ~(surface > depth - _HIDDEN_BEHIND)
 
 
+def outside(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
+    """(...) bool, whether points (..., 3) in W lie outside a frame's image."""
+    return ~_pixels(frame, points)[2]
+
+
+def _pixels(frame: RGBDFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest pixels (..., 2) of points (..., 3) in W, NaN behind the camera, the points' depths
+    (...), and whether the image has these pixels (...)."""
+    pixels, depth = project(points, frame.K, frame.T_WC)
+    pixels = np.rint(pixels)
+    rows, columns = frame.depth.shape
+    return pixels, depth, ((pixels >= 0) & (pixels < (columns, rows))).all(axis=-1)
+
+
 def _on_its_ray(frame: RGBDFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depths (N,) of points and of the surfaces at their pixels, NaN where none was measured."""
-    pixels, depth = project(points, frame.K, frame.T_WC)
-    rows, columns = frame.depth.shape
-    u, v = np.rint(pixels).T
-    within = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)  # NaN, behind the camera, is not
-    u, v = (np.where(within, along, 0).astype(np.intp) for along in (u, v))
+    pixels, depth, within = _pixels(frame, points)
+    u, v = (np.where(within, along, 0).astype(np.intp) for along in pixels.T)
     surface = frame.depth[v, u]
     return depth, np.where(within & known_depth(surface), surface, np.nan)
 
