@@ -133,6 +133,7 @@ def test_scores_that_are_chances_stay_what_they_are() -> None:
     np.testing.assert_allclose(same(scores), scores)
     # By hand: 2 ln(0.8) - 0.5 ln(0.2) + 0.3 = 0.6584, whose logistic is 0.6589.
     assert Calibration(2.0, 0.3, upper=0.5)(0.8) == pytest.approx(0.6589, abs=1e-4)
+    assert Calibration.fit([0.2, 0.5, 0.9, 1.1], [False, True, True, True]).upper == 0
     rng = np.random.default_rng(0)
     drawn = rng.beta(4, 0.6, 40_000)
     fitted = Calibration.fit(drawn, rng.uniform(size=len(drawn)) < drawn)

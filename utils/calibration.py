@@ -3,8 +3,9 @@
 Beta calibration (Kull, Silva Filho and Flach, AISTATS 2017) of scores between 0 and 1, with a
 penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
 line = slope log(score) - upper log(1 - score) + offset - penalty roughness - doubt failed, fitted
-to executed grasps. With slope = upper = 1 and no offset, a score is its own chance; with upper = 0
-it is Platt's method (1999) on the score's logarithm, which tells scores near 1 hardly apart.
+to executed grasps. With slope = upper = 1 and no offset, a score is its own chance; with upper = 0,
+as for scores that exceed 1, it is Platt's method (1999) on the score's logarithm, which tells scores
+near 1 hardly apart.
 The chance rises with the score, so that the order of grasps stays. The roughness is that of
 the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
 grasps fail. `failed` is 1 where the attempt before failed, and 0 otherwise: what is left then is
@@ -109,6 +110,7 @@ class Calibration:
         slopes and DOUBT_SPREAD on the doubt.
         """
         low, high = _low(scores), _high(scores)
+        most = None if np.max(scores) <= 1.0 else 0.0  # of the upper slope
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
@@ -121,7 +123,7 @@ class Calibration:
             slopes = (slope**2 + upper**2) / SLOPE_SPREAD**2
             return float((slopes + (doubt / DOUBT_SPREAD) ** 2) / 2 - likelihood) / len(low)
 
-        bounds = ((LEAST_SLOPE, None), (None, None), *[(0.0, None)] * 3)
+        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, None), (0.0, most))
         start = (1.0, 0.0, 0.0, 0.0, 0.0)
         best = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
         slope, offset, penalty, doubt, upper = best
