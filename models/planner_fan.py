@@ -44,8 +44,8 @@ class FanSettings:
     level: the last ring where something hangs over the table, so that the hand comes from the side
     alone.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
-    room. It decides on the order alone, and no quality falls by it. returned: grasps at most; no two are closer than distinct_distance (m) and turned by less
-    than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
+    room. It decides on the order alone, and no quality falls by it. returned: grasps at most; no
+    two are closer than distinct_distance (m) and turned by less than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
     m above the fingertips.
     """
 

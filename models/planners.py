@@ -44,7 +44,7 @@ class Planner(Protocol):
     needs_truth: True if the frame has to carry `truth`; without the attribute it carries none.
     tilts: True if grasps come from any side, and not from straight above alone.
     calibration: by which qualities are chances of success (`utils.calibration.Calibration`), so
-        that grasps which rather fail are not tried; without the attribute, or with None, they are scores.
+        that what rather fails is not tried; without the attribute, or with None, they are scores.
     reset(seed): called before each scene, for planners that draw random numbers.
     segments(frame): (H, W) int32, the number of the object at each pixel, -1 where there is none;
         a planner that has it honours `RGBDFrame.target` and returns grasps of that object alone.

@@ -245,7 +245,7 @@ def test_planners_state_chances_in_the_order_of_their_scores() -> None:
         stated = make_planner(name, gripper, workspace, 0)(frame)
         scored = PLANNERS[name](gripper, workspace, 0)(frame)
         qualities = [grasp.quality for grasp in stated]
-        assert 0 < min(qualities) and max(qualities) < 1
+        assert min(qualities) > 0 and max(qualities) < 1
         if not tilts(PLANNERS[name]):  # whose order prefers steep approaches
             assert qualities == sorted(qualities, reverse=True)
         calibration = calibrations()[name]

@@ -4,8 +4,8 @@ Beta calibration (Kull, Silva Filho and Flach, AISTATS 2017) of scores between 0
 penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
 line = slope log(score) - upper log(1 - score) + offset - penalty roughness - doubt failed, fitted
 to executed grasps. With slope = upper = 1 and no offset, a score is its own chance; with upper = 0,
-as for scores that exceed 1, it is Platt's method (1999) on the score's logarithm, which tells scores
-near 1 hardly apart.
+as for scores that exceed 1, it is Platt's method (1999) on the score's logarithm, which hardly
+tells scores near 1 apart.
 The chance rises with the score, so that the order of grasps stays. The roughness is that of
 the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
 grasps fail. `failed` is 1 where the attempt before failed, and 0 otherwise: what is left then is
@@ -147,7 +147,10 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
     planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
     return {
         name: Calibration(
-            one["slope"], one["offset"], one.get("penalty", 0.0), one.get("doubt", 0.0),
+            one["slope"],
+            one["offset"],
+            one.get("penalty", 0.0),
+            one.get("doubt", 0.0),
             one.get("upper", 0.0),
         )  # fmt: skip
         for name, one in planners.items()
