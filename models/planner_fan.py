@@ -45,8 +45,8 @@ class FanSettings:
     alone.
     tilt_scale: rad, of the Gaussian that prefers steep approaches: arm and table leave them more
     room. It decides on the order alone, and no quality falls by it. returned: grasps at most; no
-    two are closer than distinct_distance (m) and turned by less than distinct_turn (rad). wrist: what the arm behind the hand takes up beside it: m across, and
-    m above the fingertips.
+    two are closer than distinct_distance (m) and turned by less than distinct_turn (rad). wrist:
+    what the arm behind the hand takes up beside it: m across, and m above the fingertips.
     """
 
     rings: tuple[tuple[float, int], ...] = ((30.0, 8), (60.0, 8), (85.0, 4))
