@@ -3,7 +3,7 @@
 Reads run folders of evaluate.py, fits each planner's chance of success to its executed grasps
 (`utils.calibration`; it falls with the roughness of the frame and after a failure) and prints the
 expected calibration error in each scenario and with each depth noise, as stated, and as fitted to
-these same grasps, and how many succeeded of those whose stated chance is too low to try them
+these same grasps, and how many succeeded of those whose fitted chance is too low to try them
 (`envs.rounds.LEAST_CHANCE`). With --output the fits are written: into checkpoints/calibration.json,
 they are what the planners state from then on; planners that the runs do not have keep theirs.
 `make calibration` plays all planners on training objects and fits them all again:
@@ -150,13 +150,14 @@ def grasps_of(rounds: Iterable[RoundRecord]) -> ExecutedGrasps:
 
 def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
     """Cells: grasps, their share of successes, the calibration error as stated and as fitted, and
-    the successes of those that an evaluation would not try."""
+    the successes of those that an evaluation with these fits would not try."""
     scores, stated, successes, roughness, failed = grasps_of(rounds)
-    unlikely = successes[stated < LEAST_CHANCE]
+    chances = fitted(scores, roughness, failed)
+    unlikely = successes[chances < LEAST_CHANCE]
     return [
         str(len(stated)), f"{100 * successes.mean():.0f} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
-        f"{calibration_error(fitted(scores, roughness, failed), successes):.3f}",
+        f"{calibration_error(chances, successes):.3f}",
         f"{unlikely.sum()}/{len(unlikely)}",
     ]  # fmt: skip
 
