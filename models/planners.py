@@ -20,7 +20,7 @@ import numpy as np
 from models.grasp_critic import critic_inputs, shipped_critic
 from models.graspnet_io import SHIPPED
 from models.planner_antipodal import SearchPlanner
-from models.planner_candidates import SearchSettings, with_chances
+from models.planner_candidates import SearchSettings
 from models.planner_contacts import buried_share, scored_by_contacts
 from models.planner_fan import HeuristicFanPlanner, OracleFanPlanner
 from models.planner_graspnet import (
@@ -29,7 +29,7 @@ from models.planner_graspnet import (
     GraspNetPlanner,
 )
 from utils.calibration import Calibration, load_calibrations
-from utils.depth_correction import corrected, table_roughness
+from utils.depth_correction import corrected
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, height_map_from_scene
@@ -84,9 +84,8 @@ def reset_planner(planner: Planner, seed: int) -> None:
 
 
 class RandomPlanner:
-    """Grasps uniform over the pixels above the table, at random angles, with the hand wide open."""
-
-    calibration: Calibration | None = None
+    """Grasps uniform over the pixels above the table, at random angles, with the hand wide open.
+    Their scores tell nothing, so that no chances are fitted to them."""
 
     def __init__(self, gripper: GripperGeometry, workspace: Workspace, seed: int, count: int = 20):
         self.gripper, self.workspace, self.count = gripper, workspace, count
@@ -111,8 +110,7 @@ class RandomPlanner:
             height = max(top - 0.02, lowest)  # the fingers reach 2 cm below the surface
             angle = self._random.uniform(0, np.pi)
             grasps.append(Grasp(np.array([x, y, height]), angle, self.gripper.max_opening, quality))
-        rough = max(frame.roughness, table_roughness(frame, table))
-        return with_chances(grasps, self.calibration, rough)
+        return grasps
 
 
 class HeuristicPlanner(SearchPlanner):
@@ -213,14 +211,15 @@ def make_planner(
     `plugin_planner`. seed: starts the planner's own random generator. key: of the
     config, where the name stands; for errors.
 
-    The qualities of the project's own planners are chances of success (`CALIBRATIONS`); those of
-    others, and of checkpoints, are scores of their own.
+    The qualities of the project's own planners but `random` are chances of success
+    (`CALIBRATIONS`); those of others, and of checkpoints, are scores of their own.
 
     Raises UserError for any other name, and for a file or module that cannot be loaded.
     """
     if name in PLANNERS:
         planner = PLANNERS[name](gripper, workspace, seed)
-        planner.calibration = calibrations().get(name)
+        if name in calibrations():
+            planner.calibration = calibrations()[name]
         return planner
     if name == "ppo" or name.startswith(("ppo:", "sb3:")):
         raise UserError(
