@@ -152,7 +152,7 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
             one.get("penalty", 0.0),
             one.get("doubt", 0.0),
             one.get("upper", 0.0),
-        )  # fmt: skip
+        )
         for name, one in planners.items()
     }
 
