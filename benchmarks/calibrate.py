@@ -6,7 +6,7 @@ expected calibration error in each scenario and with each depth noise, as stated
 these same grasps, and how many succeeded of those whose fitted chance is too low to try them
 (`envs.rounds.LEAST_CHANCE`). With --output the fits are written: into checkpoints/calibration.json,
 they are what the planners state from then on; planners that the runs do not have keep theirs.
-`make calibration` plays all planners on training objects and fits them all again:
+`make calibration` plays all planners but `random` on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
     python evaluate.py --config configs/calibration_household.yaml

@@ -351,7 +351,7 @@ def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Gr
 
     def is_near(grasp: Grasp) -> bool:
         gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
-        return grasp.quality < 0.5 or bool(min(gaps, default=np.inf) < ANOTHER)
+        return grasp.quality < LEAST_CHANCE or bool(min(gaps, default=np.inf) < ANOTHER)
 
     return sorted(grasps, key=is_near)
 
