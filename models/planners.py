@@ -127,7 +127,9 @@ class HeuristicPlanner(SearchPlanner):
 
 
 # Score of a grasp that the critic is sure of, without antipodal contacts: below most with such.
-_FALLBACK = 0.02
+# What it is less sure of loses more than its chance, because the contacts speak against it: on
+# training rounds, 30 of 41 of chances over 0.8 succeeded, and 7 of 26 of chances around 0.5.
+_FALLBACK, _UNSURE_POWER = 0.02, 3
 _OVERHEAD = np.array((0.0, 0.0, 1.0))  # towards a camera that hides nothing from an oracle
 
 
@@ -165,7 +167,7 @@ class OraclePlanner(SearchPlanner):
             return []
         ones = np.ones(len(found))  # as if a grasp network valued all of them
         inputs = critic_inputs(found, aimed, ones, _OVERHEAD, self.gripper.least_held)
-        fallback = _FALLBACK * shipped_critic().chance(inputs)
+        fallback = _FALLBACK * shipped_critic().chance(inputs) ** _UNSURE_POWER
         buried = buried_share(truth, heights)
         return self.grasps(scored_by_contacts(found, truth, self.gripper, buried, fallback))
 
