@@ -241,10 +241,19 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
     close_fingers(cell, result.wait)
     cell.robot.hold()  # a closed loop sends nothing from here on
     shifted = give_way(cell)
-    if not cell.robot.grips():
+    if not feels_it(cell):
         raise GraspFailure("missed")
     stays = result.pose is not None and not shifted
     return result.pose if stays else forward_kinematics(cell.robot.q)
+
+
+def feels_it(cell: Cell) -> bool:
+    """Whether the closed hand grips something. Before the answer is no, it is asked once more: the
+    motor of a hand that holds something may press less for a moment."""
+    if cell.robot.grips():
+        return True
+    cell.step(round(_CHECK_SECONDS / cell.dt))
+    return cell.robot.grips()
 
 
 def give_way(cell: Cell) -> bool:

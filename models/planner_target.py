@@ -8,6 +8,7 @@ seen, so that it can uncover what is wholly hidden. This module knows no simulat
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -76,7 +77,8 @@ class TargetPlanner:
         clearing, least = self._clearing(objects, grasps), objects.promising
         first = [grasp for grasp in clearing if grasp.quality >= least]
         others = [grasp for grasp in clearing if grasp.quality < least]
-        return [*first, *sorted([*grasps, *others], key=lambda grasp: -grasp.quality)]
+        # The planner's own order of the target's grasps may count more than their chances.
+        return [*first, *heapq.merge(grasps, others, key=lambda grasp: -grasp.quality)]
 
     def clearing(self, frame: RGBDFrame, grasps: list[Grasp]) -> list[Grasp]:
         """Grasps that move aside what is in the way of the target, the promising ones of the object
@@ -174,8 +176,8 @@ class _Objects:
         ]
 
     def promise(self, grasps: list[Grasp]) -> bool:
-        """Whether the best of an object's grasps is promising."""
-        return bool(grasps) and grasps[0].quality >= self.promising
+        """Whether any of an object's grasps is promising."""
+        return any(grasp.quality >= self.promising for grasp in grasps)
 
     def surface(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 3) points in W that some pixels (H, W) show, at most `points`, evenly."""

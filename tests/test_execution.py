@@ -103,6 +103,13 @@ def test_failures_are_named(cell, box_set, grasp, reason):
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
+def test_a_hand_that_presses_less_for_a_moment_has_missed_nothing(cell, box_set, monkeypatch):
+    cell.load(cube_scene(box_set))
+    felt, grips = iter([False]), cell.robot.grips
+    monkeypatch.setattr(cell.robot, "grips", lambda: next(felt, True) and grips())
+    assert execute_grasp(cell, cube_grasp()).reason == "success"
+
+
 def test_the_arm_keeps_its_wrist_off_the_bin(cell, box_set):
     """A hand that leans by 75 degrees, low over the table: on the left side of the workspace its
     wrist is over the table, on the right side, as far from the middle, it would be in the

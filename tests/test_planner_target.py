@@ -49,6 +49,18 @@ def test_a_free_target_is_grasped_as_the_planner_would() -> None:
     assert all(is_of(grasp, FLAT) for grasp in grasps)
 
 
+def test_a_planner_keeps_its_own_order_of_the_targets_grasps() -> None:
+    """As one does that prefers steep approaches to likelier ones."""
+
+    class Backwards(HeuristicPlanner):
+        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+            return super().__call__(frame)[::-1]
+
+    plan = TargetPlanner(Backwards(GripperGeometry(), Workspace()))
+    qualities = [grasp.quality for grasp in plan(frame_of([FLAT, FAR]))]
+    assert len(set(qualities)) > 1 and qualities == sorted(qualities)
+
+
 @pytest.mark.parametrize("name", ["heuristic", "oracle"])
 def test_neighbours_in_the_way_come_first_and_the_target_when_they_are_gone(name: str) -> None:
     plan = plan_for(name)
