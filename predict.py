@@ -22,16 +22,17 @@ a PNG or NPY of the image's size, not 0 where the object is), which alone part t
 touch where the planner sees one. Then all grasps are of that object, and `clearing` holds grasps
 that first move aside what is in its way, if anything is.
 
-Without --table-height the table is the dominant plane of the depth image. Without --camera-pose
-the table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture
-in OUT/grasps.png; OUT is runs/predict/<time>-<name of the image>, or the folder of --out, where
-they replace an earlier run's. Each grasp has `pixel` (u, v) and `image_angle` (from right towards
-down), where its position and closing line lie on the image, `width` between the finger pads, `tilt`
-of the approach from the table's normal, and in `camera` and `world` the pose of the middle between
-the pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
-line. `quality` is the chance of success where `calibrated` is true, and else the planner's score.
-Units are metres and radians; quaternions are x, y, z, w. If there is nothing to grasp the list is
-empty. `remarks` say what to mistrust. Bad input ends with one sentence and status 2.
+Without --table-height the table is the dominant plane of the depth image. Without --camera-pose the
+table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture in
+OUT/grasps.png; OUT is runs/predict/<time>-<name of the image>, or the folder of --out, where they
+replace an earlier run's. Each grasp has `pixel` (u, v) and `image_angle` (from right towards down),
+where its position and closing line lie on the image, `width` between the finger pads, `tilt` of the
+approach from the table's normal, and in `camera` and `world` the pose of the middle between the
+pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
+line. `quality` is the chance of success where `calibrated` is true, and else the planner's score. A
+robot here tries none under 0.5; planners from any side prefer steep approaches to slightly likelier
+ones. Units are metres and radians; quaternions are x, y, z, w. If there is nothing to grasp the
+list is empty. `remarks` say what to mistrust. Bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations
@@ -50,11 +51,12 @@ import numpy as np
 
 from models.graspnet import check_rgbd
 from models.graspnet_inference import training_scale
-from models.graspnet_io import SHIPPED, SavedGraspNet, load_graspnet
+from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached
 from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
+from utils.calibration import unlikely_ones
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_files import (
@@ -80,12 +82,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parse_options(argv)
     saved = load_graspnet(options.checkpoint or SHIPPED)
     if options.export is not None:
-        from models.graspnet_io import export_onnx  # nothing else needs ONNX
-
         export_onnx(saved, options.export)
         print(f"wrote {options.export}", file=sys.stderr)
         return 0
-
     if options.out is not None:
         check_output(options.out)
     image = read_image(options)
@@ -103,15 +102,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if frame.target is not None:
         clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
         remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
-    posed, given = options.camera_pose is not None, options.checkpoint
-    network = options.planner.startswith("graspnet")
+    if planner.calibration is not None:
+        remarks += unlikely_ones([one.quality for one in (*grasps, *(clearing or []))])
+    posed, network = options.camera_pose is not None, options.planner.startswith("graspnet")
     content = {
         "format": FORMAT,
         "version": VERSION,
         "rgb": str(options.rgb),
         "depth": str(options.depth),
         "planner": options.planner,
-        "checkpoint": str(given or SHIPPED) if network else None,
+        "checkpoint": str(options.checkpoint or SHIPPED) if network else None,
         "calibrated": planner.calibration is not None,
         **scene_as_plain(frame, table, workspace, posed),
         "grasps": grasps_as_plain(grasps, frame, posed),

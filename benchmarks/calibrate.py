@@ -4,8 +4,10 @@ Reads run folders of evaluate.py, fits each planner's chance of success to its e
 (`utils.calibration`; it falls with the roughness of the frame and after a failure) and prints the
 expected calibration error in each scenario and with each depth noise, as stated, and as fitted to
 these same grasps, and how many succeeded of those whose fitted chance is too low to try them
-(`envs.rounds.LEAST_CHANCE`). With --output the fits are written: into checkpoints/calibration.json,
-they are what the planners state from then on; planners that the runs do not have keep theirs.
+(`utils.calibration.LEAST_CHANCE`). With --output the fits are written: into
+checkpoints/calibration.json, they are what the project's planners state from then on; planners that
+the runs do not have keep theirs. A planner of your own reads its fit from a file of your own
+(docs/planner.md). `random`, whose scores tell nothing, and learned policies are left out.
 `make calibration` plays all planners but `random` on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml
@@ -27,11 +29,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.rounds import LEAST_CHANCE
+from envs.policy_approach import is_learned
+from models.planner_graspnet import Judged
 from models.planners import PLANNERS
-from utils.calibration import Calibration, calibration_error
+from utils.calibration import LEAST_CHANCE, Calibration, calibration_error
 from utils.config import load_config
 from utils.errors import UserError
+from utils.plugins import is_import_path
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord, read_rounds
 from utils.runs import git_state, run_script, write_json_atomic
@@ -46,12 +50,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     rounds = [record for own in played.values() for record in own]
     commit = git_state().commit
     lines, found = [], {}
-    for name in dict.fromkeys(record.policy for record in rounds if record.policy in PLANNERS):
+    policies = list(dict.fromkeys(record.policy for record in rounds))
+    names = [name for name in policies if states_chances(name)]
+    if not names:
+        raise UserError(
+            f"no policy of these runs has scores to fit chances to: {', '.join(policies)}; play "
+            "planners, such as graspnet or module:name"
+        )
+    for name in names:
         own = [record for record in rounds if record.policy == name]
         scores, _, successes, roughness, failed = grasps_of(own)
         if len(successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
-        fitted = Calibration.fit(scores, successes, roughness, failed)
+        bounded = is_bounded(name, scores)
+        fitted = Calibration.fit(scores, successes, roughness, failed, bounded)
         found[name] = {
             **asdict(fitted),
             "grasps": len(successes),
@@ -71,6 +83,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})
         print(f"wrote {options.output}")
     return 0
+
+
+def states_chances(policy: str) -> bool:
+    """Whether a policy's scores may be turned into chances: those of the project's planners that
+    have a calibration, and of a user's own planners and networks."""
+    if policy in PLANNERS:
+        return hasattr(PLANNERS[policy], "calibration")
+    return not is_learned(policy) and (is_import_path(policy) or policy.endswith(".pt"))
+
+
+def is_bounded(policy: str, scores: np.ndarray) -> bool:
+    """Whether a policy's scores (N,) end at 1: a critic's do, the search's do not; of another's
+    planner these grasps alone can tell."""
+    if policy in PLANNERS:
+        planner = PLANNERS[policy]
+        return isinstance(planner, type) and issubclass(planner, Judged)
+    return bool(scores.max() <= 1.0)
 
 
 def fits_of(path: Path) -> dict[str, Any]:

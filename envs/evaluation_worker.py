@@ -76,8 +76,8 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
         if config.evaluate.abstain and not states_chances:
             raise UserError(
                 f"evaluate.abstain: {name} states no chances of success (it has no `calibration`); "
-                "allowed with it are "
-                f"{', '.join(calibrations())}, or evaluate.abstain=null"
+                f"allowed with it are {', '.join(calibrations())}, a planner of your own that has "
+                "one (docs/planner.md), or evaluate.abstain=null"
             )
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")

@@ -35,7 +35,7 @@ from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
-from utils.calibration import Calibration
+from utils.calibration import LEAST_CHANCE, Calibration
 from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
@@ -55,7 +55,6 @@ TRIED_ANGLE = np.deg2rad(30)
 ANOTHER = 0.05  # m from every grasp that failed: most likely another object
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
-LEAST_CHANCE = 0.5  # of success, below which a grasp is not tried: it is more likely to fail
 
 
 class GraspFinder(Protocol):

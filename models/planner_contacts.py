@@ -26,7 +26,8 @@ PERTURBATIONS = np.array(
 
 # The score of `scored_by_contacts` below which a grasp is left out. By the height map's fallback,
 # no executed grasp below it succeeded on training scenes, such as on plates that lie flat, and
-# nearly all others did; by the critic's, it is a chance of 5 %.
+# nearly all others did; by that of `OraclePlanner`, it is a critic's chance of 37 %: there, 5 of 70
+# grasps under 35 % succeeded.
 _HOPELESS = 1e-3
 
 

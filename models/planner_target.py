@@ -8,7 +8,6 @@ seen, so that it can uncover what is wholly hidden. This module knows no simulat
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -74,11 +73,12 @@ class TargetPlanner:
             return self.plan(frame)
         grasps = self.plan(frame) if frame.target.any() else []
         objects = self._objects(frame)
-        clearing, least = self._clearing(objects, grasps), objects.promising
-        first = [grasp for grasp in clearing if grasp.quality >= least]
-        others = [grasp for grasp in clearing if grasp.quality < least]
-        # The planner's own order of the target's grasps may count more than their chances.
-        return [*first, *heapq.merge(grasps, others, key=lambda grasp: -grasp.quality)]
+        clearing = self._clearing(objects, grasps)
+        aside, others = objects.parted(clearing)
+        # Of promising grasps the planner's own order counts, which may prefer other things.
+        promising, poor = objects.parted(grasps)
+        poor = sorted([*poor, *others], key=lambda grasp: -grasp.quality)
+        return [*aside, *promising, *poor]
 
     def clearing(self, frame: RGBDFrame, grasps: list[Grasp]) -> list[Grasp]:
         """Grasps that move aside what is in the way of the target, the promising ones of the object
@@ -100,12 +100,13 @@ class TargetPlanner:
             rough = max(rough, table_roughness(frame, table))
         if chances is not None and chances(0.0) < least:
             return float(chances(chances.scores(least), rough))
-        best = self.plan(replace(frame, target=None))[:1]
-        if not best:
+        everything = self.plan(replace(frame, target=None))
+        if not everything:
             return 0.0
+        best = max(grasp.quality for grasp in everything)
         if chances is None:
-            return self.settings.share * best[0].quality
-        return chances.of_share(best[0].quality, self.settings.share, rough)
+            return self.settings.share * best
+        return chances.of_share(best, self.settings.share, rough)
 
     def _clearing(self, objects: _Objects, grasps: list[Grasp]) -> list[Grasp]:
         shown = objects.surface(objects.target)
@@ -136,9 +137,9 @@ class TargetPlanner:
         promising, others, enough = [], [], self.settings.enough
         for number in numbers:
             found = self.plan(replace(objects.frame, target=objects.labels == number))
-            promising += [grasp for grasp in found if grasp.quality >= objects.promising]
-            others += [grasp for grasp in found if grasp.quality < objects.promising]
-            enough -= objects.promise(found)
+            sure, unsure = objects.parted(found)
+            promising, others = promising + sure, others + unsure
+            enough -= bool(sure)
             if enough == 0:
                 break
         return promising, others
@@ -177,7 +178,12 @@ class _Objects:
 
     def promise(self, grasps: list[Grasp]) -> bool:
         """Whether any of an object's grasps is promising."""
-        return any(grasp.quality >= self.promising for grasp in grasps)
+        return bool(self.parted(grasps)[0])
+
+    def parted(self, grasps: list[Grasp]) -> tuple[list[Grasp], list[Grasp]]:
+        """Promising grasps and others, in their order."""
+        sure = [grasp for grasp in grasps if grasp.quality >= self.promising]
+        return sure, [grasp for grasp in grasps if grasp.quality < self.promising]
 
     def surface(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 3) points in W that some pixels (H, W) show, at most `points`, evenly."""

@@ -220,7 +220,7 @@ def make_planner(
     """
     if name in PLANNERS:
         planner = PLANNERS[name](gripper, workspace, seed)
-        if name in calibrations():
+        if name in calibrations() and hasattr(planner, "calibration"):
             planner.calibration = calibrations()[name]
         return planner
     if name == "ppo" or name.startswith(("ppo:", "sb3:")):

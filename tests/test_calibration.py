@@ -18,7 +18,7 @@ from scipy.stats import binom
 
 from benchmarks.calibrate import grasps_of, main
 from envs.evaluation_worker import check_everything, work
-from envs.rounds import LEAST_CHANCE, least_quality, run_round
+from envs.rounds import least_quality, run_round
 from envs.simulators import make_cell
 from models.graspnet_io import SHIPPED
 from models.planners import (
@@ -33,12 +33,14 @@ from models.planners import (
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.calibration import (
+    LEAST_CHANCE,
     Calibration,
     calibration_error,
     draw_reliability,
     error_by_chance,
     reliability,
     risk_coverage,
+    unlikely_ones,
 )
 from utils.config import DEFAULTS, dump_config, load_config
 from utils.depth_correction import corrected
@@ -97,7 +99,8 @@ def test_counts_add_up_and_the_error_is_a_share(grasps) -> None:
 def test_a_fit_finds_the_chances_that_the_grasps_were_drawn_with() -> None:
     rng = np.random.default_rng(0)
     scores, truth = rng.uniform(0.05, 1.2, 20_000), Calibration(1.5, 2.0)
-    fitted = Calibration.fit(scores, rng.uniform(size=len(scores)) < truth(scores))
+    successes = rng.uniform(size=len(scores)) < truth(scores)
+    fitted = Calibration.fit(scores, successes, bounded=False)
     assert fitted.slope == pytest.approx(1.5, abs=0.08)
     assert fitted.offset == pytest.approx(2.0, abs=0.08)
 
@@ -133,11 +136,41 @@ def test_scores_that_are_chances_stay_what_they_are() -> None:
     np.testing.assert_allclose(same(scores), scores)
     # By hand: 2 ln(0.8) - 0.5 ln(0.2) + 0.3 = 0.6584, whose logistic is 0.6589.
     assert Calibration(2.0, 0.3, upper=0.5)(0.8) == pytest.approx(0.6589, abs=1e-4)
-    assert Calibration.fit([0.2, 0.5, 0.9, 1.1], [False, True, True, True]).upper == 0
     rng = np.random.default_rng(0)
     drawn = rng.beta(4, 0.6, 40_000)
     fitted = Calibration.fit(drawn, rng.uniform(size=len(drawn)) < drawn)
     np.testing.assert_allclose(fitted(scores[1:]), scores[1:], atol=0.02)
+
+
+def test_a_score_of_one_that_comes_back_from_its_chance_is_still_bounded() -> None:
+    """By rounding it may come back as a little more, which has to change no fit."""
+    rng, stated = np.random.default_rng(3), Calibration(1.57, -0.53, upper=1.07)
+    scores = np.append(rng.beta(4, 0.6, 2000), 1.0)
+    successes = rng.uniform(size=len(scores)) < scores
+    back = stated.scores(stated(scores))
+    first, again = Calibration.fit(scores, successes), Calibration.fit(back, successes)
+    assert again.upper == pytest.approx(first.upper, rel=0.01) and first.upper > 0.5
+
+
+def test_scores_that_may_exceed_one_have_platts_line_in_every_sample() -> None:
+    """Also where, by chance, none of a sample's scores exceeds 1."""
+    scores, successes = [0.2, 0.5, 0.8, 0.9], [False, True, True, True]
+    assert Calibration.fit(scores, successes, bounded=False).upper == 0
+    assert Calibration.fit([*scores, 1.1], [*successes, True], bounded=False).upper == 0
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [([], "at least one grasp"), ([0.5, np.nan], "finite"), ([0.5, 1.1], "score is 1.1.*bounded")],
+)
+def test_what_no_chances_can_be_fitted_to_is_refused(scores, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        Calibration.fit(scores, [True] * len(scores))
+
+
+@pytest.mark.parametrize("upper", [0.0, 1.0])
+def test_no_chance_has_no_score(upper) -> None:
+    assert np.isnan(Calibration(1.0, 0.0, upper=upper).scores([np.nan, 0.5])).tolist() == [1, 0]
 
 
 def test_a_fit_finds_what_rough_depth_costs() -> None:
@@ -145,7 +178,7 @@ def test_a_fit_finds_what_rough_depth_costs() -> None:
     scores, truth = rng.uniform(0.05, 1.2, 40_000), Calibration(1.5, 2.0, 400.0)
     rough = rng.choice([0.0, 0.0025], len(scores))
     success = rng.uniform(size=len(scores)) < truth(scores, rough)
-    fitted = Calibration.fit(scores, success, rough)
+    fitted = Calibration.fit(scores, success, rough, bounded=False)
     assert fitted.slope == pytest.approx(1.5, abs=0.08)
     assert fitted.offset == pytest.approx(2.0, abs=0.08)
     assert fitted.penalty == pytest.approx(400, abs=25)
@@ -166,7 +199,7 @@ def test_a_fit_finds_how_much_a_failure_before_tells() -> None:
     scores, truth = rng.uniform(0.05, 1.2, 40_000), Calibration(1.5, 2.0, 0.0, 1.8)
     failed = rng.uniform(size=len(scores)) < 0.3
     success = rng.uniform(size=len(scores)) < truth(scores, 0.0, failed)
-    fitted = Calibration.fit(scores, success, 0.0, failed)
+    fitted = Calibration.fit(scores, success, 0.0, failed, bounded=False)
     assert fitted.slope == pytest.approx(1.5, abs=0.08)
     assert fitted.offset == pytest.approx(2.0, abs=0.08)
     assert fitted.doubt == pytest.approx(1.8, abs=0.1)
@@ -509,6 +542,29 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
             main([str(tmp_path / "train"), "--output", str(file)])
     with pytest.raises(UserError, match=r"no rounds.jsonl"):
         main([str(tmp_path / "nothing")])
+
+
+def test_planners_of_a_user_are_fitted_and_random_and_policies_are_not(tmp_path, capsys) -> None:
+    (tmp_path / "config.yaml").write_text(dump_config(load_config(None, ["objects.split=train"])))
+    for name in ("random", "ppo:my.pt"):
+        append_round(tmp_path / "rounds.jsonl", played(name, [(0.9, True), (0.7, False)]))
+    with pytest.raises(UserError, match="no policy of these runs has scores.*random, ppo:my.pt"):
+        main([str(tmp_path)])
+    grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
+    append_round(tmp_path / "rounds.jsonl", played("my_module:plan", grasps))
+    assert main([str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "my_module:plan" in printed and "random" not in printed and "ppo" not in printed
+
+
+def test_random_states_no_chances_whatever_a_file_says(monkeypatch) -> None:
+    monkeypatch.setattr("models.planners.calibrations", lambda: {"random": Calibration(1.0, 0.0)})
+    assert calibration_of(make_planner("random", GripperGeometry(), Workspace(), 0)) is None
+
+
+def test_grasps_that_rather_fail_are_told_of() -> None:
+    assert unlikely_ones([0.9, 0.5]) == unlikely_ones([]) == []
+    assert unlikely_ones([0.9, 0.4, 0.1])[0].startswith("2 of the 3 grasps have a chance under 0.5")
 
 
 CONFIGS = {

@@ -56,9 +56,13 @@ def test_a_planner_keeps_its_own_order_of_the_targets_grasps() -> None:
         def __call__(self, frame: RGBDFrame) -> list[Grasp]:
             return super().__call__(frame)[::-1]
 
-    plan = TargetPlanner(Backwards(GripperGeometry(), Workspace()))
-    qualities = [grasp.quality for grasp in plan(frame_of([FLAT, FAR]))]
-    assert len(set(qualities)) > 1 and qualities == sorted(qualities)
+    plan, frame = TargetPlanner(Backwards(GripperGeometry(), Workspace())), frame_of([FLAT, FAR])
+    qualities = [grasp.quality for grasp in plan(frame)]
+    best = max(grasp.quality for grasp in plan.plan(replace(frame, target=None)))
+    sure = [quality for quality in qualities if quality >= plan.settings.share * best]
+    assert len(set(sure)) > 1 and sure == sorted(sure) == qualities[: len(sure)]
+    others = qualities[len(sure) :]
+    assert others == sorted(others, reverse=True)
 
 
 @pytest.mark.parametrize("name", ["heuristic", "oracle"])

@@ -4,7 +4,7 @@ Beta calibration (Kull, Silva Filho and Flach, AISTATS 2017) of scores between 0
 penalty for rough depth and a doubt for what failed just before: P = 1 / (1 + exp(-line)),
 line = slope log(score) - upper log(1 - score) + offset - penalty roughness - doubt failed, fitted
 to executed grasps. With slope = upper = 1 and no offset, a score is its own chance; with upper = 0,
-as for scores that exceed 1, it is Platt's method (1999) on the score's logarithm, which hardly
+as for scores that may exceed 1, it is Platt's method (1999) on the score's logarithm, which hardly
 tells scores near 1 apart.
 The chance rises with the score, so that the order of grasps stays. The roughness is that of
 the table in the frame (`utils.depth_correction`): scores hardly tell a noisy frame, in which more
@@ -31,6 +31,7 @@ from scipy.special import expit, log_expit, logit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+LEAST_CHANCE = 0.5  # of success, below which a robot does not try a grasp: it rather fails
 LEAST_SCORE = 1e-6  # scores below it count as it
 MOST_SCORE = 0.999  # in log(1 - score), scores above it count as it
 LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
@@ -40,6 +41,7 @@ DOUBT_SPREAD = 2.0  # and of doubts
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 _LONGEST = 700.0  # logarithm of a number that floats hold
 _HALVINGS = 60
+_ROUNDING = 1e-6  # by which a score of 1 may come back from its chance
 BINS = 10  # of equal width in [0, 1]
 
 
@@ -75,9 +77,10 @@ class Calibration:
         self, chances: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False
     ) -> np.ndarray:
         """(...) scores that have these chances (...) in frames of this roughness (...), m; failed:
-        (...) bool, whether the attempt before failed."""
+        (...) bool, whether the attempt before failed. Scores over 1 may come back, also where a
+        planner has none: above MOST_SCORE the line is straight in log(score)."""
         line = logit(np.clip(chances, _NEVER, _ALWAYS)) + self._deduction(roughness, failed)
-        # Above MOST_SCORE the line is straight in log(score); below, it is found by bisection.
+        # Below MOST_SCORE, the score is found by bisection.
         straight = self.offset + self.upper * _high(1.0)
         above = np.exp(np.minimum((line - straight) / self.slope, _LONGEST))
         if self.upper == 0.0:
@@ -86,9 +89,9 @@ class Calibration:
         for _ in range(_HALVINGS):
             # In steps of the odds, so that scores near both ends are as exact as others.
             middle = expit((logit(low) + logit(high)) / 2)
-            under = self._line(middle) < line
+            under = ~(self._line(middle) >= line)  # no score belongs to NaN, see below
             low, high = np.where(under, middle, low), np.where(under, high, middle)
-        return np.where(line > self._line(MOST_SCORE), above, high)
+        return np.where(line <= self._line(MOST_SCORE), high, above)
 
     def of_share(self, chance: float, share: float, roughness: float = 0.0) -> float:
         """The chance of a score that is this share of the one with that chance, both in a frame of
@@ -101,16 +104,25 @@ class Calibration:
         successes: ArrayLike,
         roughness: ArrayLike = 0.0,
         failed: ArrayLike = False,
+        bounded: bool = True,
     ) -> Calibration:
         """The most likely calibration of executed grasps: scores (N,), successes (N,) bool, the
         roughness (N,) of their frames, m, and whether the attempts before failed (N,) bool.
+        bounded: whether no score of this planner exceeds 1, in these grasps or others; where some
+        may, upper is 0. Raises ValueError for no grasps, for scores that are no numbers, and for
+        bounded ones over 1.
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
         slopes and DOUBT_SPREAD on the doubt.
         """
+        scores = np.asarray(scores, dtype=float)
+        if scores.size == 0 or not np.isfinite(scores).all():
+            raise ValueError("a fit needs at least one grasp, and scores that are finite numbers")
+        if bounded and scores.max() > 1.0 + _ROUNDING:
+            raise ValueError(f"a score is {scores.max():g}: give bounded=False where some exceed 1")
         low, high = _low(scores), _high(scores)
-        most = None if np.max(scores) <= 1.0 else 0.0  # of the upper slope
+        most = None if bounded else 0.0  # of the upper slope
         won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
@@ -155,6 +167,17 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
         )
         for name, one in planners.items()
     }
+
+
+def unlikely_ones(chances: Sequence[float]) -> list[str]:
+    """A remark on grasps that are more likely to fail than to succeed."""
+    count = sum(chance < LEAST_CHANCE for chance in chances)
+    if count == 0:
+        return []
+    return [
+        f"{count} of the {len(chances)} grasps have a chance under {LEAST_CHANCE:g}: they rather "
+        "fail than succeed"
+    ]
 
 
 class ReliabilityBin(NamedTuple):

@@ -80,7 +80,7 @@ def format_stop_reasons(stops: Iterable[StopReason]) -> str:
         f"{depth_in_words(stop.depth_noise)}: {stop.sentence} ({stop.place})"
         for stop in stops
     ]
-    return "\n".join(["why attempts failed", *lines]) if lines else ""
+    return "\n".join(["why attempts failed or rounds ended", *lines]) if lines else ""
 
 
 def depth_in_words(noise: str) -> str:
