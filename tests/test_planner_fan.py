@@ -19,7 +19,7 @@ from models.grasp_critic import INPUTS
 from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
-from models.planners import make_planner
+from models.planners import PLANNERS, make_planner
 from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame, shelf_frame
 from utils.config import DEFAULTS, load_config
 from utils.errors import UserError
@@ -221,6 +221,22 @@ def test_what_no_contacts_speak_for_has_the_critics_order(monkeypatch, sign) -> 
     grasps = make_planner("oracle", GripperGeometry(), Workspace(), 0)(frame)
     heights = [round(sign * grasp.position[2], 4) for grasp in grasps]
     assert len(set(heights)) > 2 and heights == sorted(heights, reverse=True)
+
+
+def test_what_contacts_speak_against_counts_by_the_third_power(monkeypatch) -> None:
+    """Of the critic's chance: half a chance is an eighth of the score."""
+    frame, scores = replace(boxes_frame([]), truth=leaning_plate(45)), {}
+    for likely in (1.0, 0.5):
+
+        class Critic:
+            def chance(self, inputs, likely=likely):
+                return np.full(len(inputs.facts), likely)
+
+        monkeypatch.setattr("models.planners.shipped_critic", Critic)
+        scored = PLANNERS["oracle"](GripperGeometry(), Workspace(), 0)(frame)
+        scores[likely] = [grasp.quality for grasp in scored]
+    assert scores[1.0] and max(scores[1.0]) <= 0.02  # below most with antipodal contacts
+    np.testing.assert_allclose(np.array(scores[1.0]) / scores[0.5], 8.0)
 
 
 def test_the_fan_is_even_and_holds_the_vertical() -> None:
