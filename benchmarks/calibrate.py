@@ -57,13 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"no policy of these runs has scores to fit chances to: {', '.join(policies)}; play "
             "planners, such as graspnet or module:name"
         )
-    for name in names:
-        own = [record for record in rounds if record.policy == name]
-        scores, _, successes, roughness, failed = grasps_of(own)
-        if len(successes) == 0:
-            raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
-        bounded = is_bounded(name, scores)
-        fitted = Calibration.fit(scores, successes, roughness, failed, bounded)
+    records = {name: [one for one in rounds if one.policy == name] for name in names}
+    fits = fitted_chances({name: grasps_of(own) for name, own in records.items()})
+    for name, fitted in fits.items():
+        own = records[name]
+        successes, failed = grasps_of(own).successes, grasps_of(own).failed
         found[name] = {
             **asdict(fitted),
             "grasps": len(successes),
@@ -93,13 +91,30 @@ def states_chances(policy: str) -> bool:
     return not is_learned(policy) and (is_import_path(policy) or policy.endswith(".pt"))
 
 
-def is_bounded(policy: str, scores: np.ndarray) -> bool:
-    """Whether a policy's scores (N,) end at 1: a critic's do, the search's do not; of another's
-    planner these grasps alone can tell."""
-    if policy in PLANNERS:
-        planner = PLANNERS[policy]
-        return isinstance(planner, type) and issubclass(planner, Judged)
-    return bool(scores.max() <= 1.0)
+def fitted_chances(grasps: dict[str, ExecutedGrasps]) -> dict[str, Calibration]:
+    """The calibration of each policy from its executed grasps. Those that the critic judges see the
+    same frames with the same critic: one penalty for rough depth is fitted to all of them. Raises
+    UserError for a policy without grasps."""
+    for name, own in grasps.items():
+        if len(own.successes) == 0:
+            raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
+    samples = {
+        name: (own.scores, own.successes, own.roughness, own.failed)
+        for name, own in grasps.items()
+    }  # fmt: skip
+    judged = [name for name in grasps if is_judged(name)]
+    fits = dict(zip(judged, Calibration.fit_alike([samples[name] for name in judged])))
+    for name in grasps.keys() - fits.keys():
+        # The search's scores may exceed 1; of another's planner, these grasps alone can tell.
+        bounded = name not in PLANNERS and bool(grasps[name].scores.max() <= 1.0)
+        fits[name] = Calibration.fit(*samples[name], bounded)
+    return {name: fits[name] for name in grasps}
+
+
+def is_judged(policy: str) -> bool:
+    """Whether the critic has the last word on a policy's grasps, whose chances end at 1."""
+    planner = PLANNERS.get(policy)
+    return isinstance(planner, type) and issubclass(planner, Judged)
 
 
 def fits_of(path: Path) -> dict[str, Any]:

@@ -38,6 +38,7 @@ from utils.calibration import (
     calibration_error,
     draw_reliability,
     error_by_chance,
+    load_calibrations,
     reliability,
     risk_coverage,
     unlikely_ones,
@@ -186,6 +187,38 @@ def test_a_fit_finds_what_rough_depth_costs() -> None:
     assert truth(0.5, 0.0025) == pytest.approx(0.4901, abs=1e-4)
     assert truth(0.5) > truth(0.5, 0.0025)
     np.testing.assert_allclose(truth.scores(truth(scores, rough), rough), scores)
+
+
+def test_planners_that_suffer_alike_share_a_penalty_and_nothing_else() -> None:
+    """Two planners, drawn with penalties of 600 and 200 per metre: the shared one lies between, and
+    their slopes and offsets are their own."""
+    rng, samples = np.random.default_rng(0), []
+    for truth in (Calibration(1.5, 2.0, 600.0), Calibration(0.8, 1.0, 200.0)):
+        scores, rough = rng.uniform(0.05, 1.2, 40_000), rng.choice([0.0, 0.0025], 40_000)
+        success = rng.uniform(size=len(scores)) < truth(scores, rough)
+        samples.append((scores, success, rough, np.zeros(len(scores), bool)))
+    first, second = Calibration.fit_alike(samples, bounded=False)
+    assert first.penalty == second.penalty == pytest.approx(400, abs=60)
+    assert first.slope == pytest.approx(1.5, abs=0.15) and second.slope < 1
+    alone = Calibration.fit(*samples[1], bounded=False)
+    assert alone.penalty == pytest.approx(200, abs=25)
+    assert Calibration.fit_alike([]) == []
+
+
+def test_what_the_critic_judges_has_one_penalty(tmp_path) -> None:
+    (tmp_path / "config.yaml").write_text(
+        dump_config(load_config(None, ["objects.split=train", "evaluate.abstain=0"]))
+    )
+    for name in ("graspnet", "graspnet6d", "heuristic"):
+        grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
+        append_round(tmp_path / "rounds.jsonl", played(name, grasps, roughness=0.0))
+        rough = [(0.9, name != "graspnet"), (0.7, False), (0.6, name == "heuristic"), (0.8, True)]
+        append_round(tmp_path / "rounds.jsonl", played(name, rough, roughness=0.002))
+    assert main([str(tmp_path), "--output", str(tmp_path / "fits.json")]) == 0
+    fits = load_calibrations(tmp_path / "fits.json")
+    assert fits["graspnet"].penalty == fits["graspnet6d"].penalty > 0
+    assert fits["heuristic"].penalty != fits["graspnet"].penalty
+    assert fits["graspnet"].slope != fits["graspnet6d"].slope
 
 
 def test_no_fit_states_that_noise_helps() -> None:
@@ -458,11 +491,14 @@ def test_what_states_no_chances_cannot_abstain(policy) -> None:
 
 
 def played(
-    policy: str, grasps: list[tuple[float, bool]], line: tuple[float, float] | None = None
+    policy: str,
+    grasps: list[tuple[float, bool]],
+    line: tuple[float, float] | None = None,
+    roughness: float = 0.0,
 ) -> RoundRecord:
     attempts = tuple(
         AttemptRecord(won, "success" if won else "missed", 0.01, 3.0,
-                      ImageGrasp(np.zeros(2), 0.0, 0.7, 0.05, quality), roughness=0.0)
+                      ImageGrasp(np.zeros(2), 0.0, 0.7, 0.05, quality), roughness=roughness)
         for quality, won in grasps
     )  # fmt: skip
     cleared = sum(won for _, won in grasps)

@@ -116,30 +116,74 @@ class Calibration:
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
         slopes and DOUBT_SPREAD on the doubt.
         """
-        scores = np.asarray(scores, dtype=float)
+        return Calibration.fit_alike([(scores, successes, roughness, failed)], bounded)[0]
+
+    @staticmethod
+    def fit_alike(
+        samples: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]], bounded: bool = True
+    ) -> list[Calibration]:
+        """Calibrations of planners whose scores suffer from rough depth alike, such as those of one
+        critic: with one penalty, from all of their grasps, and the rest from each one's own.
+
+        samples: for each planner the scores, successes, roughness and failures of `fit`, which also
+        tells the errors.
+        """
+        own = [_Sample.of(*sample, bounded) for sample in samples]
+        if not own:
+            return []
+
+        def loss(numbers: np.ndarray) -> float:
+            penalty, lines = numbers[0], numbers[1:].reshape(-1, 4)
+            losses = [sample.loss(*line, penalty) for sample, line in zip(own, lines)]
+            return sum(losses) / sum(len(sample.low) for sample in own)
+
+        most = None if bounded else 0.0  # of the upper slope
+        bounds = [(LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, most)] * len(own)
+        start = [0.0, *([1.0, 0.0, 0.0, 0.0] * len(own))]
+        best = minimize(loss, start, method="L-BFGS-B", bounds=[(0.0, None), *bounds]).x
+        lines = best[1:].reshape(-1, 4).tolist()
+        return [
+            Calibration(slope, offset, 1000 * float(best[0]), doubt, upper)
+            for slope, offset, doubt, upper in lines
+        ]
+
+
+class _Sample(NamedTuple):
+    """N executed grasps as a fit sees them, (N,) each: what tells poor and good scores apart,
+    Platt's targets, the roughness in mm, as large as the logarithms, and 1 after a failure."""
+
+    low: np.ndarray
+    high: np.ndarray
+    target: np.ndarray
+    rough: np.ndarray
+    failed: np.ndarray
+
+    @staticmethod
+    def of(
+        scores: ArrayLike,
+        successes: ArrayLike,
+        roughness: ArrayLike,
+        failed: ArrayLike,
+        bounded: bool,
+    ) -> _Sample:
+        scores, won = np.asarray(scores, dtype=float), np.asarray(successes, dtype=bool)
         if scores.size == 0 or not np.isfinite(scores).all():
             raise ValueError("a fit needs at least one grasp, and scores that are finite numbers")
         if bounded and scores.max() > 1.0 + _ROUNDING:
             raise ValueError(f"a score is {scores.max():g}: give bounded=False where some exceed 1")
-        low, high = _low(scores), _high(scores)
-        most = None if bounded else 0.0  # of the upper slope
-        won = np.asarray(successes, dtype=bool)
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
-        rough = 1000 * np.asarray(roughness, dtype=float)  # mm, as large as the logarithms
-        after_failure = np.asarray(failed, dtype=float)
+        rough, after_failure = 1000 * np.asarray(roughness, float), np.asarray(failed, float)
+        return _Sample(_low(scores), _high(scores), target, rough, after_failure)
 
-        def loss(line: np.ndarray) -> float:
-            slope, offset, penalty, doubt, upper = line
-            z = slope * low + upper * high + offset - penalty * rough - doubt * after_failure
-            likelihood = np.sum(target * log_expit(z) + (1 - target) * log_expit(-z))
-            slopes = (slope**2 + upper**2) / SLOPE_SPREAD**2
-            return float((slopes + (doubt / DOUBT_SPREAD) ** 2) / 2 - likelihood) / len(low)
-
-        bounds = ((LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, None), (0.0, most))
-        start = (1.0, 0.0, 0.0, 0.0, 0.0)
-        best = minimize(loss, start, method="L-BFGS-B", bounds=bounds).x.tolist()
-        slope, offset, penalty, doubt, upper = best
-        return Calibration(slope, offset, 1000 * penalty, doubt, upper)
+    def loss(
+        self, slope: float, offset: float, doubt: float, upper: float, penalty: float
+    ) -> float:
+        """Minus the logarithm of the likelihood and the priors; penalty: in 1 / mm."""
+        line = slope * self.low + upper * self.high + offset
+        z = line - penalty * self.rough - doubt * self.failed
+        likelihood = np.sum(self.target * log_expit(z) + (1 - self.target) * log_expit(-z))
+        slopes = (slope**2 + upper**2) / SLOPE_SPREAD**2
+        return float((slopes + (doubt / DOUBT_SPREAD) ** 2) / 2 - likelihood)
 
 
 def _low(scores: ArrayLike) -> np.ndarray:
