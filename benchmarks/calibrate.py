@@ -99,9 +99,8 @@ def fitted_chances(grasps: dict[str, ExecutedGrasps]) -> dict[str, Calibration]:
         if len(own.successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
     samples = {
-        name: (own.scores, own.successes, own.roughness, own.failed)
-        for name, own in grasps.items()
-    }  # fmt: skip
+        name: (own.scores, own.successes, own.roughness, own.failed) for name, own in grasps.items()
+    }
     judged = [name for name in grasps if is_judged(name)]
     fits = dict(zip(judged, Calibration.fit_alike([samples[name] for name in judged])))
     for name in grasps.keys() - fits.keys():
