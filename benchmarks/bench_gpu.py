@@ -1,8 +1,10 @@
 """What a GPU adds: python -m benchmarks.bench_gpu [--json FILE]
 
-GraspNet's training step and its maps of a batch of images, on the GPU and on all cores of the same
-machine, and MuJoCo's pictures by the OpenGL that this machine offers. Without a GPU only the
-figures of the CPU appear. Images and targets are random: their content does not change the speed.
+GraspNet's training step, its maps of a batch of images, and the plans of those planners that have
+networks, on the GPU and on all cores of the same machine; and MuJoCo's pictures by the OpenGL that
+this machine offers. Of a plan, the networks alone run on the GPU. Without a GPU only the figures of
+the CPU appear. Images and targets are random, but for the piles that are planned: their content
+does not change the speed.
 """
 
 from __future__ import annotations
@@ -14,21 +16,28 @@ from time import perf_counter
 import numpy as np
 import torch
 
+from benchmarks.bench_planning import frames_of, median_ms
 from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.cell_scenes import make_scene
 from envs.mujoco_camera import opengl_renderer
 from envs.objects import load_object_set
 from envs.simulators import make_cell
+from models.grasp_critic import SHIPPED as CRITIC
+from models.grasp_critic import load_critic
 from models.graspnet import GraspTargets
 from models.graspnet_data import Example
+from models.graspnet_io import SHIPPED, for_inference, load_graspnet
 from models.graspnet_training import Trainer, make_network
+from models.planner_graspnet import GraspNetFanPlanner, GraspNetPlanner
 from utils.config import Config, load_config
 from utils.distributed import Team
-from utils.geometry import GripperGeometry
+from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import ANGLE_BINS
 from utils.runs import run_script
+from utils.transforms import RGBDFrame
 
 PLANNED = (1, 8, 64)  # images of a batch whose maps are predicted
+PILE = 5  # objects of the piles that are planned
 CPU = torch.device("cpu")
 
 
@@ -42,7 +51,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if torch.cuda.is_available():
         devices.append(torch.device("cuda", 0))
         print(f"GPU: {torch.cuda.get_device_name(0)}")
-    rates = {device: speeds(config, device, repeats) for device in devices}
+    seen = frames_of(load_config(None, [f"scene.count={PILE}"]), repeats, "primitives")
+    rates = {device: speeds(config, device, repeats) | plans(seen, device) for device in devices}
     metrics = [Metric("threads of the CPU", torch.get_num_threads(), "")]
     for device, values in rates.items():
         metrics += [Metric(f"{name}, {device.type}", rate, "/s") for name, rate in values.items()]
@@ -74,6 +84,18 @@ def speeds(config: Config, device: torch.device, repeats: int) -> dict[str, floa
             images = images.to(memory_format=torch.channels_last)
             taken = median_seconds(lambda images=images: model(images), device, repeats)
             rates[f"images predicted, batch of {count}"] = count / taken
+    return rates
+
+
+def plans(frames: Sequence[RGBDFrame], device: torch.device) -> dict[str, float]:
+    """Plans a second with the networks on a device."""
+    rates = {}
+    for name, kind in (("graspnet", GraspNetPlanner), ("graspnet6d", GraspNetFanPlanner)):
+        saved = load_graspnet(SHIPPED)
+        network = saved._replace(model=for_inference(saved.model).to(device))
+        critic = load_critic(CRITIC).to(device)
+        plan = kind(GripperGeometry(), Workspace(), network=network, critic=critic)
+        rates[f"plans of {name}, pile of {PILE}"] = 1000 / median_ms(plan, frames)
     return rates
 
 

@@ -5,7 +5,10 @@ This module knows nothing of robots, objects or tasks.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ import pybullet
 from envs.cell import DEFAULT_LIGHT, Camera, Image, Intrinsics
 from utils.errors import UserError
 
+_EGL = "_eglRendererPlugin"  # its name in its file
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z with y up
 
 
@@ -76,18 +80,14 @@ def projection_matrix(intrinsics: Intrinsics, renderer: int) -> list[float]:
 def load_renderer(client: int, choice: str) -> int:
     """PyBullet's number of the renderer to use: `tiny` (software), `egl` (GPU) or `auto`.
 
-    `auto` takes EGL only where there is a graphics card: on Mesa's software driver it is slower
-    than TinyRenderer at every size.
+    `auto` takes EGL only where there is a graphics card that draws by it: on Mesa's software
+    driver it is slower than TinyRenderer at every size. Raises UserError for `egl` where nothing
+    draws by it.
     """
     if choice == "tiny" or (choice == "auto" and not _has_gpu()):
         return pybullet.ER_TINY_RENDERER
-    module = importlib.util.find_spec("eglRenderer")
-    plugin = (
-        pybullet.loadPlugin(module.origin, "_eglRendererPlugin", physicsClientId=client)
-        if module is not None
-        else -1
-    )
-    if plugin >= 0:
+    plugin = _egl_plugin()
+    if plugin and pybullet.loadPlugin(plugin, _EGL, physicsClientId=client) >= 0:
         return pybullet.ER_BULLET_HARDWARE_OPENGL
     if choice == "egl":
         raise UserError(
@@ -95,6 +95,23 @@ def load_renderer(client: int, choice: str) -> int:
             "use sim.renderer=auto or sim.renderer=tiny"
         )
     return pybullet.ER_TINY_RENDERER
+
+
+@functools.cache
+def _egl_plugin() -> str | None:
+    """The file of PyBullet's EGL plugin; None where it cannot be loaded. That is tried in a process
+    of its own, which the plugin ends where it finds no EGL, as on servers with a card for
+    computing alone."""
+    module = importlib.util.find_spec("eglRenderer")
+    if module is None or module.origin is None:
+        return None
+    trial = (
+        "import pybullet, sys; client = pybullet.connect(pybullet.DIRECT); "
+        "sys.exit(pybullet.loadPlugin(*sys.argv[1:], physicsClientId=client) < 0)"
+    )
+    command = [sys.executable, "-c", trial, module.origin, _EGL]
+    failed = subprocess.run(command, capture_output=True, check=False).returncode
+    return None if failed else module.origin
 
 
 def _has_gpu() -> bool:

@@ -108,9 +108,10 @@ class GraspCritic(nn.Module):
     @torch.inference_mode()
     def chance(self, inputs: CriticInputs) -> np.ndarray:
         """(N,) chances in 0..1."""
-        facts, patches = (torch.from_numpy(part).split(_AT_ONCE) for part in inputs)
+        device = self.mean.device
+        facts, patches = (torch.from_numpy(part).to(device).split(_AT_ONCE) for part in inputs)
         parts = [self(*some) for some in zip(facts, patches)]
-        return torch.cat(parts).sigmoid().numpy().astype(float)
+        return torch.cat(parts).sigmoid().cpu().numpy().astype(float)
 
 
 def critic_inputs(

@@ -3,6 +3,7 @@
 import torch
 
 from benchmarks import bench_gpu
+from benchmarks.bench_planning import frames_of
 from utils.config import load_config
 
 
@@ -28,3 +29,11 @@ def test_the_time_of_a_call_is_the_median(monkeypatch):
     clock = iter([0, 10, 20, 30, 31, 40, 42, 50, 53])  # three warm-ups, of which no time is taken
     monkeypatch.setattr(bench_gpu, "perf_counter", lambda: next(clock))
     assert bench_gpu.median_seconds(lambda: None, bench_gpu.CPU, 3) == 2
+
+
+def test_plans_are_timed():
+    small = load_config(None, ["camera.width=64", "camera.height=64", "scene.count=1"])
+    seen = frames_of(small, 1, "primitives")
+    rates = bench_gpu.plans(seen, bench_gpu.CPU)
+    assert list(rates) == ["plans of graspnet, pile of 5", "plans of graspnet6d, pile of 5"]
+    assert min(rates.values()) > 0

@@ -1,5 +1,7 @@
 """Cameras: intrinsics by hand, rendered pixels against the pinhole model."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ import pybullet
 
 from envs.cell import Intrinsics
 from envs.pybullet_bodies import static_box
-from envs.pybullet_camera import PybulletCamera, load_renderer
+from envs.pybullet_camera import PybulletCamera, _egl_plugin, load_renderer
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, look_at, project
 
@@ -87,6 +89,17 @@ def test_renderer_choice(client, monkeypatch):
     assert load_renderer(client, "tiny") == pybullet.ER_TINY_RENDERER
     monkeypatch.setattr("envs.pybullet_camera._has_gpu", lambda: False)
     assert load_renderer(client, "auto") == pybullet.ER_TINY_RENDERER
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("envs.pybullet_camera._egl_plugin", lambda: None)
     with pytest.raises(UserError, match="sim.renderer=egl"):
         load_renderer(client, "egl")
+
+
+def test_a_card_that_draws_nothing_leaves_the_software_renderer(client, monkeypatch):
+    # Without EGL the plugin ends its process; the one that asks for it goes on.
+    monkeypatch.setattr("envs.pybullet_camera._has_gpu", lambda: True)
+    monkeypatch.setattr("sys.executable", shutil.which("false"))
+    _egl_plugin.cache_clear()
+    try:
+        assert load_renderer(client, "auto") == pybullet.ER_TINY_RENDERER
+    finally:
+        _egl_plugin.cache_clear()
