@@ -23,6 +23,7 @@ from tests.helpers.simulators import move, needs_pybullet
 from utils.config import load_config
 
 CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
+ANYWHERE = ["sim.renderer=tiny", "simulator=auto", "scene.simulator=auto"]  # not as it was trained
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_policies_lift_what_they_have_never_seen(objects):
 
 def test_fresh_episodes_are_at_full_difficulty(box, monkeypatch):
     """Though half of those of its training began near the box."""
-    config = config_of(box, ["env.max_steps=1", "sim.renderer=tiny"])
+    config = config_of(box, ["env.max_steps=1", *ANYWHERE])
     assert config.env.near_share == 0.5
     starts, reset = [], RobotGraspingEnv.reset
 
@@ -88,7 +89,7 @@ def test_the_policy_does_not_observe_the_box_s_pose(box):
 
 
 def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
-    policy, env = load_policy(box), make_env(config_of(box, ["sim.renderer=tiny"]))
+    policy, env = load_policy(box), make_env(config_of(box, ANYWHERE))
     observation, _ = env.reset(seed=1)
     before = policy.layout.read_one(observation)
     cell, inner = env.unwrapped.cell, env.unwrapped
