@@ -119,7 +119,7 @@ class FanPlanner(SearchPlanner):
         covered: whether something hangs over the table. Where nothing in any view meets the
         margins, relaxed ones serve.
         """
-        views = [maps(T_WV) for T_WV in self._frames(overhead, covered)]
+        views = [maps(T_WV) for T_WV in self._view_frames(overhead, covered)]
         for settings in (self.settings, self.settings.relaxed()):
             found: Sequence[Candidates] = [
                 self._search_view(heights, settings, value) for heights in views
@@ -138,7 +138,7 @@ class FanPlanner(SearchPlanner):
         """Whether one of the solids, in W, hangs over the table."""
         return any(solid.hangs(self.workspace.table_height) for solid in solids)
 
-    def _frames(self, overhead: HeightMap, covered: bool = False) -> Iterator[np.ndarray]:
+    def _view_frames(self, overhead: HeightMap, covered: bool = False) -> Iterator[np.ndarray]:
         """The fan's frames T_WV (4, 4), the one from above first. Those of a hand that comes nearly
         level are left out where nothing is high enough for it."""
         rises = overhead.height[overhead.label >= 0] - overhead.table_height

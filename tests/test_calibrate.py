@@ -13,13 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.calibrate import grasps_of, main
-from models.planners import (
-    CALIBRATIONS,
-)
-from utils.calibration import (
-    Calibration,
-    load_calibrations,
-)
+from models.planners import CALIBRATIONS
+from utils.calibration import Calibration, load_calibrations
 from utils.config import dump_config, load_config
 from utils.errors import UserError
 from utils.result_records import AttemptRecord, RoundRecord, append_round, read_rounds

@@ -422,5 +422,5 @@ def test_level_views_are_searched_where_something_is_high():
         plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
         truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
         overhead = height_map_from_scene(truth, Workspace())
-        frames = plan._frames(overhead)
+        frames = plan._view_frames(overhead)
         assert {round(np.degrees(np.arccos(T_WV[2, 2]))) for T_WV in frames} == tilts
