@@ -160,16 +160,13 @@ def judged_by(planner: Judged, frame: RGBDFrame) -> tuple[CriticInputs, np.ndarr
     which the search ranked them, and the grasps."""
     inputs, scores, grasps = [nothing()], [np.empty(0)], []
 
-    def judge(
-        maps: Sequence[HeightMap], found: Sequence[Candidates], seen: CriticInputs
-    ) -> np.ndarray:
+    def judge(heights: HeightMap, found: Candidates, seen: CriticInputs) -> np.ndarray:
         inputs.append(seen)
-        for heights, part in zip(maps, found):
-            scores.append(part.score)
-            for grasp in part.grasps(planner.gripper):
-                pose = heights.T_WV @ grasp.pose
-                grasps.append(Grasp.from_pose(pose, grasp.width, grasp.quality))
-        return np.ones(sum(len(part) for part in found))
+        scores.append(found.score)
+        for grasp in found.grasps(planner.gripper):
+            pose = heights.T_WV @ grasp.pose
+            grasps.append(Grasp.from_pose(pose, grasp.width, grasp.quality))
+        return np.ones(len(found))
 
     planner.judge = judge
     planner(frame)

@@ -32,8 +32,8 @@ from utils.transforms import DOWN, Grasp, RGBDFrame, inverse_pose
 
 Value = Callable[[HeightMap, Candidates], np.ndarray]
 """A factor (N,) on the scores of candidates that were found on a map."""
-Judge = Callable[[Sequence[HeightMap], Sequence[Candidates]], Sequence[Candidates]]
-"""The candidates of each view, best first, with other scores; perhaps fewer."""
+Judge = Callable[[HeightMap, Candidates], Candidates]
+"""The candidates of one view, best first, with other scores; perhaps fewer."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +119,11 @@ class FanPlanner(SearchPlanner):
         covered: whether something hangs over the table. Where nothing in any view meets the
         margins, relaxed ones serve.
         """
-        views = [maps(T_WV) for T_WV in self._view_frames(overhead, covered)]
+        views = list(self._views(overhead, maps, covered))
         for settings in (self.settings, self.settings.relaxed()):
-            found: Sequence[Candidates] = [
-                self._search_view(heights, settings, value) for heights in views
-            ]
-            if judge is not None:
-                found = judge(views, found)
-            grasps = [grasp for pair in zip(views, found) for grasp in self._in_world(*pair)]
+            grasps = []
+            for heights in views:
+                grasps += self._search_view(heights, settings, value, judge)
             if grasps:
                 return distinct(sorted(grasps, key=self._worth, reverse=True), self.fan)
         return []
@@ -138,27 +135,31 @@ class FanPlanner(SearchPlanner):
         """Whether one of the solids, in W, hangs over the table."""
         return any(solid.hangs(self.workspace.table_height) for solid in solids)
 
-    def _view_frames(self, overhead: HeightMap, covered: bool = False) -> Iterator[np.ndarray]:
-        """The fan's frames T_WV (4, 4), the one from above first. Those of a hand that comes nearly
-        level are left out where nothing is high enough for it."""
+    def _views(
+        self, overhead: HeightMap, maps: Callable[[np.ndarray], HeightMap], covered: bool = False
+    ) -> Iterator[HeightMap]:
+        """The maps of the fan, the one from above first. Those of a hand that comes nearly level
+        are left out where nothing is high enough for it."""
         rises = overhead.height[overhead.label >= 0] - overhead.table_height
         level = rises.max(initial=-np.inf) >= _LEVEL_FROM
         for approach in self.fan.directions(covered):
             if level or approach[2] <= -_LEVEL:
-                yield tilted_view(approach, self.workspace)
+                yield maps(tilted_view(approach, self.workspace))
 
     def _search_view(
-        self, heights: HeightMap, settings: SearchSettings, value: Value | None
-    ) -> Candidates:
+        self,
+        heights: HeightMap,
+        settings: SearchSettings,
+        value: Value | None,
+        judge: Judge | None,
+    ) -> list[Grasp]:
         tilt = np.arccos(np.clip(heights.T_WV[2, 2], -1.0, 1.0))
         on_map = None if value is None else lambda candidates: value(heights, candidates)
-        return search_once(
+        found = search_once(
             heights, self._with_wrist, self.workspace, settings, on_map, 2 if tilt > 0 else 1
         )
-
-    def _in_world(self, heights: HeightMap, found: Candidates) -> list[Grasp]:
-        """The best of a view's candidates as grasps in W, no two of them nearly alike."""
-        settings = self.settings
+        if judge is not None and len(found):
+            found = judge(heights, found)
         found = found.distinct(
             settings.returned, settings.distinct_distance, settings.distinct_turn
         )
@@ -233,15 +234,10 @@ class OracleFanPlanner(FanPlanner):
         def exact(T_WV: np.ndarray) -> HeightMap:
             return of_target(height_map_from_scene(truth, self.workspace, T_WV=T_WV))
 
-        def of_view(heights: HeightMap, found: Candidates) -> Candidates:
+        def by_contacts(heights: HeightMap, found: Candidates) -> Candidates:
             found = found.distinct(self.count, 0.004, np.deg2rad(8))
             scene = truth.transformed(inverse_pose(heights.T_WV))
             return scored_by_contacts(found, scene, self.gripper, buried)
-
-        def by_contacts(
-            views: Sequence[HeightMap], found: Sequence[Candidates]
-        ) -> list[Candidates]:
-            return [of_view(*pair) if len(pair[1]) else pair[1] for pair in zip(views, found)]
 
         covered = self.covered(truth.walls)
         grasps = self.search_fan(of_target(overhead), exact, None, by_contacts, covered)

@@ -11,7 +11,7 @@ the network has a centre head, its votes tell the objects apart (`models.graspne
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -69,7 +69,7 @@ PLANAR_JUDGED, VIEW_JUDGED = 40, 12
 JUDGED_DISTANCE, JUDGED_TURN = 0.01, np.deg2rad(20)
 LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
-Judge = Callable[[Sequence[HeightMap], Sequence[Candidates], CriticInputs], np.ndarray]
+Judge = Callable[[HeightMap, Candidates, CriticInputs], np.ndarray]
 
 
 def loaded(checkpoint: Path) -> SavedGraspNet:
@@ -85,41 +85,29 @@ def _loaded(path: Path, changed: float) -> SavedGraspNet:
 
 def chances_by(critic: GraspCritic) -> Judge:
     """A critic as the judge of candidates."""
-    return lambda maps, found, inputs: critic.chance(inputs)
+    return lambda heights, found, inputs: critic.chance(inputs)
 
 
 class Judged:
     """What the planners share whose candidates a critic may judge last (`models.grasp_critic`).
 
-    judge: from maps, their candidates and what the critic sees of all of these to their chances
-    (N,); None leaves the search's scores.
+    judge: from a map, candidates and what the critic sees of them to their chances (N,); None
+    leaves the search's scores.
     """
 
     gripper: GripperGeometry
     judge: Judge | None = None
 
     def judged(
-        self,
-        maps: Sequence[HeightMap],
-        found: Sequence[Candidates],
-        seen: NetworkView,
-        count: int,
-    ) -> Sequence[Candidates]:
-        """The best of each map's candidates, no two alike, scored by their chances."""
-        if self.judge is None or not any(len(part) for part in found):
+        self, heights: HeightMap, found: Candidates, seen: NetworkView, count: int
+    ) -> Candidates:
+        """The best of the candidates, no two alike, scored by their chances."""
+        if self.judge is None or len(found) == 0:
             return found
-        found = [part.distinct(count, JUDGED_DISTANCE, JUDGED_TURN) for part in found]
-        inputs = CriticInputs.joined(
-            [
-                critic_inputs(
-                    part, heights, seen.value(heights, part), seen.towards, self.gripper.least_held
-                )
-                for heights, part in zip(maps, found)
-            ]
-        )
-        ends = np.cumsum([len(part) for part in found])
-        chances = np.split(self.judge(maps, found, inputs), ends[:-1])
-        return [replace(part, score=chance).best(len(part)) for part, chance in zip(found, chances)]
+        found = found.distinct(count, JUDGED_DISTANCE, JUDGED_TURN)
+        value, least_held = seen.value(heights, found), self.gripper.least_held
+        inputs = critic_inputs(found, heights, value, seen.towards, least_held)
+        return replace(found, score=self.judge(heights, found, inputs)).best(len(found))
 
 
 class GraspNetPlanner(Judged, SearchPlanner):
@@ -156,7 +144,7 @@ class GraspNetPlanner(Judged, SearchPlanner):
         if len(heights.centres) == 0:  # table and walls alone
             return []
         count = max(PLANAR_JUDGED, self.settings.returned)
-        (found,) = self.judged([heights], [self.found(heights, seen)], seen, count)
+        found = self.judged(heights, self.found(heights, seen), seen, count)
         return self.grasps(found, frame.roughness)
 
     def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
@@ -242,9 +230,11 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)
 
-        judge = partial(self.judged, seen=seen, count=VIEW_JUDGED)
+        def of_view(heights: HeightMap, found: Candidates) -> Candidates:
+            return self.judged(heights, found, seen, VIEW_JUDGED)
+
         covered = self.covered(frame.fixtures)
-        grasps = self.search_fan(overhead, tilted, seen.value, judge, covered)
+        grasps = self.search_fan(overhead, tilted, seen.value, of_view, covered)
         return with_chances(grasps, self.calibration, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
 from utils.height_map import (
     WALL_LABEL,
+    HeightMap,
     height_map_from_frame,
     height_map_from_scene,
     tilted_height_map,
@@ -417,10 +419,14 @@ def test_the_fan_has_more_level_directions_below_a_board():
     assert counts == [{0: 1, 30: 8, 60: 8, 85: 4}, {0: 1, 30: 8, 60: 8, 85: 16}]
 
 
+def _exact_map(truth: SceneGeometry, T_WV: np.ndarray) -> HeightMap:
+    return height_map_from_scene(truth, Workspace(), T_WV=T_WV)
+
+
 def test_level_views_are_searched_where_something_is_high():
     for height, tilts in ((0.08, {0, 30, 60}), (0.12, {0, 30, 60, 85})):
         plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
         truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
         overhead = height_map_from_scene(truth, Workspace())
-        frames = plan._view_frames(overhead)
-        assert {round(np.degrees(np.arccos(T_WV[2, 2]))) for T_WV in frames} == tilts
+        views = plan._views(overhead, partial(_exact_map, truth))
+        assert {round(np.degrees(np.arccos(view.T_WV[2, 2]))) for view in views} == tilts
