@@ -38,14 +38,14 @@ VIEW_INPUTS = (
 OBJECT_INPUTS = ("extent_along", "extent_across", "edge")
 # At last the width at which the hand counts as empty (`GripperGeometry.least_held`).
 INPUTS = (*VIEW_INPUTS, *FACTS, *OBJECT_INPUTS, "least_held")
-_LEAST = 1e-6  # of scores and values, in their logarithms
+LEAST = 1e-6  # of scores and values, in their logarithms
 
-_STEP = 0.004  # m between the cells of a patch
-_ALONG, _ACROSS = 48, 24  # cells: the whole palm along the closing line, the fingers' surroundings
-_MOST = 0.1  # m over and under the fingertips, beyond which a height tells no more
+STEP = 0.004  # m between the cells of a patch
+ALONG, ACROSS = 48, 24  # cells: the whole palm along the closing line, the fingers' surroundings
+MOST = 0.1  # m over and under the fingertips, beyond which a height tells no more
 _LAYERS = 3  # of a patch: heights, ceilings, and where the grasp's own object is
 _AT_ONCE = 4096  # candidates
-_UNIT = 0.001  # m of a patch's heights, which are whole numbers
+UNIT = 0.001  # m of a patch's heights, which are whole numbers
 
 
 class CriticInputs(NamedTuple):
@@ -69,7 +69,7 @@ class CriticInputs(NamedTuple):
 
 def nothing() -> CriticInputs:
     """The inputs of no candidate."""
-    patches = np.empty((0, _LAYERS, _ACROSS, _ALONG), np.int8)
+    patches = np.empty((0, _LAYERS, ACROSS, ALONG), np.int8)
     return CriticInputs(np.empty((0, len(INPUTS)), np.float32), patches)
 
 
@@ -90,7 +90,7 @@ class GraspCritic(nn.Module):
             nn.Conv2d(_LAYERS, first, 5, stride=2, padding=2), nn.ReLU(),
             nn.Conv2d(first, second, 3, stride=2, padding=1), nn.ReLU(),
             nn.Conv2d(second, third, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Flatten(), nn.Linear(third * _ACROSS * _ALONG // 64, 64), nn.ReLU(),
+            nn.Flatten(), nn.Linear(third * ACROSS * ALONG // 64, 64), nn.ReLU(),
         )  # fmt: skip
         self.fact = nn.Sequential(nn.Linear(len(inputs), 64), nn.ReLU())
         self.layers = nn.Sequential(nn.Linear(128, 64), nn.ReLU(), nn.Linear(64, 1))
@@ -98,7 +98,7 @@ class GraspCritic(nn.Module):
     def forward(self, facts: torch.Tensor, patches: torch.Tensor) -> torch.Tensor:
         # Outside of what training has seen, a fact says no more than at its border.
         facts = ((facts - self.mean) / self.scale).clamp(-5, 5)
-        heights = patches[:, :2].float() * (_UNIT / 0.03)
+        heights = patches[:, :2].float() * (UNIT / 0.03)
         # What may be hidden is told by how far the ceiling lies over the surface.
         seen = torch.cat(
             [heights[:, :1], heights[:, 1:] - heights[:, :1], patches[:, 2:].float()], dim=1
@@ -136,18 +136,18 @@ def critic_inputs(
         np.abs(closing @ towards),
         np.full(count, -approach @ towards),
         np.full(count, towards[2]),
-        np.log(np.maximum(value, _LEAST)),
+        np.log(np.maximum(value, LEAST)),
         heights.rise(tip),
-        np.log(np.maximum(found.score, _LEAST)),
+        np.log(np.maximum(found.score, LEAST)),
         found.width,
         np.abs(found.turn),
     )
     facts = [*view, found.facts, *object_size(found, heights), np.full(count, least_held)]
-    u, v = (_STEP * (np.arange(cells) - (cells - 1) / 2) for cells in (_ALONG, _ACROSS))
+    u, v = (STEP * (np.arange(cells) - (cells - 1) / 2) for cells in (ALONG, ACROSS))
     where = cells_around(found.xy, along, across, u, v, heights)
     tips = found.tip[:, None, None]
     layers = [
-        np.rint(np.clip(surface.take(where) - tips, -_MOST, _MOST) / _UNIT)
+        np.rint(np.clip(surface.take(where) - tips, -MOST, MOST) / UNIT)
         for surface in (heights.height, heights.ceiling)
     ]
     layers.append(heights.label.take(where) == found.label[:, None, None])
@@ -166,8 +166,8 @@ def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:
         if not here.any():
             continue
         own = found.label == label
-        cells = np.argwhere(here)[:, ::-1]
-        outline = cv2.convexHull(cells.astype(np.int32))[:, 0]
+        row, column = np.divmod(np.flatnonzero(here), here.shape[1])
+        outline = cv2.convexHull(np.column_stack([column, row]).astype(np.int32))[:, 0]
         places = axes[:, own] @ (heights.cell * outline.T)  # (2, n, K)
         size[:2, own] = np.ptp(places, axis=2) + heights.cell
         size[2, own] = np.cbrt(over_table[here].sum() * heights.cell**2)

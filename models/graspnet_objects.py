@@ -67,7 +67,8 @@ def labelled_by_centres(
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
     if len(centres) == 0:
         return heights
-    miss = np.linalg.norm(votes[:, None] - centres, axis=2)
+    du, dv = (votes[:, k, None] - centres[:, k] for k in (0, 1))
+    miss = np.sqrt(du * du + dv * dv)
     count, owner = len(centres), miss.argmin(axis=1)
     owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
     label = np.minimum(heights.label, -1)  # table and walls stay
@@ -122,6 +123,9 @@ def vote_centres(
     least = settings.least / cell**2 / (2 * np.pi * settings.blur**2)  # all at one point, blurred
     peaks = local_maxima(density, settings.apart, least)
     found = np.column_stack(peaks[::-1]) - settings.margin
-    near = [np.abs(votes - place).max(axis=1) <= settings.apart for place in found]
+    near = [
+        np.maximum(*(np.abs(along - at) for along, at in zip(votes.T, place))) <= settings.apart
+        for place in found
+    ]
     # The blur may make a peak between votes that are all farther away.
     return np.array([votes[some].mean(axis=0) for some in near if some.any()]).reshape(-1, 2)

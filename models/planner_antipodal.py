@@ -16,7 +16,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from models.planner_candidates import Candidates, SearchSettings, with_chances
+from models.planner_candidates import Candidates, SearchSettings, grip_score, with_chances
 from utils.calibration import Calibration
 from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
@@ -25,8 +25,12 @@ from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap
 from utils.target import pixel_labels
 from utils.transforms import Grasp, RGBDFrame, transform_points
 
-_NOWHERE = -1e3  # m, under everything
-_UNSURE = 0.001  # m, by which `_thickness` may be wrong
+NOWHERE = -1e3  # m, under everything
+UNSURE = 0.001  # m, by which `_thickness` may be wrong
+EDGE_BLUR = 0.002  # m, standard deviation over the heights whose gradients are edges
+LINES = 9  # across a pad, along which contacts are looked for
+REACH = 0.004  # m beyond the open fingers that are looked at
+PALM_STEP = 0.006  # m between the points under the palm that are looked at
 
 
 class SearchPlanner:
@@ -141,16 +145,15 @@ def dense_candidates(
     size, middle = 2 * half + 1, heights.origin + cell * centre_cell
     # Gradients of the blurred map point across an edge whatever its height.
     slope = np.stack(
-        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), 0.002 / cell))[::-1], axis=-1
+        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), EDGE_BLUR / cell))[::-1], axis=-1
     )
-    slope /= np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9
     finger = np.ones(
         (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
     )
     palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
     # Only what stands on the table is gripped; the table itself is in the way of a tilted hand.
-    standing = np.where(heights.label == -1, _NOWHERE, heights.height).astype(np.float32)
+    standing = np.where(heights.label == -1, NOWHERE, heights.height).astype(np.float32)
     ground = float(heights.height.min())
     parts = []
     for angle in np.arange(settings.angles) * np.pi / settings.angles:
@@ -163,27 +166,26 @@ def dense_candidates(
                 image, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
                 borderValue=outside,
             )
-            for image, outside in ((heights.height, ground), (standing, _NOWHERE))
+            for image, outside in ((heights.height, ground), (standing, NOWHERE))
         )  # fmt: skip
         level, row, first, last = _runs(
             objects, levels, gripper.max_opening - 2 * settings.rooms[0], cell
         )
         tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
-        limit = tip - settings.clearance
-        free = np.zeros(len(tip), bool)
+        free = under_palm[row, centre] < tip - settings.clearance + gripper.palm_height
+        row, first, last, tip = row[free], first[free], last[free], tip[free]
+        limit, free = tip - settings.clearance, np.zeros(len(tip), bool)
         rooms = settings.rooms  # a sloping flank needs more room
         if gripper.opens_fully:
             rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
         for room in rooms:
             offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
-            left, right = (
-                np.clip(np.rint(at).astype(int), 0, size - 1)
-                for at in (first - offset, last + offset)
-            )
+            # Beside a wall it may be outside.
+            left = np.maximum(np.rint(first - offset).astype(int), 0)
+            right = np.minimum(np.rint(last + offset).astype(int), size - 1)
             fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
             free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
-        free &= under_palm[row, centre] < limit + gripper.palm_height
         row, first, last, tip = row[free], first[free], last[free], tip[free]
 
         base = middle + cell * (row - half)[:, None] * across
@@ -195,7 +197,8 @@ def dense_candidates(
         reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
         # Outward normals are minus the gradient: cosines against the closing line on both sides.
         facing = np.minimum(
-            slope[heights.index(at_first)] @ along, -slope[heights.index(at_last)] @ along
+            _unit(slope[heights.index(at_first)]) @ along,
+            -_unit(slope[heights.index(at_last)]) @ along,
         )
         inside = heights.label[heights.index(at_inside)]
         arm = np.abs((heights.centres[np.maximum(inside, -1), :2] - xy) @ across)
@@ -211,6 +214,11 @@ def dense_candidates(
             Candidates.rough(xy, np.full(len(tip), angle), tip, (last - first + 1) * cell, score)
         )
     return Candidates.joined(parts)
+
+
+def _unit(slope: np.ndarray) -> np.ndarray:
+    """(N, 2) slopes as unit vectors, and 0 where it is level."""
+    return slope / (np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9)
 
 
 def _levels(
@@ -237,18 +245,22 @@ def _runs(
     """
     rows = np.nonzero(turned.max(axis=1) > levels[0])[0]
     picked = np.arange(rows[0], rows[-1] + 1, 2) if len(rows) else rows
-    matter = turned[picked] > levels[:, None, None]
-    edge = np.diff(np.pad(matter, ((0, 0), (0, 0), (1, 1))).view(np.int8), axis=-1)
-    # np.nonzero of three axes is slower.
-    level, row, first = np.unravel_index(np.flatnonzero(edge == 1), edge.shape)
-    last = np.flatnonzero(edge == -1) % edge.shape[2] - 1
+    # No matter at both ends of a row, so that every run has a first and a last cell there.
+    columns = turned.shape[1] + 2
+    matter = np.zeros((len(levels), len(picked), columns), bool)
+    np.greater(turned[picked], levels[:, None, None], out=matter[..., 1:-1])
+    matter = matter.reshape(-1)
+    line, place = np.divmod(np.flatnonzero(matter[1:] != matter[:-1]), columns)
+    line, first, last = line[::2], place[::2], place[1::2] - 1
     found = []
     for bridge in range(3):
-        n = max(len(level) - bridge, 0)
-        fits = (level[:n] == level[bridge:]) & (row[:n] == row[bridge:])
+        n = max(len(line) - bridge, 0)
+        fits = line[:n] == line[bridge:]
         fits &= (last[bridge:] - first[:n] + 1) * cell < max_width + cell
-        found.append((level[:n][fits], picked[row[:n][fits]], first[:n][fits], last[bridge:][fits]))
-    return tuple(np.concatenate(column) for column in zip(*found))
+        found.append((line[:n][fits], first[:n][fits], last[bridge:][fits]))
+    line, first, last = (np.concatenate(column) for column in zip(*found))
+    level, row = np.divmod(line, max(len(picked), 1))
+    return level, picked[row], first, last
 
 
 def turn_onto_faces(
@@ -280,10 +292,10 @@ def measure(
     """
     N, tip = len(candidates), candidates.tip
     along, across = candidates.axes()
-    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + 0.004
+    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
     most = np.ceil(reach / heights.cell)
     u = np.arange(-most, most + 1) * heights.cell
-    v = np.linspace(-1, 1, 9) * gripper.finger_half_width
+    v = np.linspace(-1, 1, LINES) * gripper.finger_half_width
     where = cells_around(candidates.xy, along, across, u, v, heights)  # (N, V, U)
     height = heights.height.take(where)
     highest = height.max(axis=1)  # across the pads
@@ -328,7 +340,7 @@ def measure(
         left_over &= ~heights.beyond[heights.index(xy)]
     if gripper.least_held:
         thickness = _thickness(low_left, low_right, along, heights.cell)
-        left_over &= thickness > gripper.least_held + _UNSURE
+        left_over &= thickness > gripper.least_held + UNSURE
     if heights.fixed is not None:  # a fixture under an object that leans over it
         between = (u > left[:, None]) & (u < right[:, None])
         fixed = heights.fixed.take(where).max(axis=1)
@@ -356,15 +368,13 @@ def measure(
     over = heights.ceiling.take(where[left_over]) - under[:, None]
     covered[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
 
-    score = np.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
-    score *= np.exp(-((arm_across / 0.022) ** 2) - (arm_along / 0.06) ** 2 - (arm_up / 0.05) ** 2)
-    score *= 0.4 + 0.6 * cover
-    score *= np.clip(engagement / settings.good_engagement, 0.2, 1)
-    score *= np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0))
-    score *= np.exp(-settings.covered_weight * covered)
-    score *= np.where(ends[0] == ends[1], 1.0, settings.split_factor)
-    over_table = heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)]))
-    score *= 1 + 2 * np.clip(over_table, 0, 0.15)  # prefers the top of a pile
+    score = grip_score(
+        np, settings, wedge=wedge, turn=turn, tilt=tilt, arms=(arm_across, arm_along, arm_up),
+        cover=cover, engagement=engagement,
+        roomy=np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0)),
+        covered=covered, together=ends[0] == ends[1],
+        over_table=heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)])),
+    )  # fmt: skip
     feasible = np.zeros(N, bool)
     feasible[left_over] = True
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
@@ -379,9 +389,18 @@ def measure(
 
 def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
     """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
-    xy, along, across = (part.T[..., None, None] for part in (xy, along, across))
-    row, col = heights.index(np.moveaxis(xy + u * along + v[:, None] * across, 0, -1))
-    return row * heights.height.shape[1] + col
+    columns = heights.height.shape[1]
+    col, row = (
+        heights.nearest(
+            (xy[:, k, None] + u * along[:, k, None])[:, None]
+            + v[:, None] * across[:, k, None, None],
+            k,
+        )
+        for k in (0, 1)
+    )
+    row *= columns
+    row += col
+    return row.astype(np.intp)
 
 
 def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
@@ -436,7 +455,7 @@ def _widest_opening(
 
 
 def _palm_gap(
-    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = 0.006
+    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = PALM_STEP
 ) -> np.ndarray:
     """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
     # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one

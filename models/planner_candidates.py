@@ -158,3 +158,25 @@ class SearchSettings:
             max_wedge=max(self.max_wedge, RELAXED.max_wedge),
             min_facing=min(self.min_facing, 0.6),
         )
+
+
+def grip_score(
+    xp, settings: SearchSettings, *, wedge, turn, tilt, arms, cover, engagement, roomy, covered,
+    together, over_table,
+):  # fmt: skip
+    """(N,) scores of measured candidates, as arrays of xp, which is numpy or torch.
+
+    wedge, turn, tilt: (N,) radians, as in FACTS and `Candidates`; tilt of the worse face. arms:
+    three of (N,), m, across, along and up. cover: (N,) share of a pad in touch. engagement: (N,) m.
+    roomy: (N,) a factor for the room beside the contacts. covered: (N,) share of the hand.
+    together: (N,) whether both ends lie on one object. over_table: (N,) m, of the object's top.
+    """
+    across, along, up = arms
+    score = xp.exp(-((wedge / 0.25) ** 2) - (turn / 0.25) ** 2 - (tilt / 0.45) ** 2)
+    score = score * xp.exp(-((across / 0.022) ** 2) - (along / 0.06) ** 2 - (up / 0.05) ** 2)
+    score = score * (0.4 + 0.6 * cover)
+    score = score * (engagement / settings.good_engagement).clip(0.2, 1)
+    score = score * roomy
+    score = score * xp.exp(-settings.covered_weight * covered)
+    score = score * xp.where(together, 1.0, settings.split_factor)
+    return score * (1 + 2 * over_table.clip(0, 0.15))  # prefers the top of a pile

@@ -9,7 +9,7 @@ decides later what it can reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,13 +119,15 @@ class FanPlanner(SearchPlanner):
         covered: whether something hangs over the table. Where nothing in any view meets the
         margins, relaxed ones serve.
         """
-        views = list(self._views(overhead, maps, covered))
+        views = [maps(T_WV) for T_WV in self.frames(overhead, covered)]
         for settings in (self.settings, self.settings.relaxed()):
             grasps = []
             for heights in views:
                 grasps += self._search_view(heights, settings, value, judge)
             if grasps:
-                return distinct(sorted(grasps, key=self._worth, reverse=True), self.fan)
+                grasps = sorted(grasps, key=self._worth, reverse=True)
+                poses = np.array([grasp.pose for grasp in grasps])
+                return [grasps[kept] for kept in distinct(poses, self.fan)]
         return []
 
     def _worth(self, grasp: Grasp) -> float:
@@ -135,16 +137,16 @@ class FanPlanner(SearchPlanner):
         """Whether one of the solids, in W, hangs over the table."""
         return any(solid.hangs(self.workspace.table_height) for solid in solids)
 
-    def _views(
-        self, overhead: HeightMap, maps: Callable[[np.ndarray], HeightMap], covered: bool = False
-    ) -> Iterator[HeightMap]:
-        """The maps of the fan, the one from above first. Those of a hand that comes nearly level
-        are left out where nothing is high enough for it."""
+    def frames(self, overhead: HeightMap, covered: bool = False) -> list[np.ndarray]:
+        """The frames T_WV (4, 4) of the fan, the one from above first. Those of a hand that comes
+        nearly level are left out where nothing is high enough for it."""
         rises = overhead.height[overhead.label >= 0] - overhead.table_height
         level = rises.max(initial=-np.inf) >= _LEVEL_FROM
-        for approach in self.fan.directions(covered):
-            if level or approach[2] <= -_LEVEL:
-                yield maps(tilted_view(approach, self.workspace))
+        return [
+            tilted_view(approach, self.workspace)
+            for approach in self.fan.directions(covered)
+            if level or approach[2] <= -_LEVEL
+        ]
 
     def _search_view(
         self,
@@ -169,30 +171,28 @@ class FanPlanner(SearchPlanner):
         ]
 
 
-def distinct(grasps: Sequence[Grasp], fan: FanSettings) -> list[Grasp]:
-    """Non-maximum suppression of grasps, best first: at most `fan.returned`."""
-    kept: list[Grasp] = []
-    for grasp in grasps:
-        if len(kept) == fan.returned:
-            break
-        near = (
-            np.linalg.norm(grasp.position - other.position) < fan.distinct_distance
-            and turn_between(grasp, other) < fan.distinct_turn
-            for other in kept
-        )
-        if not any(near):
-            kept.append(grasp)
+def distinct(poses: np.ndarray, fan: FanSettings) -> list[int]:
+    """Non-maximum suppression of hands at poses T_WE (N, 4, 4), best first: the numbers of at most
+    `fan.returned` that are left."""
+    place = poses[:, :3, 3]
+    alike = np.linalg.norm(place[:, None] - place, axis=2) < fan.distinct_distance
+    alike &= turns_between(poses) < fan.distinct_turn
+    kept, free = [], np.ones(len(poses), bool)
+    while free.any() and len(kept) < fan.returned:
+        kept.append(int(free.argmax()))
+        free &= ~alike[kept[-1]]
+        free[kept[-1]] = False
     return kept
 
 
-def turn_between(first: Grasp, second: Grasp) -> float:
-    """Radians of the least turn that takes one grasp's hand to the other's, which may be flipped.
+def turns_between(poses: np.ndarray) -> np.ndarray:
+    """(N, N) radians of the least turn that takes the hand at one of the poses T_WE (N, 4, 4),
+    which may be flipped, to that at another.
 
     For rotations R and S: trace(R^T S) = 1 + 2 cos(turn).
     """
-    relative = first.pose[:3, :3].T @ second.pose[:3, :3]
-    x, y, z = np.diag(relative)
-    return float(np.arccos(np.clip((max(x + y, -x - y) + z - 1) / 2, -1, 1)))
+    x, y, z = (poses[:, :3, k] @ poses[:, :3, k].T for k in range(3))  # the diagonal of R^T S
+    return np.arccos(np.clip((np.maximum(x + y, -x - y) + z - 1) / 2, -1, 1))
 
 
 class HeuristicFanPlanner(FanPlanner):
@@ -200,8 +200,9 @@ class HeuristicFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        overhead = only_target(self.heights(frame), frame)
-        filled, hiding = without_holes(frame, self.workspace)
+        filled, hiding = holeless = without_holes(frame, self.workspace)
+        heights = height_map_from_frame(frame, self.workspace, below=True, holeless=holeless)
+        overhead = only_target(heights, frame)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)

@@ -10,6 +10,7 @@ the network has a centre head, its votes tell the objects apart (`models.graspne
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +21,9 @@ import cv2
 import numpy as np
 import torch
 
+from models import fan_search
+from models.fan_search import FanCandidates
+from models.fan_views import FanViews, fan_views
 from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
 from models.graspnet_inference import run_network, training_scale
@@ -27,7 +31,7 @@ from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_grasp
 from models.graspnet_objects import labelled_by_centres
 from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
 from models.planner_candidates import Candidates, SearchSettings, with_chances
-from models.planner_fan import SEARCH, FanPlanner, FanSettings
+from models.planner_fan import SEARCH, FanPlanner, FanSettings, distinct
 from utils.depth import (
     TABLE_FLATNESS,
     depth_of_plane,
@@ -50,8 +54,10 @@ from utils.transforms import (
     Grasp,
     RGBDFrame,
     deproject,
+    inverse_pose,
     known_depth,
     project,
+    top_down_pose,
     transform_points,
 )
 
@@ -204,7 +210,11 @@ JUDGED_FAN = FanSettings(tilt_scale=3.0)
 
 class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on each view's: the shipped one, unless `critic` is given."""
+    the last word on each view's: the shipped one, unless `critic` is given.
+
+    at_once: whether all views are searched in one pass where the network is, which pays on a GPU
+    (`models.fan_search`); frames with fixtures or a second look are searched view by view.
+    """
 
     def __init__(
         self,
@@ -217,7 +227,12 @@ class GraspNetFanPlanner(Judged, FanPlanner):
     ):
         super().__init__(gripper, workspace, seed, SEARCH, JUDGED_FAN)
         self.network = network or loaded(checkpoint)
-        self.judge = chances_by(critic or shipped_critic())
+        self.device = next(self.network.model.parameters()).device
+        self.critic = critic or shipped_critic()
+        if next(self.critic.parameters()).device != self.device:
+            self.critic = copy.deepcopy(self.critic).to(self.device)  # others use it where it is
+        self.judge = chances_by(self.critic)
+        self.at_once = self.device.type != "cpu"
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if not known_depth(frame.depth).any():
@@ -225,29 +240,63 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         frame = corrected(frame, self.workspace.table_height)
         seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)
-        filled, hiding = without_holes(seen.frame, self.workspace)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
-            return tilted_height_map(overhead, filled, hiding, T_WV)
+            return tilted_height_map(overhead, *seen.holeless, T_WV)
 
         def of_view(heights: HeightMap, found: Candidates) -> Candidates:
             return self.judged(heights, found, seen, VIEW_JUDGED)
 
-        covered = self.covered(frame.fixtures)
-        grasps = self.search_fan(overhead, tilted, seen.value, of_view, covered)
+        if self.at_once and not frame.fixtures and frame.second is None:
+            grasps = self._searched_at_once(seen, overhead)
+        else:
+            covered = self.covered(frame.fixtures)
+            grasps = self.search_fan(overhead, tilted, seen.value, of_view, covered)
         return with_chances(grasps, self.calibration, frame.roughness)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights
+
+    @torch.inference_mode()
+    def _searched_at_once(self, seen: NetworkView, overhead: HeightMap) -> list[Grasp]:
+        """As `search_fan`, all views together on the network's device."""
+        frames = np.stack(self.frames(overhead))
+        views = fan_views(overhead, *seen.holeless, frames, self.device)
+        for settings in (self.settings, self.settings.relaxed()):
+            found = fan_search.search_once(
+                views, self._with_wrist, self.workspace, settings, seen.values
+            )
+            if len(found):
+                break
+        else:
+            return []
+        found = found.distinct(VIEW_JUDGED, JUDGED_DISTANCE, JUDGED_TURN)
+        value = seen.values(views, found)
+        chance = fan_search.chances(
+            found, views, value, seen.towards, self.gripper.least_held, self.critic
+        )
+        found = replace(found, score=chance).best()
+        numbers = (found.view, found.xy, found.angle, found.tip, found.opening, found.score)
+        view, xy, angle, tip, opening, score = (part.cpu().numpy() for part in numbers)
+        tilt = np.arccos(np.clip(frames[:, 2, 2], -1.0, 1.0))[view]
+        height = tip + self.gripper.tip_below_centre
+        order = np.argsort(-score * self.fan.preference(tilt), kind="stable")
+        poses = np.array(
+            [frames[view[at]] @ top_down_pose((*xy[at], height[at]), angle[at]) for at in order]
+        )
+        return [
+            Grasp.from_pose(poses[kept], float(opening[order[kept]]), float(score[order[kept]]))
+            for kept in distinct(poses, self.fan)
+        ]
 
 
 class NetworkView:
     """What a network tells about a frame: heights with its objects, and the quality of candidates.
 
     The given frame is corrected by its table (`utils.depth_correction`). frame: the same, holes of
-    its depth filled where colours tell what is there. heights: the map from above. crop: whether
-    only the part of the image is looked at in which something stands. below: as in
-    `height_map_from_frame`. Where the frame has a second
+    its depth filled where colours tell what is there. holeless: that frame `without_holes`.
+    heights: the map from above. crop: whether only the part of the image is looked at in which
+    something stands. below: as in `height_map_from_frame`. Where the frame has a second
     one, its network maps serve for what the first does not show. towards: (3,) unit vector in W
     from the middle of the workspace to the camera. Raises UserError for an image that
     the network cannot take.
@@ -269,7 +318,10 @@ class NetworkView:
         self.frame = self._first.frame
         towards = frame.T_WC[:3, 3] - [*workspace.centre, table]
         self.towards = towards / np.linalg.norm(towards)
-        self.heights = height_map_from_frame(self.frame, workspace, below=below)
+        self.holeless = without_holes(self.frame, workspace)
+        self.heights = height_map_from_frame(
+            self.frame, workspace, below=below, holeless=self.holeless
+        )
         if network.model.centre_head is not None:
             offset = self._first.maps[3][0].numpy()
             scaling = self._first.scaling
@@ -296,6 +348,16 @@ class NetworkView:
             quality[hidden] = self._second.quality(ends[:, hidden])
         return np.maximum(quality, LEAST)
 
+    def values(self, views: FanViews, candidates: FanCandidates) -> torch.Tensor:
+        """(N,) the same of candidates in the views of a fan, by the first frame alone."""
+        view, (along, _) = candidates.view, candidates.axes()
+        height = views.height.flatten()[views.cells(view, candidates.xy)].double()
+        xy = candidates.xy + 0.01 * torch.stack([-along, along])
+        ends = torch.cat([xy, height[None, :, None].expand(2, -1, -1)], dim=2)
+        frames = views.T_WV[view]
+        ends = (frames[:, :3, :3] @ ends[..., None])[..., 0] + frames[:, :3, 3]
+        return self._first.qualities(ends).clamp(min=LEAST)
+
 
 class _Prediction:
     """A network's maps of one image. frame: as in `NetworkView`, the part that was looked at."""
@@ -306,12 +368,43 @@ class _Prediction:
             frame = around_matter(frame, table)
         self.frame = surfaces_in_holes(table_in_holes(frame, table))
         model = network.model
+        self._device = next(model.parameters()).device
         self.maps = run_network(model, self.frame, self.scaling, model.centre_head is not None)
 
     def quality(self, ends: np.ndarray) -> np.ndarray:
         """(N,) quality of closing along the lines between points (2, N, 3) in W."""
         pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
-        return quality_between(self.maps, *self.scaling.pixels(pixels))
+        return quality_between(self._blurred, self.maps[1], *self.scaling.pixels(pixels))
+
+    def qualities(self, ends: torch.Tensor) -> torch.Tensor:
+        """(N,) the same as tensors on the network's device."""
+        quality, angle = self._maps_there
+        to_image = self.scaling.intrinsics(self.frame.K) @ inverse_pose(self.frame.T_WC)[:3]
+        to_image, shift = to_image[:, :3].T, to_image[:, 3]
+        pixels = ends @ ends.new_tensor(to_image) + ends.new_tensor(shift)
+        depth = pixels[..., 2:]
+        ahead = (depth > 1e-9).all(dim=0)[:, 0]
+        start, end = pixels[..., :2] / torch.where(ahead[:, None], depth, 1.0)
+        rows, columns = quality.shape
+        column, row = ((start + end) / 2).round().long().T
+        column, row = column.clamp(0, columns - 1), row.clamp(0, rows - 1)
+        share = angle[:, row, column].softmax(dim=0) ** (1 / 3)
+        bins, each = len(share), torch.arange(len(row), device=ends.device)
+        du, dv = (end - start).T
+        place = torch.atan2(dv, du).remainder(np.pi) * bins / np.pi
+        below, part = place.floor().long(), place - place.floor()
+        at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
+        return torch.where(ahead, quality[row, column] * at / share.amax(dim=0), 0.0)
+
+    @functools.cached_property
+    def _maps_there(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The blurred quality (H, W) and the angles' logits (K, H, W), where the network is."""
+        return torch.from_numpy(self._blurred).to(self._device), self.maps[1][0].to(self._device)
+
+    @functools.cached_property
+    def _blurred(self) -> np.ndarray:
+        """(H, W) the quality."""
+        return cv2.GaussianBlur(self.maps[0][0, 0].numpy(), (0, 0), BLUR)
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
@@ -332,9 +425,10 @@ def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
 
 
 def quality_between(
-    maps: tuple[torch.Tensor, ...], start: np.ndarray, end: np.ndarray
+    quality: np.ndarray, angle: torch.Tensor, start: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
-    """(N,) quality of closing along the lines from `start` to `end` (N, 2), in the maps' pixels.
+    """(N,) quality of closing along the lines from `start` to `end` (N, 2), in pixels of the maps
+    quality (H, W) and angle (1, K, H, W), logits.
 
     It is the quality at a line's middle, times the quality of the line's angle relative to the best
     angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`).
@@ -342,10 +436,9 @@ def quality_between(
     """
     ahead = np.isfinite(start + end).all(axis=1)
     start, end = (np.where(ahead[:, None], pixels, 0.0) for pixels in (start, end))
-    quality = cv2.GaussianBlur(maps[0][0, 0].numpy(), (0, 0), BLUR)
     u, v = np.rint((start + end) / 2).astype(int).T
     u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
-    share = np.cbrt(maps[1][0, :, v, u].softmax(dim=0).numpy())
+    share = np.cbrt(angle[0, :, v, u].softmax(dim=0).numpy())
     bins, each = len(share), np.arange(len(u))
     du, dv = (end - start).T
     place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins

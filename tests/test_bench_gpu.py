@@ -35,5 +35,8 @@ def test_plans_are_timed():
     small = load_config(None, ["camera.width=64", "camera.height=64", "scene.count=1"])
     seen = frames_of(small, 1, "primitives")
     rates = bench_gpu.plans(seen, bench_gpu.CPU)
-    assert list(rates) == ["plans of graspnet, pile of 5", "plans of graspnet6d, pile of 5"]
+    assert list(rates) == [
+        "plans of graspnet, pile of 5", "plans of graspnet6d, pile of 5, view by view",
+        "plans of graspnet6d, pile of 5, all views at once",
+    ]  # fmt: skip
     assert min(rates.values()) > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from envs.rounds import checked_grasps
 from models.grasp_critic import INPUTS
 from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
-from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turn_between
+from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turns_between
 from models.planners import PLANNERS, make_planner
 from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame, shelf_frame
 from utils.config import DEFAULTS, load_config
@@ -26,7 +25,6 @@ from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
 from utils.height_map import (
     WALL_LABEL,
-    HeightMap,
     height_map_from_frame,
     height_map_from_scene,
     tilted_height_map,
@@ -50,6 +48,10 @@ def approach(tilt: float, turn: float) -> np.ndarray:
     return np.array([*out, -np.cos(np.deg2rad(tilt))])
 
 
+def between(first: Grasp, second: Grasp) -> float:
+    return turns_between(np.array([first.pose, second.pose]))[0, 1]
+
+
 # --- Poses ------------------------------------------------------------------------------------
 
 
@@ -69,7 +71,7 @@ def test_a_grasp_is_its_pose_whichever_finger_is_left(direction, angle, flipped)
     np.testing.assert_allclose(grasp.pose[:3, 2], direction, atol=1e-12)
     np.testing.assert_allclose(grasp.pose[:3, 1], grasp.closing_direction, atol=1e-12)
     again = Grasp.from_pose(grasp.pose @ FLIP if flipped else grasp.pose, 0.06, 0.5)
-    assert turn_between(grasp, again) < 1e-6
+    assert between(grasp, again) < 1e-6
     np.testing.assert_allclose(again.approach, direction, atol=1e-9)
     assert grasp.tilt == pytest.approx(np.arccos(-direction[2]), abs=1e-7)
 
@@ -83,7 +85,7 @@ def test_the_turn_between_grasps_is_that_of_their_hands(direction, angle, turn, 
     if turned[2, 2] < 0:  # not from below
         other = Grasp.from_pose(turned @ FLIP, 0.06, 0.5)
         grasp = Grasp.from_pose(T, 0.06, 0.5)
-        assert turn_between(grasp, other) == pytest.approx(turn, abs=1e-5)
+        assert between(grasp, other) == pytest.approx(turn, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +263,7 @@ def test_the_same_frame_gives_the_same_grasps_and_none_are_alike() -> None:
         assert 0 < grasp.width <= GripperGeometry().max_opening + 1e-9
         for other in first[:i]:
             apart = np.linalg.norm(grasp.position - other.position)
-            assert apart >= 0.01 or turn_between(grasp, other) >= np.deg2rad(20) - 1e-9
+            assert apart >= 0.01 or between(grasp, other) >= np.deg2rad(20) - 1e-9
 
 
 def test_an_empty_table_has_no_grasp() -> None:
@@ -419,14 +421,10 @@ def test_the_fan_has_more_level_directions_below_a_board():
     assert counts == [{0: 1, 30: 8, 60: 8, 85: 4}, {0: 1, 30: 8, 60: 8, 85: 16}]
 
 
-def _exact_map(truth: SceneGeometry, T_WV: np.ndarray) -> HeightMap:
-    return height_map_from_scene(truth, Workspace(), T_WV=T_WV)
-
-
 def test_level_views_are_searched_where_something_is_high():
     for height, tilts in ((0.08, {0, 30, 60}), (0.12, {0, 30, 60, 85})):
         plan = HeuristicFanPlanner(GripperGeometry(), Workspace())
         truth = boxes_frame([((0.05, 0.05, height), 0.0, (0.5, 0.0))]).truth
         overhead = height_map_from_scene(truth, Workspace())
-        views = plan._views(overhead, partial(_exact_map, truth))
-        assert {round(np.degrees(np.arccos(view.T_WV[2, 2]))) for view in views} == tilts
+        frames = plan.frames(overhead)
+        assert {round(np.degrees(np.arccos(T_WV[2, 2]))) for T_WV in frames} == tilts

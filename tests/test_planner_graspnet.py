@@ -91,20 +91,20 @@ def test_quality_between_two_pixels_is_that_of_their_angle() -> None:
     probability = torch.full((18,), 1e-12)
     probability[4], probability[5] = 8 / 9, 1 / 9
     angle = probability.log()[None, :, None, None].expand(1, 18, 40, 60)
-    maps = (torch.full((1, 1, 40, 60), 0.6), angle, torch.zeros(1, 1, 40, 60))
+    quality = np.full((40, 60), 0.6)
     for degrees, expected in ((40, 0.6), (220, 0.6), (50, 0.3), (45, 0.45), (100, 0.0)):
         step = 5 * np.array([[np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))]])
         middle = np.array([[30.0, 20.0]])
-        found = quality_between(maps, middle - step, middle + step)
+        found = quality_between(quality, angle, middle - step, middle + step)
         assert found == pytest.approx([expected], abs=1e-3)
 
 
 @pytest.mark.filterwarnings("error")
 def test_what_the_camera_cannot_see_has_no_quality() -> None:
     """Pixels of points behind the camera are NaN (`project`)."""
-    maps = (torch.ones(1, 1, 40, 60), torch.zeros(1, 18, 40, 60), torch.zeros(1, 1, 40, 60))
+    quality, angle = np.ones((40, 60)), torch.zeros(1, 18, 40, 60)
     start, end = np.array([[25.0, 20.0], [np.nan, np.nan]]), np.array([[35.0, 20.0], [30.0, 9.0]])
-    assert quality_between(maps, start, end) == pytest.approx([1.0, 0.0])
+    assert quality_between(quality, angle, start, end) == pytest.approx([1.0, 0.0])
 
 
 class FixedCentres(FixedMaps):

@@ -22,8 +22,8 @@ from utils.height_map import HeightMap
 
 _RIM = 0.004  # m of map beyond the hand around every grasp
 _SMALLEST_HALF = 0.004  # m, half the smallest opening that is tried
-_NEAR_FACE = 0.008  # m, lines across the pad within this gap belong to the face that is fitted
-_TOUCH = 0.0025  # m, and those within this gap touch it
+NEAR_FACE = 0.008  # m, lines across the pad within this gap belong to the face that is fitted
+TOUCH = 0.0025  # m, and those within this gap touch it
 _NOTHING = np.iinfo(np.int16).min  # in place of the label of what a line touches
 
 
@@ -356,7 +356,7 @@ def _faces(
     inner = np.int32(2)
     labels = np.concatenate([
         np.where(
-            gap < _TOUCH, turned.at(turned.label, index, lines[None], steps[end] + inward), _NOTHING
+            gap < TOUCH, turned.at(turned.label, index, lines[None], steps[end] + inward), _NOTHING
         )
         for gap, end, inward in zip(gaps, low[1:], (inner, -inner))
     ], axis=1)  # fmt: skip
@@ -378,7 +378,7 @@ def _first_matter(height: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, ..
 def contact_levels(tip: np.ndarray, engagement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two heights (...) in W at which the contacts of the pads are looked for: just over the
     fingertips `tip`, and up to 8 mm higher, within the `engagement` of the object."""
-    return tip + 0.001, tip + 0.5 * np.clip(engagement, 0.002, 0.016)
+    return tip + 0.001, tip + 0.5 * engagement.clip(0.002, 0.016)
 
 
 def fit_faces(
@@ -398,15 +398,15 @@ def fit_faces(
 
 def _fit_face(gap: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Slope (...) of the gaps (..., L) over the places v (L,), by least squares over those under
-    `_NEAR_FACE`; and the share (...) of lines in touch."""
-    weight = (gap < _NEAR_FACE).astype(float)
-    gap = np.where(gap < _NEAR_FACE, gap, 0.0)
+    `NEAR_FACE`; and the share (...) of lines in touch."""
+    weight = (gap < NEAR_FACE).astype(float)
+    gap = np.where(gap < NEAR_FACE, gap, 0.0)
     total = np.maximum(weight.sum(axis=-1), 1)
     mean_v = (weight * v).sum(axis=-1) / total
     spread = weight * (v - mean_v[..., None])
     variance = (spread * v).sum(axis=-1)
     slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < _TOUCH)).mean(axis=-1)
+    return slope, (weight * (gap < TOUCH)).mean(axis=-1)
 
 
 def _quality(

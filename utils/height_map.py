@@ -33,12 +33,12 @@ from utils.transforms import (
 
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
-_LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
 _HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
-_RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
+RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
 
 
@@ -76,12 +76,17 @@ class HeightMap:
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row and column (...) of the cells of points (..., 2); the nearest cell if outside."""
-        rows, cols = self.height.shape
-        col, row = (
-            np.clip(np.rint((xy[..., k] - self.origin[k]) / self.cell), 0, count - 1)
-            for k, count in enumerate((cols, rows))
-        )
-        return row.astype(np.intp), col.astype(np.intp)
+        col, row = (self.nearest(xy[..., k], k).astype(np.intp) for k in (0, 1))
+        return row, col
+
+    def nearest(self, place: np.ndarray, axis: int) -> np.ndarray:
+        """(...) whole floats: the cells along an axis, 0 of columns and 1 of rows, of places (...)
+        in metres; the nearest cell if outside."""
+        cells = np.asarray(place - self.origin[axis])
+        cells /= self.cell
+        np.rint(cells, out=cells)
+        np.maximum(cells, 0, out=cells)
+        return np.minimum(cells, self.height.shape[1 - axis] - 1, out=cells)
 
     def rise(self, points: np.ndarray) -> np.ndarray:
         """(...) metres of points (..., 3) in V over the table."""
@@ -142,6 +147,7 @@ def height_map_from_frame(
     cell: float = 0.002,
     margin: float = MARGIN,
     below: bool = False,
+    holeless: tuple[RGBDFrame, np.ndarray] | None = None,
 ) -> HeightMap:
     """The height map of a depth image from above; uses nothing of the frame but depth, K, T_WC and
     fixtures.
@@ -151,11 +157,11 @@ def height_map_from_frame(
     discontinuities; their centres are volume centroids of the columns between the table and the
     visible surface. below: whether fixtures that hang over the table are left out, so that what a
     camera at the side sees below them is an object of the map; no hand can come down to it from
-    above.
+    above. holeless: the frame `without_holes`, where that is known.
     """
     grid, origin = grid_points(workspace, margin, cell)
     table = float(workspace.table_height)
-    filled, hiding = without_holes(frame, workspace)
+    filled, hiding = holeless or without_holes(frame, workspace)
     if below:
         filled, hiding = _uncovered(filled, hiding, table)
     seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
@@ -232,7 +238,7 @@ def without_rims(
     window = np.ones((reach, reach))
     fixed = np.maximum(fixed, -FARTHEST)  # so that heights can be subtracted
     near = cv2.dilate(fixed, window)
-    edge = near - cv2.erode(fixed, window) > _LABEL_FLOOR
+    edge = near - cv2.erode(fixed, window) > LABEL_FLOOR
     edge &= height < near + _RIM_RISE
     count = np.bincount(label[label >= 0], minlength=_count(label))
     on_edge = np.bincount(label[(label >= 0) & edge], minlength=_count(label))
@@ -248,7 +254,7 @@ def _count(label: np.ndarray) -> int:
 
 def _bare(height: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """(R, C) bool: the surface there is that of a fixture. fixed: (R, C) the fixtures' tops."""
-    return height < cv2.dilate(fixed, np.ones((5, 5))) + _LABEL_FLOOR
+    return height < cv2.dilate(fixed, np.ones((5, 5))) + LABEL_FLOOR
 
 
 def tilted_height_map(
@@ -269,14 +275,14 @@ def tilted_height_map(
     surface = np.broadcast_arrays(origin[0] + cell * column, origin[1] + cell * row, seen.height)
     points = transform_points(T_WV, np.stack(surface, axis=-1))
     place = (points[..., :2] - origin) / cell
-    matter = points[..., 2] > overhead.table_height + _LABEL_FLOOR
+    matter = points[..., 2] > overhead.table_height + LABEL_FLOOR
     matter &= ((place >= 0) & (place <= (shape[1] - 1, shape[0] - 1))).all(axis=-1)
     label = np.where(matter, overhead.label[overhead.index(points[..., :2])], -1)
     hanging = [solid for solid in filled.fixtures if solid.hangs(overhead.table_height)]
     label = np.where(_hung(points, hanging), WALL_LABEL, label)
     # At the rim of an object its surface may lie beside its label.
     known = label != -1
-    rim = cv2.dilate(known.astype(np.uint8), np.ones((2 * _RIM + 1, 2 * _RIM + 1))) > 0
+    rim = cv2.dilate(known.astype(np.uint8), np.ones((2 * RIM + 1, 2 * RIM + 1))) > 0
     rim &= matter & ~known
     if rim.any():
         label = np.where(rim, nearest_values(label, known), label)
@@ -355,7 +361,7 @@ def _tops(
 
 
 def label_pieces(
-    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = _LABEL_FLOOR
+    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = LABEL_FLOOR
 ) -> np.ndarray:
     """(R, C) labels of the pieces higher than `floor` over the table, cut where neighbouring cells
     differ by `step`, all in metres.

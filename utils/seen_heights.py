@@ -44,6 +44,10 @@ _HIDDEN_BEHIND = 0.01  # m, by which a point has to lie behind a surface to be h
 _CARVED = 2  # cells of height that are carved from a ceiling at once
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
 FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
+BORROWED_WITHIN = 0.02  # m, within which a hidden cell takes the lowest surface
+GRAZING_JUMP = 0.006  # m of depth between neighbouring pixels, at which a ray grazes an edge
+GRAZING_SHARES = 60  # points on such a ray, at most
+SUBPIXELS = 2  # points along each side of the square that a pixel stands for
 
 
 @dataclass(frozen=True)
@@ -195,7 +199,9 @@ def _filled(seen: np.ndarray, slope: np.ndarray, cell: float) -> np.ndarray:
     the lowest surface within 2 cm, so that an occluded flank does not widen the object."""
     hidden = ~np.isfinite(seen)
     # OpenCV pads with the largest float, which a cell far outside the view would inherit.
-    lowest = cv2.erode(np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(0.02 / cell))
+    lowest = cv2.erode(
+        np.where(hidden, np.inf, seen), np.ones((3, 3)), iterations=int(BORROWED_WITHIN / cell)
+    )
     return np.maximum(np.where(hidden, np.where(lowest < 1e3, lowest, slope), seen), slope)
 
 
@@ -293,21 +299,26 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
 def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
     """(R, C) float32 highest z of the points in each cell; -inf where there is none.
 
-    Each part holds columns and rows, in cells, and z (metres) of points, (3, ...).
+    Each part holds columns and rows, in cells, and z (metres) of points, (3, ...); it is
+    overwritten.
     """
     rows, cols = shape
     height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for points outside
     for col, row, z in parts:
-        index = np.rint(np.clip(row, -1, rows)) + 1
-        index *= cols + 2
-        index += np.rint(np.clip(col, -1, cols)) + 1
-        index, z = index.astype(np.intp), z.astype(np.float32)
+        for place, count in ((col, cols), (row, rows)):
+            np.clip(place, -1, count, out=place)
+            np.rint(place, out=place)
+        row += 1
+        row *= cols + 2
+        row += col
+        row += 1
+        index, z = row.astype(np.intp), z.astype(np.float32)
         np.maximum.at(height.reshape(-1), index.ravel(), z.ravel())
     return height[1:-1, 1:-1]
 
 
 def _surface_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int = 2
+    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int = SUBPIXELS
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Columns, rows and z (H, W) of points, split x split times: each pixel stands for that many
     points of its square, because it covers about 2 mm of the table and single points would leave
@@ -323,16 +334,18 @@ def _surface_points(
     v, u = (np.arange(count, dtype=float) for count in depth.shape)
     sub = (np.arange(split) + 0.5) / split - 0.5
     for dv, du in itertools.product(sub, sub):
-        col, row, z = (
-            depth * ((a * (u + du) + c) + (b * (v + dv))[:, None]) + d
-            for a, b, c, d in zip(by_u, by_v, axis, start)
-        )
-        z[unknown] = -np.inf
-        yield col, row, z
+        points = []
+        for a, b, c, d in zip(by_u, by_v, axis, start):
+            along = (a * (u + du) + c) + (b * (v + dv))[:, None]
+            along *= depth
+            along += d
+            points.append(along)
+        points[2][unknown] = -np.inf
+        yield tuple(points)
 
 
 def _grazing_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = 0.006
+    frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = GRAZING_JUMP
 ) -> Iterator[np.ndarray]:
     """Columns, rows and z (3, S, N) of points on the rays between neighbouring pixels whose depths
     differ by a jump: beside each other, and one below the other."""
@@ -351,5 +364,5 @@ def _grazing_points(
         for end in (near, far):
             end[:2] = (end[:2] - origin[:, None]) / cell
         cells = np.linalg.norm((far - near)[:2], axis=0).max()
-        share = np.linspace(0, 1, int(np.clip(2 * cells, 2, 60)))[:, None]
+        share = np.linspace(0, 1, int(np.clip(2 * cells, 2, GRAZING_SHARES)))[:, None]
         yield near[:, None] + share * (far - near)[:, None]
