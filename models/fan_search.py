@@ -187,19 +187,16 @@ def dense_candidates(
     free = torch.nonzero(at(palm, centre, every) < tip - settings.clearance + gripper.palm_height)[
         :, 0
     ]
-    fits = torch.zeros(len(free), dtype=torch.bool, device=device)
-    rooms: Sequence[float | torch.Tensor] = settings.rooms
+    length, limit = (last[free] - first[free] + 1) * cell, tip[free] - settings.clearance
+    rooms = tip.new_tensor(settings.rooms)[:, None]  # (rooms, M) from here on
     if gripper.opens_fully:
-        rooms = ((gripper.max_opening - (last[free] - first[free] + 1) * cell) / 2,)
-    for room in rooms:
-        offset = (room + thickness / 2) / cell
-        left = (first[free] - offset).round().long().clamp(min=0)
-        right = (last[free] + offset).round().long().clamp(max=size - 1)
-        limit = tip[free] - settings.clearance
-        open_there = (at(finger, left, free) < limit) & (at(finger, right, free) < limit)
-        wide = (last[free] - first[free] + 1) * cell + 2 * room < gripper.max_opening + 2 * cell
-        fits |= open_there & wide
-    free = free[fits]
+        rooms = (gripper.max_opening - length[None]) / 2
+    offset = (rooms + thickness / 2) / cell
+    left = (first[free] - offset).round().long().clamp(min=0)
+    right = (last[free] + offset).round().long().clamp(max=size - 1)
+    fits = (at(finger, left, free) < limit) & (at(finger, right, free) < limit)
+    fits &= length + 2 * rooms < gripper.max_opening + 2 * cell
+    free = free[fits.any(dim=0)]
     view, turn, row, tip = view[free], turn[free], row[free], tip[free]
     first, last, image = first[free], last[free], image[free]
 
@@ -242,7 +239,7 @@ def _levels(
     views: FanViews, on_objects: torch.Tensor, gripper: GripperGeometry, settings: SearchSettings
 ) -> torch.Tensor:
     """(B, L) heights of the fingertips to try in each view, at least one; infinite beyond those."""
-    lowest = torch.where(on_objects, views.table(), torch.inf).amin(dim=(1, 2)).double()
+    lowest = torch.where(on_objects, views.table, torch.inf).amin(dim=(1, 2)).double()
     lowest = lowest + settings.table_clearance
     low = torch.where(on_objects, views.height, torch.inf).amin(dim=(1, 2))
     high = torch.where(on_objects, views.height, -torch.inf).amax(dim=(1, 2))
@@ -382,7 +379,7 @@ def measure(
         mixed = other.flatten()[where] & (height > tip[:, None, None]) & between[:, None]
         good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
     near = (u - shift[:, None]).abs()
-    around = highest_within(views.height, 1).flatten()[where].amax(dim=1)
+    around = views.highest_beside.flatten()[where].amax(dim=1)
     opening = _widest_opening(around, near, tip, width, gripper, settings)
     good &= opening > 0
     gap = _palm_gap(xy, view, along, across, views, gripper)
@@ -473,31 +470,15 @@ def _widest_opening(
 
 def _palm_gap(xy, view, along, across, views: FanViews, gripper: GripperGeometry) -> torch.Tensor:
     """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
-    radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
-    scene = _highest_in_disc(views.ceiling, radius).flatten()
     u, v = (
         np.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1)
         for end in (gripper.palm_half_length, gripper.palm_outline[-1][0])
     )
     underside, u, v = (xy.new_tensor(part) for part in (gripper.palm_underside(v), u, v))
+    radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
+    scene = views.ceiling_within(radius).flatten()
     nearby = scene[cells_around(xy, view, along, across, u, v, views)].amax(dim=2)
     return (underside - nearby).amin(dim=1)
-
-
-def _highest_in_disc(image: torch.Tensor, radius: int) -> torch.Tensor:
-    """(B, R, C) highest value within OpenCV's disc of a radius in cells."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    highest = torch.full_like(image, -torch.inf)
-    rows, columns = image.shape[1:]
-    padded = F.pad(image[:, None], (radius,) * 4, value=-torch.inf)[:, 0]
-    for half in np.unique(disc.sum(axis=1) // 2):  # rows of the disc that are as long
-        lines = np.flatnonzero(disc.sum(axis=1) // 2 == half)
-        wide = F.max_pool2d(padded, (1, 2 * int(half) + 1), stride=1)
-        first = radius - int(half)
-        for line in lines:
-            part = wide[:, line : line + rows, first : first + columns]
-            highest = torch.maximum(highest, part)
-    return highest
 
 
 def _outline(outline: Sequence[tuple[float, float]], outward: torch.Tensor) -> torch.Tensor:
@@ -568,7 +549,7 @@ def _object_size(found: FanCandidates, views: FanViews) -> torch.Tensor:
         most = torch.where(here, place, -torch.inf).amax(dim=1)
         least = torch.where(here, place, torch.inf).amin(dim=1)
         sizes.append((most - least + views.cell).clamp(min=0))
-    over_table = (views.height - views.table()).clamp(min=0).flatten(1)[found.view]
+    over_table = (views.height - views.table).clamp(min=0).flatten(1)[found.view]
     volume = torch.where(here, over_table, 0.0).sum(dim=1) * views.cell**2
     return torch.stack([*sizes, volume.double() ** (1 / 3)]).double()
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -47,6 +48,7 @@ class FanViews:
     cell: float
     table_height: float
     beyond: torch.Tensor | None = None
+    _ceiling_within: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.height)
@@ -72,10 +74,22 @@ class FanViews:
         up = self.T_WV[view, 2]
         return (points * up[:, :3]).sum(dim=1) + (up[:, 3] - self.table_height)
 
+    @functools.cached_property
     def table(self) -> torch.Tensor:
         """(B, R, C) float32 metres in V of the table."""
         shape = self.height.shape[1:]
         return _table_slopes(self.T_WV, shape, self.origin, self.cell, self.table_height)
+
+    @functools.cached_property
+    def highest_beside(self) -> torch.Tensor:
+        """(B, R, C) the highest surface of each cell and of the eight beside it."""
+        return highest_within(self.height, 1)
+
+    def ceiling_within(self, radius: int) -> torch.Tensor:
+        """(B, R, C) the highest ceiling within `radius` cells. The result is kept."""
+        if radius not in self._ceiling_within:
+            self._ceiling_within[radius] = _highest_in_disc(self.ceiling, radius)
+        return self._ceiling_within[radius]
 
     def part(self, first: int, end: int) -> FanViews:
         """The maps of some of the views."""
@@ -242,6 +256,22 @@ def highest_within(
     padded = F.pad(image[:, None], (left, right, above, below), value=-torch.inf)
     padded = F.max_pool2d(padded, (above + below + 1, 1), stride=1)
     return F.max_pool2d(padded, (1, left + right + 1), stride=1)[:, 0]
+
+
+def _highest_in_disc(image: torch.Tensor, radius: int) -> torch.Tensor:
+    """(B, R, C) highest value within OpenCV's disc of a radius in cells."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    highest = torch.full_like(image, -torch.inf)
+    rows, columns = image.shape[1:]
+    padded = F.pad(image[:, None], (radius,) * 4, value=-torch.inf)[:, 0]
+    for half in np.unique(disc.sum(axis=1) // 2):  # rows of the disc that are as long
+        lines = np.flatnonzero(disc.sum(axis=1) // 2 == half)
+        wide = F.max_pool2d(padded, (1, 2 * int(half) + 1), stride=1)
+        first = radius - int(half)
+        for line in lines:
+            part = wide[:, line : line + rows, first : first + columns]
+            highest = torch.maximum(highest, part)
+    return highest
 
 
 def _known(depth: torch.Tensor) -> torch.Tensor:

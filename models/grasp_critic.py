@@ -160,13 +160,15 @@ def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:
     """(3, N) OBJECT_INPUTS of candidates; 0 for those of no object."""
     size = np.zeros((len(OBJECT_INPUTS), len(found)))
     axes = np.stack(found.axes())
-    over_table = np.maximum(heights.height - heights.table(), 0.0)
+    cells = np.flatnonzero(heights.label >= 0)
+    owner = heights.label.take(cells)
+    over_table = np.maximum(heights.height.take(cells) - heights.table().take(cells), 0.0)
     for label in np.unique(found.label[found.label >= 0]):
-        here = heights.label == label
+        here = owner == label
         if not here.any():
             continue
         own = found.label == label
-        row, column = np.divmod(np.flatnonzero(here), here.shape[1])
+        row, column = np.divmod(cells[here], heights.label.shape[1])
         outline = cv2.convexHull(np.column_stack([column, row]).astype(np.int32))[:, 0]
         places = axes[:, own] @ (heights.cell * outline.T)  # (2, n, K)
         size[:2, own] = np.ptp(places, axis=2) + heights.cell

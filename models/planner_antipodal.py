@@ -16,7 +16,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from models.planner_candidates import Candidates, SearchSettings, grip_score, with_chances
+from models.planner_candidates import Candidates, SearchSettings, grip_score
 from utils.calibration import Calibration
 from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
@@ -80,7 +80,9 @@ class SearchPlanner:
         frame that they were found in."""
         settings = self.settings
         kept = found.distinct(settings.returned, settings.distinct_distance, settings.distinct_turn)
-        return with_chances(kept.grasps(self.gripper), self.calibration, roughness)
+        if self.calibration is not None:
+            kept = replace(kept, score=self.calibration(kept.score, roughness))
+        return kept.grasps(self.gripper)
 
 
 def search(
@@ -283,12 +285,18 @@ def turn_onto_faces(
 
 
 def measure(
-    candidates: Candidates, heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings
+    candidates: Candidates,
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+    depths: int = 1,
 ) -> Candidates:
     """The candidates posed on the map, centred between their contacts, and scored.
 
     The pads are flat: a pad stops where the first of the lines across it meets matter. The slope of
     the contacts across the pad gives the angle to the face, their shift with height its tilt.
+    depths: how many times the same places and angles follow each other, at other heights of the
+    fingertips.
     """
     N, tip = len(candidates), candidates.tip
     along, across = candidates.axes()
@@ -296,9 +304,15 @@ def measure(
     most = np.ceil(reach / heights.cell)
     u = np.arange(-most, most + 1) * heights.cell
     v = np.linspace(-1, 1, LINES) * gripper.finger_half_width
-    where = cells_around(candidates.xy, along, across, u, v, heights)  # (N, V, U)
+    once = N // depths
+    where = cells_around(
+        candidates.xy[:once], along[:once], across[:once], u, v, heights
+    )  # (N, V, U)
     height = heights.height.take(where)
     highest = height.max(axis=1)  # across the pads
+    if depths > 1:
+        where, height = (np.tile(part, (depths, 1, 1)) for part in (where, height))
+        highest = np.tile(highest, (depths, 1))
 
     # Contacts, searched a little beyond the width that the candidate claims.
     window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]

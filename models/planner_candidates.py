@@ -91,7 +91,8 @@ class Candidates:
 
     def distinct(self, count: int, distance: float, angle: float) -> Candidates:
         """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
-        apart = np.linalg.norm(self.xy[:, None] - self.xy, axis=2) >= distance
+        dx, dy = (along[:, None] - along for along in self.xy.T)
+        apart = np.sqrt(dx * dx + dy * dy) >= distance
         apart |= angle_difference(self.angle[:, None], self.angle) >= angle
         kept, free = [], np.ones(len(self), bool)
         while free.any() and len(kept) < count:

@@ -175,7 +175,9 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         rough = self._at_peaks(seen.peaks(PEAKS), heights)
         rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
         for settings in (self.settings, self.settings.relaxed()):
-            found = measure(self._at_depths(rough, settings), heights, self.gripper, settings)
+            found = measure(
+                self._at_depths(rough, settings), heights, self.gripper, settings, len(DEPTH_STEPS)
+            )
             found = found.best(settings.finalists)
             if len(found):
                 found = turn_onto_faces(found, heights, self.gripper, settings)
@@ -438,10 +440,11 @@ def quality_between(
     start, end = (np.where(ahead[:, None], pixels, 0.0) for pixels in (start, end))
     u, v = np.rint((start + end) / 2).astype(int).T
     u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
-    share = np.cbrt(angle[0, :, v, u].softmax(dim=0).numpy())
+    share = angle[0, :, v, u].softmax(dim=0).numpy()
     bins, each = len(share), np.arange(len(u))
     du, dv = (end - start).T
     place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
     below, part = np.floor(place).astype(int), place - np.floor(place)
-    at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
-    return np.where(ahead, quality[v, u] * at / share.max(axis=0), 0.0)
+    at = (1 - part) * np.cbrt(share[below % bins, each])
+    at += part * np.cbrt(share[(below + 1) % bins, each])
+    return np.where(ahead, quality[v, u] * at / np.cbrt(share.max(axis=0)), 0.0)

@@ -82,7 +82,7 @@ def test_the_maps_are_those_of_each_view(noise, holes) -> None:
             other = np.abs(found - expected) > 1e-4
             assert other.mean() < 1e-3, (number, name, other.sum())
         np.testing.assert_allclose(views.centres[number].numpy(), heights.centres, atol=1e-12)
-        np.testing.assert_allclose(views.table()[number].numpy(), heights.table(), atol=1e-6)
+        np.testing.assert_allclose(views.table[number].numpy(), heights.table(), atol=1e-6)
 
 
 @given(st.integers(0, 3), st.integers(0, 2), st.integers(0, 4), st.integers(0, 2**31))
