@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields, replace
 
 import cv2
@@ -26,6 +27,7 @@ from utils.seen_heights import without_holes
 from utils.transforms import DOWN, RGBDFrame, look_at
 
 CPU = torch.device("cpu")
+GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 BOXES = [
     ((0.05, 0.05, 0.05), 0.4, (0.47, 0.03)),
     ((0.03, 0.10, 0.12), 1.0, (0.56, -0.05)),
@@ -179,13 +181,17 @@ def assert_same(found: FanCandidates, expected: Candidates) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
-def test_the_grasps_are_those_of_one_view_after_the_other(noise: float) -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
-    assert not planner.at_once, "on a CPU NumPy is quicker"
-    frame = frame_of(noise)
-    expected = planner(frame)
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=GPU)])
+def test_the_grasps_are_those_of_one_view_after_the_other(device: str, noise: float) -> None:
+    by_view = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    assert not by_view.at_once, "on two cores NumPy is quicker"
+    saved = by_view.network
+    saved = saved._replace(model=copy.deepcopy(saved.model).to(device))
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), network=saved)
+    assert planner.at_once == (device == "cuda")
     planner.at_once = True
-    found = planner(frame)
+    frame = frame_of(noise)
+    expected, found = by_view(frame), planner(frame)
     assert len(found) == len(expected) == planner.fan.returned
     assert found[0].quality == pytest.approx(expected[0].quality, abs=0.01)
     turns = turns_between(np.array([grasp.pose for grasp in (*expected, *found)]))
