@@ -96,8 +96,8 @@ def plans(frames: Sequence[RGBDFrame], device: torch.device) -> dict[str, float]
     planar = GraspNetPlanner(*hand_and_table, network=network, critic=critic)
     fan = GraspNetFanPlanner(*hand_and_table, network=network, critic=critic)
     rates = {f"plans of graspnet, pile of {PILE}": 1000 / median_ms(planar, frames)}
-    for fan.at_once in (False, True):
-        way = "all views at once" if fan.at_once else "view by view"
+    for way, at_once in (("view by view", False), ("all views at once", True)):
+        fan.at_once = at_once
         rates[f"plans of graspnet6d, pile of {PILE}, {way}"] = 1000 / median_ms(fan, frames)
     return rates
 

@@ -30,7 +30,8 @@ Value = Callable[["FanViews", "FanCandidates"], torch.Tensor]
 
 @dataclass
 class FanCandidates:
-    """N candidate grasps of several views: view (N,) int64, the others as of `Candidates`."""
+    """N candidate grasps of several views: view (N,) int64; value (N,) the factor that a `Value`
+    gave them; the others as of `Candidates`."""
 
     view: torch.Tensor
     xy: torch.Tensor
@@ -42,12 +43,14 @@ class FanCandidates:
     label: torch.Tensor
     score: torch.Tensor
     facts: torch.Tensor
+    value: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.angle)
 
     @staticmethod
     def joined(parts: Sequence[FanCandidates]) -> FanCandidates:
+        """All candidates of several lists."""
         return FanCandidates(
             *(
                 torch.cat([getattr(part, field.name) for part in parts])
@@ -56,6 +59,7 @@ class FanCandidates:
         )
 
     def take(self, index: torch.Tensor) -> FanCandidates:
+        """Those with the numbers `index` (M,)."""
         return FanCandidates(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def axes(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -112,13 +116,19 @@ def search_once(
 ) -> FanCandidates:
     """Feasible candidates of all views, the first of which is the one from above, measured and
     scored, view by view and best first."""
-    upright = dense_candidates(views.part(0, 1), gripper, workspace, settings)
-    tilted = dense_candidates(views.part(1, len(views)).every(2), gripper, workspace, settings)
-    found = FanCandidates.joined([upright, replace(tilted, view=tilted.view + 1)])
-    found = replace(found, score=found.score * value(views, found)).best(settings.shortlist)
+    found = dense_candidates(views.part(0, 1), gripper, workspace, settings)
+    if len(views) > 1:
+        tilted = views.part(1, len(views)).every(2)
+        tilted = dense_candidates(tilted, gripper, workspace, settings)
+        found = FanCandidates.joined([found, replace(tilted, view=tilted.view + 1)])
+    found = _valued(found, value(views, found)).best(settings.shortlist)
     found = measure(found, views, gripper, settings).best(settings.finalists)
     found = turn_onto_faces(found, views, gripper, settings)
-    return replace(found, score=found.score * value(views, found)).best()
+    return _valued(found, value(views, found)).best()
+
+
+def _valued(found: FanCandidates, value: torch.Tensor) -> FanCandidates:
+    return replace(found, score=found.score * value, value=value)
 
 
 def dense_candidates(
@@ -137,10 +147,10 @@ def dense_candidates(
     last = torch.where(on_objects.any(dim=1).any(dim=1, keepdim=True), last, first)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
     beside = (gripper.max_opening if gripper.opens_fully else max(settings.rooms)) + 2 * thickness
-    if bool((views.label == OTHER_LABEL).any()):
+    if views.others:
         beside += gripper.palm_half_length
     half = int((last - first).double().norm(dim=1).max() / 2 + beside / cell) + 2
-    size, middle = 2 * half + 1, _pair(views.origin, device) + cell * centre_cell
+    size, middle = 2 * half + 1, _pair(views.origin, device) + cell * centre_cell.double()
 
     # Every view at every angle.
     angles = torch.arange(settings.angles, dtype=torch.float64, device=device)
@@ -182,29 +192,30 @@ def dense_candidates(
     def at(images: torch.Tensor, column: torch.Tensor, some: torch.Tensor) -> torch.Tensor:
         return images.flatten()[(image[some] * size + row[some]) * size + column]
 
+    length = (last - first + 1).double() * cell
     centre = ((first + last).double() / 2).round().long()
     every = torch.arange(len(tip), device=device)
     free = torch.nonzero(at(palm, centre, every) < tip - settings.clearance + gripper.palm_height)[
         :, 0
     ]
-    length, limit = (last[free] - first[free] + 1) * cell, tip[free] - settings.clearance
+    limit = tip[free] - settings.clearance
     rooms = tip.new_tensor(settings.rooms)[:, None]  # (rooms, M) from here on
     if gripper.opens_fully:
-        rooms = (gripper.max_opening - length[None]) / 2
+        rooms = (gripper.max_opening - length[None, free]) / 2
     offset = (rooms + thickness / 2) / cell
     left = (first[free] - offset).round().long().clamp(min=0)
     right = (last[free] + offset).round().long().clamp(max=size - 1)
     fits = (at(finger, left, free) < limit) & (at(finger, right, free) < limit)
-    fits &= length + 2 * rooms < gripper.max_opening + 2 * cell
+    fits &= length[free] + 2 * rooms < gripper.max_opening + 2 * cell
     free = free[fits.any(dim=0)]
     view, turn, row, tip = view[free], turn[free], row[free], tip[free]
-    first, last, image = first[free], last[free], image[free]
+    first, last, image, width = first[free], last[free], image[free], length[free]
 
     along, across = along[turn], across[turn]
-    base = middle[view] + cell * (row - half)[:, None] * across
+    base = middle[view] + cell * (row - half).double()[:, None] * across
     at_first, at_inside, xy, at_last = (
-        base + cell * (column - half)[:, None] * along
-        for column in (first, first + 1.5, (first + last) / 2, last)
+        base + cell * (column.double() - half)[:, None] * along
+        for column in (first, first + 1.5, (first + last).double() / 2, last)
     )
     frames = views.T_WV[view]
     place = (frames[:, :2, :3] @ torch.cat([xy, tip[:, None]], dim=1)[..., None])[..., 0]
@@ -219,26 +230,24 @@ def dense_candidates(
         )
     )
     inside = views.label.flatten()[views.cells(view, at_inside)]
-    if views.centres.shape[1] == 0:
-        arm = torch.zeros_like(tip)
-    else:
-        towards = views.centres[view, inside.clamp(min=0), :2] - xy
-        arm = (towards * across).sum(dim=1).abs()
+    arm = ((views.centres[view, inside.clamp(min=0), :2] - xy) * across).sum(dim=1).abs()
     rise = turned.flatten()[(image * size + row) * size + first] - tip
     score = torch.exp(-((arm / 0.03) ** 2)) * facing.clamp(0, 1) ** 2
     score = score * (reach & (inside >= 0) & (facing > settings.min_facing))
     score = score * (rise / settings.good_engagement).clamp(0.2, 1)
-    width = (last - first + 1) * cell
     nothing, none = torch.zeros_like(score), torch.full_like(view, -1)
     facts = score.new_zeros(len(score), len(FACTS))
-    found = FanCandidates(view, xy, angles[turn], tip, width, width, nothing, none, score, facts)
+    found = FanCandidates(
+        view, xy, angles[turn], tip, width, width, nothing, none, score, facts, nothing
+    )
     return found.take(torch.nonzero(score > 0)[:, 0])
 
 
 def _levels(
     views: FanViews, on_objects: torch.Tensor, gripper: GripperGeometry, settings: SearchSettings
 ) -> torch.Tensor:
-    """(B, L) heights of the fingertips to try in each view, at least one; infinite beyond those."""
+    """(B, L) metres in V: heights of the fingertips to try in each view; infinite where a view has
+    fewer. on_objects: (B, R, C) bool."""
     lowest = torch.where(on_objects, views.table, torch.inf).amin(dim=(1, 2)).double()
     lowest = lowest + settings.table_clearance
     low = torch.where(on_objects, views.height, torch.inf).amin(dim=(1, 2))
@@ -247,7 +256,7 @@ def _levels(
     first = lowest + settings.level_step * torch.floor(useless / settings.level_step).clamp(min=0)
     count = torch.ceil((high - settings.min_engagement - first) / settings.level_step)
     count = torch.where(count.isfinite(), count, 0).clamp(min=0)
-    number = torch.arange(max(int(count.max()), 1), device=high.device)
+    number = torch.arange(max(int(count.max()), 1), dtype=torch.float64, device=high.device)
     levels = first[:, None] + settings.level_step * number
     return torch.where(number < count[:, None], levels, torch.inf)
 
@@ -274,7 +283,7 @@ def _runs(
     for bridge in range(3):
         n = max(len(line) - bridge, 0)
         fits = line[:n] == line[bridge:]
-        fits &= (last[bridge:] - first[:n] + 1) * cell < max_width + cell
+        fits &= (last[bridge:] - first[:n] + 1).double() * cell < max_width + cell
         found.append((line[:n][fits], first[:n][fits], last[bridge:][fits]))
     line, first, last = (torch.cat(column) for column in zip(*found))
     image, rest = line // (levels.shape[1] * max(count, 1)), line % max(count, 1)
@@ -286,8 +295,9 @@ def _slopes(height: torch.Tensor, cell: float) -> torch.Tensor:
     """(B * R * C, 2) gradients along x and y of the blurred maps."""
     sigma = EDGE_BLUR / cell
     side = round(8 * sigma + 1) | 1  # as OpenCV has it for floats
-    kernel = torch.from_numpy(cv2.getGaussianKernel(side, sigma)[:, 0]).to(height)
-    image = F.pad(height[:, None], (side // 2,) * 4, mode="reflect")
+    kernel = torch.from_numpy(cv2.getGaussianKernel(side, sigma)[:, 0]).to(height.device)
+    # In 64 bits, for a GPU may take 32 for less.
+    image = F.pad(height.double()[:, None], (side // 2,) * 4, mode="reflect")
     image = F.conv2d(F.conv2d(image, kernel[None, None, None]), kernel[None, None, :, None])
     rows, columns = torch.gradient(image[:, 0], dim=(1, 2))
     return torch.stack([columns, rows], dim=-1).flatten(0, 2)
@@ -323,6 +333,89 @@ def measure(
     candidates: FanCandidates, views: FanViews, gripper: GripperGeometry, settings: SearchSettings
 ) -> FanCandidates:
     """The candidates posed on their maps, centred between their contacts, and scored."""
+    radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
+    maps = views.highest_beside, views.ceiling_within(radius)
+    if views.height.device.type == "cpu" or len(candidates) == 0:
+        return _measured(candidates, views, *maps, gripper, settings)
+    return _measured_by_recording(candidates, views, *maps, gripper, settings)
+
+
+class _Recording:
+    """`_measured` for so many candidates and such maps, recorded as a CUDA graph: a GPU starts its
+    hundreds of short steps itself, which takes Python longer than the GPU needs for them.
+
+    The arguments are an example; those of each call have to have the same shapes.
+    """
+
+    def __init__(self, candidates, views, beside, under_palm, gripper, settings):
+        maps = {name: part.clone() for name, part in _maps_of(views).items()}
+        self._views = replace(views, **maps)
+        self._inputs = [*_columns(candidates.take(slice(None))), *maps.values()]
+        self._inputs += [beside.clone(), under_palm.clone()]
+        count = len(fields(FanCandidates))
+        arguments = (
+            FanCandidates(*self._inputs[:count]), self._views, *self._inputs[-2:], gripper, settings
+        )  # fmt: skip
+        warm_up = torch.cuda.Stream()
+        warm_up.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(warm_up):  # before a recording, as PyTorch asks for
+            _measured(*arguments)
+        torch.cuda.current_stream().wait_stream(warm_up)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self._result = _measured(*arguments)
+
+    def __call__(self, candidates, views, beside, under_palm) -> FanCandidates:
+        """The measured candidates; the next call overwrites them."""
+        given = [*_columns(candidates), *_maps_of(views).values(), beside, under_palm]
+        for mine, new in zip(self._inputs, given):
+            mine.copy_(new)
+        self._graph.replay()
+        return self._result
+
+
+_recordings: dict[tuple, _Recording] = {}
+
+
+@torch.inference_mode()
+def _measured_by_recording(
+    candidates, views, beside, under_palm, gripper, settings
+) -> FanCandidates:
+    """As `_measured`. A recording serves all numbers of candidates up to one of a few."""
+    device, count = views.height.device, len(candidates)
+    most = settings.finalists * len(views)
+    size = most if count <= most else settings.shortlist * len(views)
+    number = torch.arange(max(size, count), device=device)
+    padded = candidates.take(number.clamp(max=count - 1))
+    shapes = tuple((name, part.shape) for name, part in _maps_of(views).items())
+    key = (
+        gripper, settings, len(number), shapes, views.origin, views.cell, views.table_height,
+        views.others, device,
+    )  # fmt: skip
+    if key not in _recordings:
+        _recordings[key] = _Recording(padded, views, beside, under_palm, gripper, settings)
+    return _recordings[key](padded, views, beside, under_palm).take(number[:count])
+
+
+def _columns(candidates: FanCandidates) -> list[torch.Tensor]:
+    return [getattr(candidates, field.name) for field in fields(candidates)]
+
+
+def _maps_of(views: FanViews) -> dict[str, torch.Tensor]:
+    names = ("height", "ceiling", "label", "centres", "T_WV", "beyond")
+    return {name: getattr(views, name) for name in names if getattr(views, name) is not None}
+
+
+def _measured(
+    candidates: FanCandidates,
+    views: FanViews,
+    beside: torch.Tensor,
+    under_palm: torch.Tensor,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> FanCandidates:
+    """See `measure`. beside, under_palm: (B, R, C) `FanViews.highest_beside`, and the highest
+    ceilings that a point under the palm stands for."""
     device, cell, tip = views.height.device, views.cell, candidates.tip
     view, width, (along, across) = candidates.view, candidates.width, candidates.axes()
     most = np.ceil((gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH) / cell)
@@ -373,21 +466,24 @@ def measure(
         chords = (low_right - low_left).sort(dim=1).values[:, -(LINES // 3) :]
         thickness = chords.mean(dim=1) - cell * along.abs().sum(dim=1)
         good &= thickness > gripper.least_held + UNSURE
-    other = views.label == OTHER_LABEL
-    if bool(other.any()):
+    if views.others:
         between = (u - shift[:, None]).abs() < width[:, None] / 2
-        mixed = other.flatten()[where] & (height > tip[:, None, None]) & between[:, None]
+        mixed = (
+            (views.label.flatten()[where] == OTHER_LABEL)
+            & (height > tip[:, None, None])
+            & between[:, None]
+        )
         good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
     near = (u - shift[:, None]).abs()
-    around = views.highest_beside.flatten()[where].amax(dim=1)
+    around = beside.flatten()[where].amax(dim=1)
     opening = _widest_opening(around, near, tip, width, gripper, settings)
     good &= opening > 0
-    gap = _palm_gap(xy, view, along, across, views, gripper)
+    gap = _palm_gap(xy, view, along, across, views, under_palm, gripper)
     good &= gap >= settings.clearance - tip
-    beside = opening
+    open_wide = opening
     if gripper.opens_fully:
-        beside = torch.minimum(beside, width + 2 * settings.rooms[-1])
-    under = _outline(gripper.finger_outline, near - beside[:, None] / 2)
+        open_wide = torch.minimum(opening, width + 2 * settings.rooms[-1])
+    under = _outline(gripper.finger_outline, near - open_wide[:, None] / 2)
     over = views.ceiling.flatten()[where] - under[:, None]
     covered = (over > tip[:, None, None]).double().mean(dim=(1, 2))
     opening, covered = torch.where(good, opening, 0.0), torch.where(good, covered, 0.0)
@@ -410,11 +506,13 @@ def measure(
     )  # fmt: skip
     facts = facts.nan_to_num(nan=0.0, posinf=np.pi, neginf=-np.pi)
     score = torch.where(good, score, 0.0)
-    return FanCandidates(view, xy, candidates.angle, tip, width, opening, turn, label, score, facts)
+    columns = (width, opening, turn, label, score, facts, candidates.value)
+    return FanCandidates(view, xy, candidates.angle, tip, *columns)
 
 
 def cells_around(xy, view, along, across, u, v, views: FanViews) -> torch.Tensor:
-    """(N, V, U) flat indices of the maps' cells u along and v across from each centre."""
+    """(N, V, U) flat indices of the maps' cells u (U,) along and v (V,) across, m, from the centres
+    xy (N, 2) in the views (N,); along, across: (N, 2) unit vectors."""
     places = (
         (xy[:, k, None] + u * along[:, k, None])[:, None] + v[:, None] * across[:, k, None, None]
         for k in (0, 1)
@@ -456,8 +554,9 @@ def _widest_opening(
     settings: SearchSettings,
 ) -> torch.Tensor:
     """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is."""
-    rooms = near.new_tensor((np.inf,) if gripper.opens_fully else settings.rooms)
-    half = (width / 2 + rooms[:, None]).clamp(max=gripper.max_opening / 2)  # (rooms, N)
+    rooms = (np.inf,) if gripper.opens_fully else settings.rooms
+    half = torch.stack([width / 2 + room for room in rooms])  # (rooms, N)
+    half = half.clamp(max=gripper.max_opening / 2)
     least = width / 2 + settings.rooms[0]
     sill = torch.where(near > least[:, None], settings.clearance + 0.001, torch.inf)
     outward = near - half[..., None]
@@ -468,34 +567,33 @@ def _widest_opening(
     return torch.where(fits, 2 * half, 0.0).amax(dim=0)
 
 
-def _palm_gap(xy, view, along, across, views: FanViews, gripper: GripperGeometry) -> torch.Tensor:
+def _palm_gap(
+    xy, view, along, across, views: FanViews, under_palm: torch.Tensor, gripper: GripperGeometry
+) -> torch.Tensor:
     """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
     u, v = (
-        np.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1)
+        torch.linspace(
+            -end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, dtype=torch.float64, device=xy.device
+        )
         for end in (gripper.palm_half_length, gripper.palm_outline[-1][0])
     )
-    underside, u, v = (xy.new_tensor(part) for part in (gripper.palm_underside(v), u, v))
-    radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
-    scene = views.ceiling_within(radius).flatten()
-    nearby = scene[cells_around(xy, view, along, across, u, v, views)].amax(dim=2)
-    return (underside - nearby).amin(dim=1)
+    nearby = under_palm.flatten()[cells_around(xy, view, along, across, u, v, views)].amax(dim=2)
+    return (_outline(gripper.palm_outline, v.abs()) - nearby).amin(dim=1)
 
 
 def _outline(outline: Sequence[tuple[float, float]], outward: torch.Tensor) -> torch.Tensor:
     """(...) height of an underside at distances outward, linear between its corners; infinite
     beside it."""
-    distance, height = outward.new_tensor(outline).T.contiguous()
-    after = torch.bucketize(outward, distance, right=True).clamp(1, len(distance) - 1)
-    share = (outward - distance[after - 1]) / (distance[after] - distance[after - 1])
-    under = height[after - 1] + share * (height[after] - height[after - 1])
-    beside = (outward < distance[0]) | (outward > distance[-1])
-    return torch.where(beside, torch.inf, under)
+    under = torch.full_like(outward, torch.inf)
+    for (near, low), (far, high) in zip(outline, outline[1:]):
+        here = (outward >= near) & (outward <= far)
+        under = torch.where(here, low + (high - low) / (far - near) * (outward - near), under)
+    return under
 
 
 def chances(
     found: FanCandidates,
     views: FanViews,
-    value: torch.Tensor,
     towards: np.ndarray,
     least_held: float,
     critic: GraspCritic,
@@ -512,7 +610,7 @@ def chances(
             (closing @ camera).abs(),
             -approach @ camera,
             camera[2].expand(len(found)),
-            value.clamp(min=LEAST).log(),
+            found.value.clamp(min=LEAST).log(),
             views.rise(found.view, tip),
             found.score.clamp(min=LEAST).log(),
             found.width,
@@ -538,7 +636,7 @@ def chances(
 
 
 def _object_size(found: FanCandidates, views: FanViews) -> torch.Tensor:
-    """(3, N) the sizes of the candidates' objects (`models.grasp_critic.object_size`)."""
+    """(3, N) metres: the sizes of the candidates' objects (`models.grasp_critic.object_size`)."""
     rows, columns = views.height.shape[1:]
     here = views.label.flatten(1)[found.view] == found.label[:, None]  # (N, R * C)
     cell = torch.arange(rows * columns, device=here.device)

@@ -8,7 +8,8 @@ NumPy. This module knows neither networks nor the search.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -17,7 +18,7 @@ import torch
 import torch.nn.functional as F
 
 from utils.depth import depth_of_plane
-from utils.height_map import LABEL_FLOOR, RIM, HeightMap
+from utils.height_map import LABEL_FLOOR, OTHER_LABEL, RIM, HeightMap
 from utils.seen_heights import (
     BORROWED_WITHIN,
     FARTHEST,
@@ -30,13 +31,17 @@ from utils.seen_heights import (
 )
 from utils.transforms import RGBDFrame, known_depth
 
+CENTRES = 32
+
 
 @dataclass(frozen=True)
 class FanViews:
-    """B height maps of one scene; in each its own frame V, on one grid of R x C cells.
+    """B height maps of one scene, each in a frame V of its own, on one grid of R x C cells.
 
     height, ceiling: (B, R, C) float32; label: (B, R, C) int64; centres: (B, M, 3) float64; beyond:
-    (B, R, C) bool, or None; each as of `HeightMap`. T_WV: (B, 4, 4) float64. origin: (x, y) m.
+    (B, R, C) bool, or None; each as of `HeightMap`; the last of the centres may be filled up with
+    zeros. T_WV: (B, 4, 4) float64. origin: (x, y) m in V. cell: m. table_height: m in W. others:
+    whether OTHER_LABEL occurs.
     """
 
     height: torch.Tensor
@@ -48,6 +53,7 @@ class FanViews:
     cell: float
     table_height: float
     beyond: torch.Tensor | None = None
+    others: bool = False
     _ceiling_within: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -104,7 +110,7 @@ class FanViews:
         )  # fmt: skip
 
     def every(self, stride: int) -> FanViews:
-        """Coarser maps: every `stride`-th cell along rows and columns."""
+        """Coarser maps: every `stride`-th cell along rows and columns, without `beyond`."""
         height, ceiling, label = (
             part[:, ::stride, ::stride].contiguous()
             for part in (self.height, self.ceiling, self.label)
@@ -122,7 +128,8 @@ def fan_views(
 ) -> FanViews:
     """The maps of the scene in the frames T_WV (B, 4, 4), on the grid of the map from above.
 
-    filled, hiding: the frame `without_holes`, which has neither fixtures nor a second frame.
+    filled, hiding: the frame `without_holes`, which has neither fixtures nor a second frame. Of an
+    image of 640 x 480 pixels the points of all views take some 0.5 GB.
     """
     shape, cell, table = overhead.height.shape, overhead.cell, overhead.table_height
     origin = (float(overhead.origin[0]), float(overhead.origin[1]))
@@ -161,12 +168,17 @@ def fan_views(
     label = torch.where(matter, known[row, column], -1)
     label = _with_rims(label, matter)
     rotation, shift = frames[:, :3, :3], frames[:, None, :3, 3]
-    centres = (torch.from_numpy(overhead.centres).to(device) - shift) @ rotation
+    # As many for most scenes, so that what is recorded for a number of them serves most.
+    count = len(overhead.centres)
+    centres = np.zeros((max(-(-count // CENTRES), 1) * CENTRES, 3))
+    centres[:count] = overhead.centres
+    centres = (torch.from_numpy(centres).to(device) - shift) @ rotation
     beyond = None
     if overhead.beyond is not None:
         beyond = torch.from_numpy(overhead.beyond).to(device)[row, column]
     ceiling = torch.maximum(ceiling, walled)
-    return FanViews(walled, ceiling, label, centres, frames, origin, cell, table, beyond)
+    others = bool((overhead.label == OTHER_LABEL).any())
+    return FanViews(walled, ceiling, label, centres, frames, origin, cell, table, beyond, others)
 
 
 class _Drawing:
@@ -182,10 +194,10 @@ class _Drawing:
     ):
         self._shape, self._device = shape, frames.device
         # From a pixel times its depth to columns, rows and metres of each view.
-        to_view = torch.linalg.inv(frames) @ torch.from_numpy(frame.T_WC).to(self._device)
+        to_view = torch.linalg.inv(frames) @ frames.new_tensor(np.asarray(frame.T_WC, float))
         steps = torch.tensor([1 / cell, 1 / cell, 1.0], dtype=torch.float64, device=self._device)
         first = torch.tensor([*origin, 0.0], dtype=torch.float64, device=self._device)
-        ahead = torch.from_numpy(np.linalg.inv(frame.K)).to(self._device)
+        ahead = frames.new_tensor(np.linalg.inv(np.asarray(frame.K, float)))
         self._ray = steps[:, None] * (to_view[:, :3, :3] @ ahead)  # (B, 3, 3)
         self._eye = (steps * (to_view[:, :3, 3] - first))[..., None]  # (B, 3, 1)
 
@@ -194,17 +206,18 @@ class _Drawing:
         none; each pixel stands for several points of its square."""
         depth = self._tensor(depth)
         row, column = torch.nonzero(_known(depth), as_tuple=True)
-        sub = (torch.arange(SUBPIXELS, device=self._device) + 0.5) / SUBPIXELS - 0.5
-        u = (column + sub[:, None])[None].expand(SUBPIXELS, -1, -1)
-        v = (row + sub[:, None])[:, None].expand(-1, SUBPIXELS, -1)
-        pixels = torch.stack([u, v]).reshape(2, -1)
-        return self._highest(self._points(pixels, depth[row, column].repeat(SUBPIXELS**2)))
+        depth = depth[row, column]
+        sub = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+        return self._highest(
+            self._points(torch.stack([column + du, row + dv]), depth)
+            for dv, du in itertools.product(sub.tolist(), sub.tolist())
+        )
 
     def grazing(self, depth: np.ndarray) -> torch.Tensor:
         """(B, R, C) the same of points on the rays between neighbouring pixels that lie beside a
         step of the depth."""
         depth = self._tensor(depth)
-        highest = []
+        parts = []
         for down, right in ((0, 1), (1, 0)):
             here = depth[: len(depth) - down, : depth.shape[1] - right]
             there = depth[down:, right:]
@@ -218,9 +231,8 @@ class _Drawing:
             count = (2 * longest).clamp(2, GRAZING_SHARES).long()[:, None, None, None]
             share = torch.arange(GRAZING_SHARES, device=self._device)[:, None] / (count - 1)
             points = near[:, :, None] + share.clamp(max=1.0) * (far - near)[:, :, None]
-            highest.append(self._highest(points.flatten(2)))
-        none = torch.full((len(self._ray), *self._shape), -torch.inf, device=self._device)
-        return torch.maximum(*highest) if len(highest) == 2 else (highest or [none])[0]
+            parts.append(points.flatten(2))
+        return self._highest(parts)
 
     def _points(self, pixels: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         """(B, 3, N) float32 columns, rows and metres of pixels (2, N) at depths (N,)."""
@@ -230,17 +242,17 @@ class _Drawing:
     def _tensor(self, depth: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(depth, dtype=np.float32)).to(self._device)
 
-    def _highest(self, points: torch.Tensor) -> torch.Tensor:
-        """(B, R, C) highest z of points (B, 3, N): columns, rows, metres."""
-        (rows, columns), views = self._shape, len(points)
-        column, row = (
-            points[:, k].round().clamp(-1, count).long() + 1
-            for k, count in enumerate((columns, rows))
-        )
-        index = row * (columns + 2) + column  # with a rim for points outside
-        size = (rows + 2) * (columns + 2)
+    def _highest(self, parts: Iterable[torch.Tensor]) -> torch.Tensor:
+        """(B, R, C) highest z of points, each part (B, 3, N): columns, rows, metres."""
+        (rows, columns), views = self._shape, len(self._ray)
+        size = (rows + 2) * (columns + 2)  # with a rim for points outside
         height = torch.full((views, size), -torch.inf, device=self._device)
-        height.scatter_reduce_(1, index, points[:, 2], "amax")
+        for points in parts:
+            column, row = (
+                points[:, k].round().clamp(-1, count).long() + 1
+                for k, count in enumerate((columns, rows))
+            )
+            height.scatter_reduce_(1, row * (columns + 2) + column, points[:, 2], "amax")
         return height.reshape(views, rows + 2, columns + 2)[:, 1:-1, 1:-1].contiguous()
 
 
@@ -274,6 +286,11 @@ def _highest_in_disc(image: torch.Tensor, radius: int) -> torch.Tensor:
     return highest
 
 
+def _numbers(count: int, device: torch.device) -> torch.Tensor:
+    """(count,) float64: 0, 1, 2 and so on."""
+    return torch.arange(count, dtype=torch.float64, device=device)
+
+
 def _known(depth: torch.Tensor) -> torch.Tensor:
     return depth.isfinite() & (depth > 0)
 
@@ -287,7 +304,7 @@ def _table_slopes(
 ) -> torch.Tensor:
     """(B, R, C) float32 metres in V: the table, `table` m high in W, in each cell of a grid; as
     `table_slope`."""
-    rows, columns = (torch.arange(count, device=frames.device) for count in shape)
+    rows, columns = (_numbers(count, frames.device) for count in shape)
     steep_x, steep_y, up, middle = frames[:, 2].T[..., None, None]
     level = (table - middle) - steep_x * (origin[0] + cell * columns)
     level = level - steep_y * (origin[1] + cell * rows)[:, None]
@@ -298,7 +315,7 @@ def _in_world(
     frames: torch.Tensor, height: torch.Tensor, origin: tuple[float, float], cell: float
 ) -> torch.Tensor:
     """(3, B, R, C) float64 points in W of the heights (B, R, C) of a grid in V."""
-    rows, columns = (torch.arange(count, device=height.device) for count in height.shape[1:])
+    rows, columns = (_numbers(count, height.device) for count in height.shape[1:])
     x, y = origin[0] + cell * columns, (origin[1] + cell * rows)[:, None]
     return torch.stack(
         [

@@ -80,7 +80,7 @@ class SearchPlanner:
         frame that they were found in."""
         settings = self.settings
         kept = found.distinct(settings.returned, settings.distinct_distance, settings.distinct_turn)
-        if self.calibration is not None:
+        if self.calibration is not None:  # as `with_chances`, but each grasp is made once
             kept = replace(kept, score=self.calibration(kept.score, roughness))
         return kept.grasps(self.gripper)
 

@@ -200,9 +200,8 @@ class HeuristicFanPlanner(FanPlanner):
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         frame = corrected(frame, self.workspace.table_height)
-        filled, hiding = holeless = without_holes(frame, self.workspace)
-        heights = height_map_from_frame(frame, self.workspace, below=True, holeless=holeless)
-        overhead = only_target(heights, frame)
+        overhead = only_target(self.heights(frame), frame)
+        filled, hiding = without_holes(frame, self.workspace)
 
         def seen(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, filled, hiding, T_WV)

@@ -212,10 +212,13 @@ JUDGED_FAN = FanSettings(tilt_scale=3.0)
 
 class GraspNetFanPlanner(Judged, FanPlanner):
     """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on each view's: the shipped one, unless `critic` is given.
+    the last word on each view's: the shipped one, unless `critic` is given. A critic on another
+    device than the network's is copied.
 
-    at_once: whether all views are searched in one pass where the network is, which pays on a GPU
-    (`models.fan_search`); frames with fixtures or a second look are searched view by view.
+    device: of the network. at_once: whether all views are searched in one pass there
+    (`models.fan_search`); by default on a GPU alone, though with many cores it is quicker on a CPU,
+    too. Frames with fixtures or a second look, and those of a planner with another `judge`, are
+    searched view by view.
     """
 
     def __init__(
@@ -233,8 +236,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         self.critic = critic or shipped_critic()
         if next(self.critic.parameters()).device != self.device:
             self.critic = copy.deepcopy(self.critic).to(self.device)  # others use it where it is
-        self.judge = chances_by(self.critic)
-        self.at_once = self.device.type != "cpu"
+        self.judge = self._own_judge = chances_by(self.critic)
+        self.at_once = self.device.type == "cuda"
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if not known_depth(frame.depth).any():
@@ -249,7 +252,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         def of_view(heights: HeightMap, found: Candidates) -> Candidates:
             return self.judged(heights, found, seen, VIEW_JUDGED)
 
-        if self.at_once and not frame.fixtures and frame.second is None:
+        by_critic = self.judge is self._own_judge
+        if self.at_once and by_critic and not frame.fixtures and frame.second is None:
             grasps = self._searched_at_once(seen, overhead)
         else:
             covered = self.covered(frame.fixtures)
@@ -273,19 +277,17 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         else:
             return []
         found = found.distinct(VIEW_JUDGED, JUDGED_DISTANCE, JUDGED_TURN)
-        value = seen.values(views, found)
         chance = fan_search.chances(
-            found, views, value, seen.towards, self.gripper.least_held, self.critic
+            found, views, seen.towards, self.gripper.least_held, self.critic
         )
         found = replace(found, score=chance).best()
-        numbers = (found.view, found.xy, found.angle, found.tip, found.opening, found.score)
-        view, xy, angle, tip, opening, score = (part.cpu().numpy() for part in numbers)
+        numbers = (found.view, *found.xy.T, found.tip, found.angle, found.opening, found.score)
+        *numbers, angle, opening, score = torch.stack(numbers).cpu().numpy()
+        view, place = numbers[0].astype(int), np.column_stack(numbers[1:])
+        place[:, 2] += self.gripper.tip_below_centre
         tilt = np.arccos(np.clip(frames[:, 2, 2], -1.0, 1.0))[view]
-        height = tip + self.gripper.tip_below_centre
         order = np.argsort(-score * self.fan.preference(tilt), kind="stable")
-        poses = np.array(
-            [frames[view[at]] @ top_down_pose((*xy[at], height[at]), angle[at]) for at in order]
-        )
+        poses = frames[view[order]] @ top_down_pose(place[order], angle[order])
         return [
             Grasp.from_pose(poses[kept], float(opening[order[kept]]), float(score[order[kept]]))
             for kept in distinct(poses, self.fan)

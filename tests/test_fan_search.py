@@ -67,7 +67,7 @@ def both(frame: RGBDFrame, others: bool = False) -> tuple[list[HeightMap], FanVi
 def tensors(found: Candidates, view: int) -> FanCandidates:
     """Candidates of one map as those of a view."""
     columns = (torch.from_numpy(np.array(getattr(found, field.name))) for field in fields(found))
-    return FanCandidates(torch.full((len(found),), view), *columns)
+    return FanCandidates(torch.full((len(found),), view), *columns, torch.ones(len(found)).double())
 
 
 # --- Maps -------------------------------------------------------------------------------------
@@ -83,7 +83,8 @@ def test_the_maps_are_those_of_each_view(noise, holes) -> None:
             expected, found = getattr(heights, name), getattr(views, name)[number].numpy()
             other = np.abs(found - expected) > 1e-4
             assert other.mean() < 1e-3, (number, name, other.sum())
-        np.testing.assert_allclose(views.centres[number].numpy(), heights.centres, atol=1e-12)
+        centres = views.centres[number, : len(heights.centres)].numpy()
+        np.testing.assert_allclose(centres, heights.centres, atol=1e-12)
         np.testing.assert_allclose(views.table[number].numpy(), heights.table(), atol=1e-6)
 
 
@@ -142,8 +143,9 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
         expected = dense_candidates(heights.every(2), gripper, workspace, SEARCH)
         expected = expected.take(expected.score > 0)
         found = fan_search.dense_candidates(one.every(2), gripper, workspace, SEARCH)
-        assert len(found) == pytest.approx(len(expected), rel=0.06, abs=3)
-
+        assert all(part.dtype in (torch.int64, torch.float64) for part in vars(found).values())
+        if len(expected):
+            assert alike_rough(found, expected) >= 0.97
         rough = expected.best(80)
         expected, found = (
             measure(rough, heights, gripper, SEARCH),
@@ -161,11 +163,23 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
         assert_same(found, expected)
         towards, value = np.array([0.6, 0.0, 0.8]), np.linspace(0.1, 0.9, len(expected))
         inputs = critic_inputs(expected, heights, value, towards, gripper.least_held)
-        chance = fan_search.chances(
-            found, one, torch.from_numpy(value), towards, gripper.least_held, critic
-        )
+        found = replace(found, value=torch.from_numpy(value))
+        chance = fan_search.chances(found, one, towards, gripper.least_held, critic)
         np.testing.assert_allclose(chance.detach(), critic.chance(inputs), atol=1e-4)
     assert feasible > 20
+
+
+def alike_rough(found: FanCandidates, expected: Candidates) -> float:
+    """The smaller share of either whose place, angle, height, width and score the other has."""
+    rows, scores = [], []
+    for part in (found, expected):
+        numbers = (part.xy, part.angle, part.tip, part.width, part.score)
+        xy, angle, tip, width, score = map(np.asarray, map(torch.as_tensor, numbers))
+        rows.append(np.column_stack([xy, 10 * angle, 10 * tip, width]))
+        scores.append(score)
+    same = np.abs(rows[0][:, None] - rows[1]).max(axis=2) < 1e-4
+    same &= np.abs(scores[0][:, None] - scores[1]) < 1e-3
+    return min(same.any(axis=0).mean(), same.any(axis=1).mean())
 
 
 def assert_same(found: FanCandidates, expected: Candidates) -> None:
@@ -180,26 +194,66 @@ def assert_same(found: FanCandidates, expected: Candidates) -> None:
 # --- Planner ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.001])
+KINDS = {
+    "plain": {},
+    "fully open": {"opens_fully": True},
+    "least held": {"least_held": 0.032},
+    "target": {},
+    "cut off": {},
+    "flat": {},
+}
+
+
+def kind_of_frame(kind: str) -> RGBDFrame:
+    if kind == "cut off":  # by the border of the image
+        return boxes_frame([*BOXES, ((0.2, 0.05, 0.05), 0.0, (0.5, 0.23))])
+    if kind == "flat":  # so that only relaxed margins fit
+        return boxes_frame([((0.03, 0.12, 0.0095), 0.4, (0.5, 0.0))], T_WC=ASIDE)
+    frame = frame_of(0.001)
+    if kind == "target":
+        segments = GraspNetFanPlanner(GripperGeometry(), Workspace()).segments(frame)
+        frame = replace(frame, target=segments == segments.max())
+    return frame
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=GPU)])
-def test_the_grasps_are_those_of_one_view_after_the_other(device: str, noise: float) -> None:
-    by_view = GraspNetFanPlanner(GripperGeometry(), Workspace())
+def test_the_grasps_are_those_of_one_view_after_the_other(device: str, kind: str) -> None:
+    gripper = GripperGeometry(**KINDS[kind])
+    by_view = GraspNetFanPlanner(gripper, Workspace())
     assert not by_view.at_once, "on two cores NumPy is quicker"
     saved = by_view.network
     saved = saved._replace(model=copy.deepcopy(saved.model).to(device))
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), network=saved)
+    planner = GraspNetFanPlanner(gripper, Workspace(), network=saved)
     assert planner.at_once == (device == "cuda")
     planner.at_once = True
-    frame = frame_of(noise)
+    frame = kind_of_frame(kind)
+    planner(boxes_frame(BOXES[:2]))  # what is recorded on a GPU serves any frame
     expected, found = by_view(frame), planner(frame)
-    assert len(found) == len(expected) == planner.fan.returned
-    assert found[0].quality == pytest.approx(expected[0].quality, abs=0.01)
+    assert len(expected) >= 3
+    assert len(found) == pytest.approx(len(expected), abs=2)
+    assert found[0].quality == pytest.approx(expected[0].quality, abs=0.02)
     turns = turns_between(np.array([grasp.pose for grasp in (*expected, *found)]))
     away = np.array([[np.linalg.norm(a.position - b.position) for b in found] for a in expected])
     alike = (away < 0.004) & (turns[: len(expected), len(expected) :] < np.deg2rad(6))
     assert alike.any(axis=1).mean() >= 0.8
     worth = [g.quality * float(planner.fan.preference(np.array(g.tilt))) for g in found]
-    assert worth == sorted(worth, reverse=True)
+    assert worth == pytest.approx(sorted(worth, reverse=True), abs=1e-12)
+
+
+def test_a_camera_in_32_bits_gives_the_same_grasps() -> None:
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner.at_once = True
+    frame = boxes_frame(BOXES)
+    single = replace(frame, K=frame.K.astype(np.float32), T_WC=frame.T_WC.astype(np.float32))
+    assert len(planner(single)) == planner.fan.returned
+
+
+def test_another_judge_judges_view_by_view() -> None:
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner.at_once = True
+    planner.judge = lambda heights, found, inputs: np.full(len(found), 0.25)
+    assert {grasp.quality for grasp in planner(boxes_frame(BOXES))} == {0.25}
 
 
 def test_an_empty_table_has_no_grasp() -> None:

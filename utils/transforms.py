@@ -245,12 +245,14 @@ def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def top_down_pose(position: ArrayLike, angle: float) -> np.ndarray:
-    """(4, 4) T_WE of a gripper pointing straight down whose fingers close along `angle`."""
+def top_down_pose(position: ArrayLike, angle: ArrayLike) -> np.ndarray:
+    """(..., 4, 4) T_WE of a gripper pointing straight down at positions (..., 3), whose fingers
+    close along angles (...)."""
     c, s = np.cos(angle), np.sin(angle)
-    T = np.eye(4)
-    T[:3, :3] = np.array([[-s, c, 0.0], [c, s, 0.0], [0.0, 0.0, -1.0]])
-    T[:3, 3] = position
+    T = np.zeros((*np.shape(angle), 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 1, 0], T[..., 1, 1] = -s, c, c, s
+    T[..., 2, 2], T[..., 3, 3] = -1.0, 1.0
+    T[..., :3, 3] = position
     return T
 
 
