@@ -8,6 +8,7 @@ same grasps.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -335,9 +336,9 @@ def measure(
     """The candidates posed on their maps, centred between their contacts, and scored."""
     radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
     maps = views.highest_beside, views.ceiling_within(radius)
-    if views.height.device.type == "cpu" or len(candidates) == 0:
-        return _measured(candidates, views, *maps, gripper, settings)
-    return _measured_by_recording(candidates, views, *maps, gripper, settings)
+    if views.height.device.type == "cuda" and len(candidates):
+        return _measured_by_recording(candidates, views, *maps, gripper, settings)
+    return _measured(candidates, views, *maps, gripper, settings)
 
 
 class _Recording:
@@ -347,7 +348,15 @@ class _Recording:
     The arguments are an example; those of each call have to have the same shapes.
     """
 
-    def __init__(self, candidates, views, beside, under_palm, gripper, settings):
+    def __init__(
+        self,
+        candidates: FanCandidates,
+        views: FanViews,
+        beside: torch.Tensor,
+        under_palm: torch.Tensor,
+        gripper: GripperGeometry,
+        settings: SearchSettings,
+    ):
         maps = {name: part.clone() for name, part in _maps_of(views).items()}
         self._views = replace(views, **maps)
         self._inputs = [*_columns(candidates.take(slice(None))), *maps.values()]
@@ -362,11 +371,17 @@ class _Recording:
             _measured(*arguments)
         torch.cuda.current_stream().wait_stream(warm_up)
         self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
+        with torch.cuda.graph(self._graph, pool=_memory()):
             self._result = _measured(*arguments)
 
-    def __call__(self, candidates, views, beside, under_palm) -> FanCandidates:
-        """The measured candidates; the next call overwrites them."""
+    def __call__(
+        self,
+        candidates: FanCandidates,
+        views: FanViews,
+        beside: torch.Tensor,
+        under_palm: torch.Tensor,
+    ) -> FanCandidates:
+        """The measured candidates; the next call, of any recording, overwrites them."""
         given = [*_columns(candidates), *_maps_of(views).values(), beside, under_palm]
         for mine, new in zip(self._inputs, given):
             mine.copy_(new)
@@ -377,9 +392,20 @@ class _Recording:
 _recordings: dict[tuple, _Recording] = {}
 
 
+@functools.cache
+def _memory() -> tuple[int, int]:
+    """The memory that all recordings share: their results are copied before the next one plays."""
+    return torch.cuda.graph_pool_handle()
+
+
 @torch.inference_mode()
 def _measured_by_recording(
-    candidates, views, beside, under_palm, gripper, settings
+    candidates: FanCandidates,
+    views: FanViews,
+    beside: torch.Tensor,
+    under_palm: torch.Tensor,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
 ) -> FanCandidates:
     """As `_measured`. A recording serves all numbers of candidates up to one of a few."""
     device, count = views.height.device, len(candidates)

@@ -31,7 +31,7 @@ from utils.seen_heights import (
 )
 from utils.transforms import RGBDFrame, known_depth
 
-CENTRES = 32
+CENTRES = 32  # objects, in steps of which there are centres
 
 
 @dataclass(frozen=True)
