@@ -281,10 +281,10 @@ class GraspNetFanPlanner(Judged, FanPlanner):
             found, views, seen.towards, self.gripper.least_held, self.critic
         )
         found = replace(found, score=chance).best()
-        numbers = (found.view, *found.xy.T, found.tip, found.angle, found.opening, found.score)
-        *numbers, angle, opening, score = torch.stack(numbers).cpu().numpy()
-        view, place = numbers[0].astype(int), np.column_stack(numbers[1:])
-        place[:, 2] += self.gripper.tip_below_centre
+        columns = (found.view, *found.xy.T, found.tip, found.angle, found.opening, found.score)
+        view, x, y, tip, angle, opening, score = torch.stack(columns).cpu().numpy()
+        view = view.astype(int)
+        place = np.column_stack([x, y, tip + self.gripper.tip_below_centre])
         tilt = np.arccos(np.clip(frames[:, 2, 2], -1.0, 1.0))[view]
         order = np.argsort(-score * self.fan.preference(tilt), kind="stable")
         poses = frames[view[order]] @ top_down_pose(place[order], angle[order])
