@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from models import fan_search
-from models.fan_search import FanCandidates
+from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews, fan_views
 from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth

@@ -12,8 +12,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import fan_search
-from models.fan_search import FanCandidates
+from models import fan_measure, fan_search
+from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews, fan_views, highest_within
 from models.grasp_critic import critic_inputs, shipped_critic
 from models.planner_antipodal import dense_candidates, measure, turn_onto_faces
@@ -103,7 +103,7 @@ def test_the_highest_within_a_window_is_opencvs(above, left, right, seed) -> Non
 @given(st.integers(-10_000, 40_000))
 def test_the_underside_of_a_finger_is_that_of_its_outline(micrometres) -> None:
     gripper, outward = GripperGeometry(), 1e-6 * micrometres
-    found = fan_search._outline(gripper.finger_outline, torch.tensor([outward]).double())
+    found = fan_measure._outline(gripper.finger_outline, torch.tensor([outward]).double())
     assert float(found[0]) == pytest.approx(float(gripper.finger_underside(np.array(outward))))
 
 
@@ -149,7 +149,7 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
         rough = expected.best(80)
         expected, found = (
             measure(rough, heights, gripper, SEARCH),
-            fan_search.measure(tensors(rough, 0), one, gripper, SEARCH),
+            fan_measure.measure(tensors(rough, 0), one, gripper, SEARCH),
         )
         feasible += (expected.score > 0).sum()
         assert_same(found, expected)
@@ -158,7 +158,7 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
             continue
         expected, found = (
             turn_onto_faces(expected, heights, gripper, SEARCH),
-            fan_search.turn_onto_faces(found.best(60), one, gripper, SEARCH),
+            fan_measure.turn_onto_faces(found.best(60), one, gripper, SEARCH),
         )
         assert_same(found, expected)
         towards, value = np.array([0.6, 0.0, 0.8]), np.linspace(0.1, 0.9, len(expected))

@@ -1,0 +1,336 @@
+"""Candidates of all views of a fan, posed on their maps, measured and scored, as tensors.
+
+`measure` is that of `models.planner_antipodal` with PyTorch: names and order are the same, what a
+step is for is told there, and a test holds both to the same numbers. On a GPU it is recorded as a
+CUDA graph.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+
+from models.fan_candidates import FanCandidates
+from models.fan_views import FanViews
+from models.planner_antipodal import LINES, PALM_STEP, REACH, UNSURE
+from models.planner_candidates import SearchSettings, grip_score
+from utils.geometry import GripperGeometry
+from utils.grasp_quality import NEAR_FACE, TOUCH, contact_levels
+from utils.height_map import OTHER_LABEL, WALL_LABEL
+
+
+def turn_onto_faces(
+    found: FanCandidates,
+    views: FanViews,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+    times: int = 2,
+) -> FanCandidates:
+    """Measured candidates, each turned and measured again as long as its score rises."""
+    better = torch.ones_like(found.score, dtype=torch.bool)
+    for _ in range(times):
+        turned = replace(found, angle=(found.angle + found.turn) % np.pi)
+        turned = measure(turned, views, gripper, settings)
+        better = better & (turned.score > found.score)
+        columns = (
+            (getattr(part, field.name) for part in (turned, found))
+            for field in fields(FanCandidates)
+        )
+        found = FanCandidates(
+            *(
+                torch.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in columns
+            )
+        )
+    return found
+
+
+def measure(
+    candidates: FanCandidates, views: FanViews, gripper: GripperGeometry, settings: SearchSettings
+) -> FanCandidates:
+    """The candidates posed on their maps, centred between their contacts, and scored."""
+    radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
+    maps = views.highest_beside, views.ceiling_within(radius)
+    if views.height.device.type == "cuda" and len(candidates):
+        return _measured_by_recording(candidates, views, *maps, gripper, settings)
+    return _measured(candidates, views, *maps, gripper, settings)
+
+
+class _Recording:
+    """`_measured` for so many candidates and such maps, recorded as a CUDA graph: a GPU starts its
+    hundreds of short steps itself, which takes Python longer than the GPU needs for them.
+
+    The arguments are an example; those of each call have to have the same shapes.
+    """
+
+    def __init__(
+        self,
+        candidates: FanCandidates,
+        views: FanViews,
+        beside: torch.Tensor,
+        under_palm: torch.Tensor,
+        gripper: GripperGeometry,
+        settings: SearchSettings,
+    ):
+        maps = {name: part.clone() for name, part in _maps_of(views).items()}
+        self._views = replace(views, **maps)
+        self._inputs = [*_columns(candidates.take(slice(None))), *maps.values()]
+        self._inputs += [beside.clone(), under_palm.clone()]
+        count = len(fields(FanCandidates))
+        arguments = (
+            FanCandidates(*self._inputs[:count]), self._views, *self._inputs[-2:], gripper, settings
+        )  # fmt: skip
+        warm_up = torch.cuda.Stream()
+        warm_up.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(warm_up):  # before a recording, as PyTorch asks for
+            _measured(*arguments)
+        torch.cuda.current_stream().wait_stream(warm_up)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, pool=_memory()):
+            self._result = _measured(*arguments)
+
+    def __call__(
+        self,
+        candidates: FanCandidates,
+        views: FanViews,
+        beside: torch.Tensor,
+        under_palm: torch.Tensor,
+    ) -> FanCandidates:
+        """The measured candidates; the next call, of any recording, overwrites them."""
+        given = [*_columns(candidates), *_maps_of(views).values(), beside, under_palm]
+        for mine, new in zip(self._inputs, given):
+            mine.copy_(new)
+        self._graph.replay()
+        return self._result
+
+
+_recordings: dict[tuple, _Recording] = {}
+
+
+@functools.cache
+def _memory() -> tuple[int, int]:
+    """The memory that all recordings share: their results are copied before the next one plays."""
+    return torch.cuda.graph_pool_handle()
+
+
+@torch.inference_mode()
+def _measured_by_recording(
+    candidates: FanCandidates,
+    views: FanViews,
+    beside: torch.Tensor,
+    under_palm: torch.Tensor,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> FanCandidates:
+    """As `_measured`. A recording serves all numbers of candidates up to one of a few."""
+    device, count = views.height.device, len(candidates)
+    most = settings.finalists * len(views)
+    size = most if count <= most else settings.shortlist * len(views)
+    number = torch.arange(max(size, count), device=device)
+    padded = candidates.take(number.clamp(max=count - 1))
+    shapes = tuple((name, part.shape) for name, part in _maps_of(views).items())
+    key = (
+        gripper, settings, len(number), shapes, views.origin, views.cell, views.table_height,
+        views.others, device,
+    )  # fmt: skip
+    if key not in _recordings:
+        _recordings[key] = _Recording(padded, views, beside, under_palm, gripper, settings)
+    return _recordings[key](padded, views, beside, under_palm).take(number[:count])
+
+
+def _columns(candidates: FanCandidates) -> list[torch.Tensor]:
+    return [getattr(candidates, field.name) for field in fields(candidates)]
+
+
+def _maps_of(views: FanViews) -> dict[str, torch.Tensor]:
+    names = ("height", "ceiling", "label", "centres", "T_WV", "beyond")
+    return {name: getattr(views, name) for name in names if getattr(views, name) is not None}
+
+
+def _measured(
+    candidates: FanCandidates,
+    views: FanViews,
+    beside: torch.Tensor,
+    under_palm: torch.Tensor,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> FanCandidates:
+    """See `measure`. beside, under_palm: (B, R, C) `FanViews.highest_beside`, and the highest
+    ceilings that a point under the palm stands for."""
+    device, cell, tip = views.height.device, views.cell, candidates.tip
+    view, width, (along, across) = candidates.view, candidates.width, candidates.axes()
+    most = np.ceil((gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH) / cell)
+    u = torch.arange(-most, most + 1, dtype=torch.float64, device=device) * cell
+    v = torch.linspace(-1, 1, LINES, dtype=torch.float64, device=device)
+    v = v * gripper.finger_half_width
+    where = cells_around(candidates.xy, view, along, across, u, v, views)  # (N, V, U)
+    height = views.height.flatten()[where]
+    highest = height.amax(dim=1)
+
+    window = u.abs() <= width[:, None] / 2 + settings.rooms[0]
+    top = torch.where(window, highest, -torch.inf).amax(dim=1)
+    engagement = top - tip
+    lower, upper = contact_levels(tip, engagement)
+    low = (height > lower[:, None, None]) & window[:, None]
+    low_left, low_right = _first_contacts(low, u, cell)
+    high = (highest > upper[:, None]) & window
+    high_left, high_right = _first_contacts(high, u, cell)
+    left, right = low_left.amin(dim=1), low_right.amax(dim=1)
+    touched = left.isfinite() & high_left.isfinite()
+    left, right = torch.where(touched, left, 0.0), torch.where(touched, right, 0.0)
+    width, shift = right - left, (right + left) / 2
+    turn, wedge, cover = _fit_faces(low_left - left[:, None], right[:, None] - low_right, v)
+    rise = upper - tip - 0.001
+    tilt_left = torch.atan2((high_left - left).clamp(min=0), rise)
+    tilt_right = torch.atan2((right - high_right).clamp(min=0), rise)
+    tilt = torch.where(touched, torch.maximum(tilt_left, tilt_right), np.pi / 2)
+
+    xy = candidates.xy + shift[:, None] * along
+    inner = (width / 3).clamp(max=0.003)
+    ends = [
+        views.label.flatten()[views.cells(view, candidates.xy + end[:, None] * along)]
+        for end in (left + inner, right - inner)
+    ]
+    label = torch.maximum(*ends)
+    centre = views.centres[view, label.clamp(min=0)]
+    arms = (
+        ((centre[:, :2] - xy) * across).sum(dim=1).abs(),
+        ((centre[:, :2] - xy) * along).sum(dim=1).abs(),
+        (centre[:, 2] - tip - gripper.pad_height / 2).abs(),
+    )
+
+    good = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
+    good &= (torch.minimum(*ends) > WALL_LABEL) & (label >= 0) & (width > 0)
+    if views.beyond is not None:
+        good &= ~views.beyond.flatten()[views.cells(view, xy)]
+    if gripper.least_held:
+        chords = (low_right - low_left).sort(dim=1).values[:, -(LINES // 3) :]
+        thickness = chords.mean(dim=1) - cell * along.abs().sum(dim=1)
+        good &= thickness > gripper.least_held + UNSURE
+    if views.others:
+        between = (u - shift[:, None]).abs() < width[:, None] / 2
+        mixed = (
+            (views.label.flatten()[where] == OTHER_LABEL)
+            & (height > tip[:, None, None])
+            & between[:, None]
+        )
+        good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
+    near = (u - shift[:, None]).abs()
+    around = beside.flatten()[where].amax(dim=1)
+    opening = _widest_opening(around, near, tip, width, gripper, settings)
+    good &= opening > 0
+    gap = _palm_gap(xy, view, along, across, views, under_palm, gripper)
+    good &= gap >= settings.clearance - tip
+    open_wide = opening
+    if gripper.opens_fully:
+        open_wide = torch.minimum(opening, width + 2 * settings.rooms[-1])
+    under = _outline(gripper.finger_outline, near - open_wide[:, None] / 2)
+    over = views.ceiling.flatten()[where] - under[:, None]
+    covered = (over > tip[:, None, None]).double().mean(dim=(1, 2))
+    opening, covered = torch.where(good, opening, 0.0), torch.where(good, covered, 0.0)
+
+    room, together = (opening - width) / 2, ends[0] == ends[1]
+    on_top = torch.where(touched, top, 0.0)
+    score = grip_score(
+        torch, settings, wedge=wedge, turn=turn, tilt=tilt, arms=arms, cover=cover,
+        engagement=engagement, roomy=0.4 + 0.6 * ((room - 0.003) / 0.005).clamp(0, 1),
+        covered=covered, together=together,
+        over_table=views.rise(view, torch.cat([xy, on_top[:, None]], dim=1)),
+    )  # fmt: skip
+    turn = turn.clamp(-np.pi / settings.angles, np.pi / settings.angles)
+    facts = torch.stack(
+        [
+            wedge, tilt_left, tilt_right, cover, *arms, engagement, covered, room,
+            together.double(),
+        ],
+        dim=1,
+    )  # fmt: skip
+    facts = facts.nan_to_num(nan=0.0, posinf=np.pi, neginf=-np.pi)
+    score = torch.where(good, score, 0.0)
+    columns = (width, opening, turn, label, score, facts, candidates.value)
+    return FanCandidates(view, xy, candidates.angle, tip, *columns)
+
+
+def cells_around(xy, view, along, across, u, v, views: FanViews) -> torch.Tensor:
+    """(N, V, U) flat indices of the maps' cells u (U,) along and v (V,) across, m, from the centres
+    xy (N, 2) in the views (N,); along, across: (N, 2) unit vectors."""
+    places = (
+        (xy[:, k, None] + u * along[:, k, None])[:, None] + v[:, None] * across[:, k, None, None]
+        for k in (0, 1)
+    )
+    return views.cells(view[:, None, None], torch.stack(tuple(places), dim=-1))
+
+
+def _first_contacts(
+    matter: torch.Tensor, u: torch.Tensor, cell: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(...) places at which lines (..., U) first meet matter, from the left and from the right."""
+    left = torch.where(matter, u, torch.inf).amin(dim=-1) - cell / 2
+    right = torch.where(matter, u, -torch.inf).amax(dim=-1) + cell / 2
+    return left, right
+
+
+def _fit_faces(
+    left_gap: torch.Tensor, right_gap: torch.Tensor, v: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Turn, wedge and cover, each (N,), as of `utils.grasp_quality.fit_faces`."""
+    gap = torch.stack([left_gap, right_gap])
+    weight = (gap < NEAR_FACE).double()
+    cover = (weight * (gap < TOUCH)).mean(dim=-1).amin(dim=0)
+    gap = torch.where(gap < NEAR_FACE, gap, 0.0)
+    mean_v = (weight * v).sum(dim=-1) / weight.sum(dim=-1).clamp(min=1)
+    spread = weight * (v - mean_v[..., None])
+    variance = (spread * v).sum(dim=-1)
+    slope = (spread * gap).sum(dim=-1) / torch.where(variance > 1e-9, variance, torch.inf)
+    left, right = slope.atan()
+    return -(left - right) / 2, (left + right).abs() / 2, cover
+
+
+def _widest_opening(
+    obstacles: torch.Tensor,
+    near: torch.Tensor,
+    tip: torch.Tensor,
+    width: torch.Tensor,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> torch.Tensor:
+    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is."""
+    rooms = (np.inf,) if gripper.opens_fully else settings.rooms
+    half = torch.stack([width / 2 + room for room in rooms])  # (rooms, N)
+    half = half.clamp(max=gripper.max_opening / 2)
+    least = width / 2 + settings.rooms[0]
+    sill = torch.where(near > least[:, None], settings.clearance + 0.001, torch.inf)
+    outward = near - half[..., None]
+    below_finger = _outline(gripper.finger_outline, outward.clamp(min=0))
+    under = torch.where(outward < -settings.inner_margin, sill, below_finger)
+    fits = (obstacles - under).amax(dim=2) <= tip - settings.clearance
+    fits &= half >= least - 1e-9
+    return torch.where(fits, 2 * half, 0.0).amax(dim=0)
+
+
+def _palm_gap(
+    xy, view, along, across, views: FanViews, under_palm: torch.Tensor, gripper: GripperGeometry
+) -> torch.Tensor:
+    """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
+    u, v = (
+        torch.linspace(
+            -end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, dtype=torch.float64, device=xy.device
+        )
+        for end in (gripper.palm_half_length, gripper.palm_outline[-1][0])
+    )
+    nearby = under_palm.flatten()[cells_around(xy, view, along, across, u, v, views)].amax(dim=2)
+    return (_outline(gripper.palm_outline, v.abs()) - nearby).amin(dim=1)
+
+
+def _outline(outline: Sequence[tuple[float, float]], outward: torch.Tensor) -> torch.Tensor:
+    """(...) height of an underside at distances outward, linear between its corners; infinite
+    beside it."""
+    under = torch.full_like(outward, torch.inf)
+    for (near, low), (far, high) in zip(outline, outline[1:]):
+        here = (outward >= near) & (outward <= far)
+        under = torch.where(here, low + (high - low) / (far - near) * (outward - near), under)
+    return under
