@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -54,10 +55,32 @@ def measure(
 ) -> FanCandidates:
     """The candidates posed on their maps, centred between their contacts, and scored."""
     radius = int(np.ceil(PALM_STEP / np.sqrt(2) / views.cell)) + 1
-    maps = views.highest_beside, views.ceiling_within(radius)
+    maps = _Maps(views, views.highest_beside, views.ceiling_within(radius))
     if views.height.device.type == "cuda" and len(candidates):
-        return _measured_by_recording(candidates, views, *maps, gripper, settings)
-    return _measured(candidates, views, *maps, gripper, settings)
+        return _measured_by_recording(candidates, maps, gripper, settings)
+    return _measured(candidates, maps, gripper, settings)
+
+
+class _Maps(NamedTuple):
+    """What candidates are measured on. beside: (B, R, C) `FanViews.highest_beside`. under_palm:
+    (B, R, C) m in V, the highest ceilings that a point under the palm stands for."""
+
+    views: FanViews
+    beside: torch.Tensor
+    under_palm: torch.Tensor
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All that changes from frame to frame."""
+        names = ("height", "ceiling", "label", "centres", "T_WV", "beyond")
+        found = {name: getattr(self.views, name) for name in names}
+        found |= {"beside": self.beside, "under_palm": self.under_palm}
+        return {name: part for name, part in found.items() if part is not None}
+
+    def copied(self) -> _Maps:
+        """The same with tensors of their own."""
+        own = {name: part.clone() for name, part in self.tensors().items()}
+        beside, under_palm = own.pop("beside"), own.pop("under_palm")
+        return _Maps(replace(self.views, **own), beside, under_palm)
 
 
 class _Recording:
@@ -70,20 +93,14 @@ class _Recording:
     def __init__(
         self,
         candidates: FanCandidates,
-        views: FanViews,
-        beside: torch.Tensor,
-        under_palm: torch.Tensor,
+        maps: _Maps,
         gripper: GripperGeometry,
         settings: SearchSettings,
     ):
-        maps = {name: part.clone() for name, part in _maps_of(views).items()}
-        self._views = replace(views, **maps)
-        self._inputs = [*_columns(candidates.take(slice(None))), *maps.values()]
-        self._inputs += [beside.clone(), under_palm.clone()]
-        count = len(fields(FanCandidates))
-        arguments = (
-            FanCandidates(*self._inputs[:count]), self._views, *self._inputs[-2:], gripper, settings
-        )  # fmt: skip
+        mine = maps.copied()
+        self._inputs = [*_columns(candidates), *mine.tensors().values()]
+        # Kept, with what is cached in them: the graph reads their memory.
+        self._arguments = arguments = candidates, mine, gripper, settings
         warm_up = torch.cuda.Stream()
         warm_up.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(warm_up):  # before a recording, as PyTorch asks for
@@ -93,15 +110,9 @@ class _Recording:
         with torch.cuda.graph(self._graph, pool=_memory()):
             self._result = _measured(*arguments)
 
-    def __call__(
-        self,
-        candidates: FanCandidates,
-        views: FanViews,
-        beside: torch.Tensor,
-        under_palm: torch.Tensor,
-    ) -> FanCandidates:
+    def __call__(self, candidates: FanCandidates, maps: _Maps) -> FanCandidates:
         """The measured candidates; the next call, of any recording, overwrites them."""
-        given = [*_columns(candidates), *_maps_of(views).values(), beside, under_palm]
+        given = [*_columns(candidates), *maps.tensors().values()]
         for mine, new in zip(self._inputs, given):
             mine.copy_(new)
         self._graph.replay()
@@ -119,48 +130,34 @@ def _memory() -> tuple[int, int]:
 
 @torch.inference_mode()
 def _measured_by_recording(
-    candidates: FanCandidates,
-    views: FanViews,
-    beside: torch.Tensor,
-    under_palm: torch.Tensor,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
+    candidates: FanCandidates, maps: _Maps, gripper: GripperGeometry, settings: SearchSettings
 ) -> FanCandidates:
     """As `_measured`. A recording serves all numbers of candidates up to one of a few."""
-    device, count = views.height.device, len(candidates)
+    views, count = maps.views, len(candidates)
+    device = views.height.device
     most = settings.finalists * len(views)
     size = most if count <= most else settings.shortlist * len(views)
     number = torch.arange(max(size, count), device=device)
     padded = candidates.take(number.clamp(max=count - 1))
-    shapes = tuple((name, part.shape) for name, part in _maps_of(views).items())
+    shapes = tuple((name, part.shape) for name, part in maps.tensors().items())
     key = (
         gripper, settings, len(number), shapes, views.origin, views.cell, views.table_height,
         views.others, device,
     )  # fmt: skip
     if key not in _recordings:
-        _recordings[key] = _Recording(padded, views, beside, under_palm, gripper, settings)
-    return _recordings[key](padded, views, beside, under_palm).take(number[:count])
+        _recordings[key] = _Recording(padded, maps, gripper, settings)
+    return _recordings[key](padded, maps).take(number[:count])
 
 
 def _columns(candidates: FanCandidates) -> list[torch.Tensor]:
     return [getattr(candidates, field.name) for field in fields(candidates)]
 
 
-def _maps_of(views: FanViews) -> dict[str, torch.Tensor]:
-    names = ("height", "ceiling", "label", "centres", "T_WV", "beyond")
-    return {name: getattr(views, name) for name in names if getattr(views, name) is not None}
-
-
 def _measured(
-    candidates: FanCandidates,
-    views: FanViews,
-    beside: torch.Tensor,
-    under_palm: torch.Tensor,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
+    candidates: FanCandidates, maps: _Maps, gripper: GripperGeometry, settings: SearchSettings
 ) -> FanCandidates:
-    """See `measure`. beside, under_palm: (B, R, C) `FanViews.highest_beside`, and the highest
-    ceilings that a point under the palm stands for."""
+    """See `measure`."""
+    views, beside, under_palm = maps
     device, cell, tip = views.height.device, views.cell, candidates.tip
     view, width, (along, across) = candidates.view, candidates.width, candidates.axes()
     most = np.ceil((gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH) / cell)
