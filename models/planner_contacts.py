@@ -42,11 +42,12 @@ def scored_by_contacts(
     out.
 
     scene: in the candidates' frame. buried: (M,) share of each object that others cover. fallback:
-    (N,) small scores, which decide where no contacts are antipodal; by default those of the height
-    map.
+    (N,) small scores, which decide where no contacts are antipodal, unless the pads would slip off;
+    by default those of the height map.
     """
-    quality = exact_quality(found, scene, gripper)
+    quality, slips = exact_contacts(found, scene, gripper)
     least = 0.01 * found.score if fallback is None else fallback
+    least = np.where(slips, 0.0, least)
     score = (found.score * quality + least) * (1 - 0.7 * buried[found.label])
     found = replace(found, score=np.where(score >= _HOPELESS, score, 0.0))
     return found.best(len(found))
@@ -55,10 +56,22 @@ def scored_by_contacts(
 def exact_quality(
     candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
 ) -> np.ndarray:
-    """(N,) in [0, 1]: quality of the pads' contacts, at the nominal pose and at `PERTURBATIONS`.
+    """(N,) in [0, 1]: the quality of `exact_contacts`."""
+    return exact_contacts(candidates, scene, gripper)[0]
+
+
+def exact_contacts(
+    candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
+) -> tuple[np.ndarray, np.ndarray]:
+    """How well the pads hold, and whether they slip off.
+
+    Returns the quality (N,) in [0, 1] of the pads' contacts, at the nominal pose and at
+    `PERTURBATIONS`, and (N,) bool whether the pads slip off upwards at the nominal one.
 
     The quality of a pose is 0 unless both pads first meet the same object with normals inside the
     friction cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
+    Pads slip off where the two faces rise towards the hand, on average, by more than that cone's
+    angle: no turn of the object makes such a wedge narrower.
     """
     N, P = len(candidates), len(PERTURBATIONS)
     along, across = candidates.axes()
@@ -70,17 +83,19 @@ def exact_quality(
     centre = np.column_stack([candidates.xy, candidates.tip])[:, None]
     centre = centre + PERTURBATIONS[:, :1] * along + PERTURBATIONS[:, 1:2] * across
     along, across = cos * along + sin * across, cos * across - sin * along
-    value = _pad_contacts(
+    value, slips = _pad_contacts(
         centre.reshape(-1, 3), along.reshape(-1, 3), across.reshape(-1, 3),
         np.repeat(candidates.opening / 2, P), scene, gripper,
-    ).reshape(N, P)  # fmt: skip
-    return 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
+    )  # fmt: skip
+    value, slips = value.reshape(N, P), slips.reshape(N, P)[:, 0]
+    quality = 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
+    return quality, slips
 
 
 def _pad_contacts(
     centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
-) -> np.ndarray:
-    """(N,) quality in [0, 1] of the contacts of two closing pads.
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) quality in [0, 1] of the contacts of two closing pads, and (N,) whether they slip off.
 
     centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
     """
@@ -103,6 +118,7 @@ def _pad_contacts(
     travel = np.full((2, N * L), np.inf)
     owner = np.full((2, N * L), -1)
     facing = np.zeros((2, N * L))
+    rising = np.zeros((2, N * L))  # sine of the angle by which the face looks up
     bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
     for number, solids in [*bodies, (-1, scene.walls)]:  # -1 is not an object to be held
         for solid in solids:
@@ -126,7 +142,8 @@ def _pad_contacts(
                 travel[side, chosen] = distance[better]
                 owner[side, chosen] = number
                 facing[side, chosen] = sign * (normal[better] * directions[chosen]).sum(axis=1)
-    travel, owner, facing = (x.reshape(2, N, L) for x in (travel, owner, facing))
+                rising[side, chosen] = normal[better, 2]
+    travel, owner, facing, rising = (x.reshape(2, N, L) for x in (travel, owner, facing, rising))
 
     first = travel.min(axis=2, keepdims=True)
     touch = travel < first + 0.0015
@@ -144,6 +161,8 @@ def _pad_contacts(
     held = held[0, :, 0]
     friction = np.array([item.friction for item in scene.objects])[held]
     cone = 0.9 * np.arctan(np.minimum(friction, 1.0))  # the fingers' own friction is 1
+    slope = np.arcsin(np.clip((rising * touch).sum(axis=2) / count, -1, 1))
+    slips = slope.mean(axis=0) > cone
     worst = angle.max(axis=0)
     to_mass = np.array([item.centre_of_mass for item in scene.objects])[held] - centre
     arm = np.abs((to_mass * across).sum(axis=1) - point[..., 0].mean(axis=0))
@@ -151,7 +170,8 @@ def _pad_contacts(
     value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(
         -((arm / 0.02) ** 2) - (above / 0.06) ** 2
     )
-    return value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
+    value = value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
+    return value, slips
 
 
 def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:
