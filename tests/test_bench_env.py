@@ -17,9 +17,12 @@ def test_quick_benchmark_writes_every_metric(tmp_path, capfd):
     bench_env.main(["--quick", "--json", str(path)])
     content = json.loads(path.read_text())
     assert {name: metric["target"] for name, metric in content.items()} == {
-        "step_vs_panda_gym": ">= 1.5",
-        "step_vs_bare_physics": "<= 1.25",
+        "step_vs_panda_gym": ">= 1.6",
+        "step_vs_bare_physics": "<= 1.2",
         "steps_per_second": None,
+        "held_step_vs_panda_gym": ">= 1.6",
+        "held_step_vs_bare_physics": "<= 1.2",
+        "held_steps_per_second": None,
         "frame_64_vs_stock": ">= 8",
         "frame_224_vs_stock": ">= 2.2",
         "physics_5_objects_vs_stock": ">= 2",
