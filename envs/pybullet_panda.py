@@ -32,6 +32,8 @@ _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
 _ANY_SPEED = 100.0  # rad/s, at which Bullet cuts every joint off unless told otherwise
+_RENEWED_COSINE = math.cos(math.radians(5) / 2)  # of half the angle by which the hand has turned
+_MOVING, _EVERYTHING = 1, -1  # Bullet's group of what moves, and the groups that this meets
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 
 
@@ -48,6 +50,7 @@ class PybulletHand(Hand):
         """Load the body and make its joints' nature that of the real hand."""
         self.client = client
         self.gripper_gain = 1.0
+        self._contacts_from: tuple[float, ...] | None = None  # the hand's quaternion of then
         self.palm = self._carriers[-1]
         self.fingers = [self.palm + 1, self.palm + 2]
         self.joints = [*self._carriers, *self.fingers]
@@ -104,6 +107,22 @@ class PybulletHand(Hand):
         return -sum(state[3] for state in states) / 2
 
     # --- Contacts -----------------------------------------------------------------------------
+
+    def renew_contacts(self) -> None:
+        """Let the fingers' contacts be found again where the hand has turned by some degrees.
+
+        Bullet keeps a contact with a friction anchor as it was found, its normal in W included: in
+        a hand that turns with what it holds, the fingers soon press across their closing line, and
+        the object slips out.
+        """
+        turned = pybullet.getLinkState(self.body, self.palm, physicsClientId=self.client)[5]
+        before = self._contacts_from = self._contacts_from or turned
+        if abs(sum(a * b for a, b in zip(turned, before))) < _RENEWED_COSINE:
+            self._contacts_from = turned
+            for finger in self.fingers:  # the same filter again: Bullet forgets what it had found
+                pybullet.setCollisionFilterGroupMask(
+                    self.body, finger, _MOVING, _EVERYTHING, physicsClientId=self.client
+                )
 
     def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
         contacts = pybullet.getContactPoints(

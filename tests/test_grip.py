@@ -9,6 +9,7 @@ from envs.cell import Cell
 from envs.cell_layout import Placement, Scene
 from envs.execution import close_fingers, execute_grasp, give_way, open_loop
 from envs.object_primitives import NativeShape
+from envs.objects import load_object_set
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
 from tests.helpers.simulators import INSTALLED
@@ -82,6 +83,24 @@ def test_a_bar_that_turns_in_the_hand_is_reported(config, box_set):
     assert (lenient.reason, strict.reason, centred.reason) == ("success", "turned", "success")
     assert np.degrees(lenient.motion.turned) > 15 > 5 > np.degrees(centred.motion.turned)
     assert centred.motion.slid < 0.005
+
+
+def test_contacts_turn_with_the_hand(cell, config):
+    """A mesh, gripped and turned by 120 degrees in a second: the fingers press along their closing
+    line as before. (Bullet's own contacts keep their direction in the world.)"""
+    model = load_object_set("random_urdfs", cache_dir=config.cache_folder)[10]
+    grip(cell, model, 10.0)
+    cell.step(120)
+    before, start, steps = cell.robot.grip_forces(cell.bodies[0]), cell.robot.q, 240
+    assert min(before) > 8
+    for step in range(steps):
+        turn = np.zeros((2, 7))  # of joint 7, and its speed
+        phase = np.pi * (step + 1) / steps
+        turn[:, 6] = -np.deg2rad(60) * np.array([1 - np.cos(phase), np.pi * np.sin(phase)])
+        cell.robot.command_arm(start + turn[0], turn[1])
+        cell.step()
+        assert cell.robot.holds(cell.bodies[0], min_force=7)
+    assert start[6] - cell.robot.q[6] > np.deg2rad(110)
 
 
 @pytest.mark.parametrize("mass", [0.1, 1.2])
