@@ -310,6 +310,7 @@ def _carry_to_bin(
     way = robot.blended_moves(start, lift, carry, corner, **scales(cell))
     grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
     for first in range(0, len(lift), every):
+        robot.renew_contacts()
         follow(cell, way[first : min(first + every, len(lift))], grip.feel)
         grip.press()
     if index is None or motion is None:
@@ -318,6 +319,7 @@ def _carry_to_bin(
         raise GraspFailure("slipped")
     end = cell.seconds + settings.hold_seconds
     for first in range(len(lift), len(way), every):
+        robot.renew_contacts()
         follow(cell, way[first : first + every], grip.feel)
         grip.press()
         _still_lifted(cell, index, motion)

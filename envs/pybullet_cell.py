@@ -105,7 +105,6 @@ class PybulletCell(Cell):
 
     def _simulate(self, count: int) -> None:
         client = self.client
-        self.robot.renew_contacts()
         if not self._gui and _divides(self.dt, count):
             # The same steps in one call. The time step is set only for that call, because motor
             # commands and contact forces are converted by it.

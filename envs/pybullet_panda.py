@@ -32,7 +32,7 @@ _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
 _ANY_SPEED = 100.0  # rad/s, at which Bullet cuts every joint off unless told otherwise
-_RENEWED_COSINE = math.cos(math.radians(5) / 2)  # of half the angle by which the hand has turned
+_RENEWED_COSINE = math.cos(math.radians(10) / 2)  # of half the angle by which the hand has turned
 _MOVING, _EVERYTHING = 1, -1  # Bullet's group of what moves, and the groups that this meets
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
 

@@ -98,6 +98,8 @@ def test_contacts_turn_with_the_hand(cell, config):
         phase = np.pi * (step + 1) / steps
         turn[:, 6] = -np.deg2rad(60) * np.array([1 - np.cos(phase), np.pi * np.sin(phase)])
         cell.robot.command_arm(start + turn[0], turn[1])
+        if step % 12 == 0:
+            cell.robot.renew_contacts()
         cell.step()
         assert cell.robot.holds(cell.bodies[0], min_force=7)
     assert start[6] - cell.robot.q[6] > np.deg2rad(110)
