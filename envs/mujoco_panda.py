@@ -229,6 +229,9 @@ class MujocoHand(Hand):
 
     # --- Contacts -----------------------------------------------------------------------------
 
+    def renew_contacts(self) -> None:
+        """Nothing is left to do: MuJoCo finds all contacts anew in each of its steps."""
+
     def _finger_contacts(self, finger: int, body: int) -> Iterator[Contact]:
         for number, normal in self._contacts_between(self._links[FINGERS[finger]], body):
             yield tuple(normal.tolist()), self._normal_force(number)

@@ -152,6 +152,7 @@ class Hand(ABC):
         """Whether both fingers grip the body with at least `min_force` newtons each."""
         return min(self.grip_forces(body)) >= min_force
 
+    @abstractmethod
     def renew_contacts(self) -> None:
         """Ask now and then while the hand carries something: a simulator that keeps contacts as it
         found them finds the fingers' anew, in its next step, where the hand has turned since."""
