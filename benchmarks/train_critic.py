@@ -34,6 +34,7 @@ from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
 from utils.config import Config
+from utils.distributed import choose_device
 from utils.errors import UserError
 from utils.executor import completed, open_executor
 from utils.result_formats import aligned
@@ -43,6 +44,7 @@ HELD_OUT = 10  # every tenth scene
 SHARD = 50  # scenes of a file
 EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
 FURTHER_RATE = 3e-4  # from weights that are given: at the rate above they forget what they know
+CPU = torch.device("cpu")
 UPRIGHT = np.cos(np.deg2rad(30))  # cosine of a camera's angle to the vertical, from which it counts
 TILTS = INPUTS.index("tilt_left"), INPUTS.index("tilt_right")
 
@@ -71,11 +73,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     if chosen.scenes < HELD_OUT:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
+    device = choose_device(config.train.device)
     initial = None if chosen.initial is None else load_critic(chosen.initial)
     examples = collect(config, chosen.scenes, chosen.examples)
     if chosen.folds is not None:
         assert initial is not None  # checked above
-        print(compared(initial, examples, config.seed, chosen.folds))
+        print(compared(initial, examples, config.seed, chosen.folds, device))
         return 0
     held_out = examples.scene % HELD_OUT == 0
     scores = {}
@@ -86,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     more = [Examples.load(path) for folder in chosen.more for path in shards(folder)]
     more = [part.where(part.scene % HELD_OUT != 0) for part in more]
     learned = Examples.joined([examples.where(~held_out), *more])
-    critic = fit(learned, config.seed, initial=initial)
+    critic = fit(learned, config.seed, initial=initial, device=device)
     scores |= judged(critic, examples.where(held_out))
     print(
         f"{len(examples.success)} grasps of {chosen.scenes} scenes, "
@@ -108,24 +111,28 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
     scenes each in a file, and what it has already is not played again. Raises UserError where it
     holds scenes of another seed or a damaged file."""
     check_same_settings(folder, config)
-    parts = []
+    files = {
+        first: folder / f"scenes-{first:05d}-{min(first + SHARD, scenes) - 1:05d}.npz"
+        for first in range(0, scenes, SHARD)
+    }
+    missing = [number for number in range(scenes) if not files[number - number % SHARD].exists()]
+    found: dict[int, dict[int, Examples]] = {first: {} for first in files}
     with (
         open_executor(config.compute, config.data.workers) as workers,
-        tqdm(total=scenes, unit="scene") as progress,
+        tqdm(total=scenes, initial=scenes - len(missing), unit="scene") as progress,
     ):
-        for first in range(0, scenes, SHARD):
-            numbers = range(first, min(first + SHARD, scenes))
-            path = folder / f"scenes-{numbers.start:05d}-{numbers.stop - 1:05d}.npz"
-            if path.exists():
-                progress.update(len(numbers))
-            else:
-                found = []
-                for one in completed(workers, partial(examples_of, config), numbers):
-                    found.append(one)
-                    progress.update()
-                Examples.joined(sorted(found, key=lambda one: one.scene[:1].tolist())).save(path)
-            parts.append(Examples.load(path))
-    return Examples.joined(parts)
+        for number, one in completed(workers, partial(_numbered, config), missing):
+            first = number - number % SHARD
+            found[first][number] = one
+            if len(found[first]) == min(first + SHARD, scenes) - first:
+                part = found.pop(first)
+                Examples.joined([part[number] for number in sorted(part)]).save(files[first])
+            progress.update()
+    return Examples.joined([Examples.load(path) for path in files.values()])
+
+
+def _numbered(config: Config, number: int) -> tuple[int, Examples]:
+    return number, examples_of(config, number)
 
 
 def shards(folder: Path) -> list[Path]:
@@ -159,10 +166,14 @@ def check_same_settings(folder: Path, config: Config) -> None:
 
 
 def fit(
-    examples: Examples, seed: int, epochs: int = EPOCHS, initial: GraspCritic | None = None
+    examples: Examples,
+    seed: int,
+    epochs: int = EPOCHS,
+    initial: GraspCritic | None = None,
+    device: torch.device = CPU,
 ) -> GraspCritic:
     """A critic of these candidates, by cross-entropy. initial: whose weights to start from; the
-    facts keep its mean and scale."""
+    facts keep its mean and scale. device: where it is trained; the result is on the CPU."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     critic = GraspCritic()
@@ -173,12 +184,15 @@ def fit(
     else:
         critic.mean.copy_(facts.mean(dim=0))
         critic.scale.copy_(facts.std(dim=0).clamp_min(1e-3))
+    critic, facts, patches, success = (
+        part.to(device) for part in (critic, facts, patches, success)
+    )
     optimizer = torch.optim.AdamW(critic.parameters(), lr=RATE, weight_decay=DECAY)
     steps = epochs * -(-len(success) // BATCH)
     rate = RATE if initial is None else FURTHER_RATE
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for _ in tqdm(range(epochs), unit="epoch"):
-        order = torch.from_numpy(rng.permutation(len(success)))
+        order = torch.from_numpy(rng.permutation(len(success))).to(device)
         for batch in order.split(BATCH):
             logits = critic(*mirrored(facts[batch], patches[batch], rng))
             loss = functional.binary_cross_entropy_with_logits(logits, success[batch])
@@ -186,7 +200,7 @@ def fit(
             loss.backward()
             optimizer.step()
             schedule.step()
-    return critic.eval()
+    return critic.eval().to(CPU)
 
 
 def mirrored(
@@ -223,13 +237,15 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
     return scores
 
 
-def compared(initial: GraspCritic, examples: Examples, seed: int, folds: int) -> str:
+def compared(
+    initial: GraspCritic, examples: Examples, seed: int, folds: int, device: torch.device = CPU
+) -> str:
     """A table of `initial` and of what it becomes: how many first candidates of plans succeed, the
     difference with the half width of its 95 % interval, in points, and the mean log loss."""
     before, after = initial.chance(examples.inputs), np.empty(len(examples.success))
     for fold in range(folds):
         own = examples.scene % folds == fold
-        critic = fit(examples.where(~own), seed, initial=initial)
+        critic = fit(examples.where(~own), seed, initial=initial, device=device)
         after[own] = critic.chance(examples.where(own).inputs)
     facts = dict(zip(INPUTS, examples.inputs.facts.T))
     preference, upright = JUDGED_FAN.preference(facts["tilt"]), facts["camera_height"] > UPRIGHT

@@ -59,7 +59,7 @@ def test_a_comparison_judges_each_scene_by_what_learned_from_the_others(monkeypa
     facts[:, INPUTS.index("camera_height")] = 1.0
     learned_from = []
 
-    def fitted(own: Examples, seed: int, initial: GraspCritic) -> GraspCritic:
+    def fitted(own: Examples, seed: int, initial: GraspCritic, device) -> GraspCritic:
         learned_from.append({*own.scene})
         return fit(own, seed, epochs=15)
 
