@@ -47,13 +47,12 @@ from utils.result_records import (
     RoundRecord,
     policy_name,
 )
-from utils.transforms import Grasp, RGBDFrame, grasp_to_image
+from utils.transforms import PLANAR, Grasp, RGBDFrame, grasp_to_image
 
 # A grasp nearer than both to one that failed is the same one again.
 TRIED_DISTANCE = 0.02  # m
 TRIED_ANGLE = np.deg2rad(30)
 ANOTHER = 0.05  # m from every grasp that failed: most likely another object
-PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
 

@@ -51,6 +51,7 @@ from utils.height_map import (
 from utils.seen_heights import hides, without_holes
 from utils.target import only_target
 from utils.transforms import (
+    PLANAR,
     Grasp,
     RGBDFrame,
     deproject,
@@ -208,17 +209,22 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
 # The critic's chance tells already what a tilt costs; what is left is the room for the arm.
 JUDGED_FAN = FanSettings(tilt_scale=3.0)
+# The critic's chance from which a grasp from straight above is as good as any: chosen on training
+# objects (docs/six_dof.md).
+LIKELY = 0.975
 
 
 class GraspNetFanPlanner(Judged, FanPlanner):
-    """A fan of views: a network values the candidates by the image that was taken, and a critic has
-    the last word on each view's: the shipped one, unless `critic` is given. A critic on another
+    """From straight above as `GraspNetPlanner` plans, where that is likely to succeed; elsewhere in
+    a fan of views, too: a network values the candidates by the image that was taken, and a critic
+    has the last word on each view's: the shipped one, unless `critic` is given. A critic on another
     device than the network's is copied.
 
-    device: of the network. at_once: whether all views are searched in one pass there
-    (`models.fan_search`); by default on a GPU alone, though with many cores it is quicker on a CPU,
-    too. Frames with fixtures or a second look, and those of a planner with another `judge`, are
-    searched view by view.
+    likely: the critic's chance of the best grasp from straight above, from which no other side is
+    looked at; over 1, the fan alone serves. device: of the network. at_once: whether all views are
+    searched in one pass there (`models.fan_search`); by default on a GPU alone, though with many
+    cores it is quicker on a CPU, too. Frames with fixtures or a second look, and those of a planner
+    with another `judge`, are searched view by view, the latter in the fan alone.
     """
 
     def __init__(
@@ -229,6 +235,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         checkpoint: Path = SHIPPED,
         network: SavedGraspNet | None = None,
         critic: GraspCritic | None = None,
+        likely: float = LIKELY,
     ):
         super().__init__(gripper, workspace, seed, SEARCH, JUDGED_FAN)
         self.network = network or loaded(checkpoint)
@@ -237,14 +244,38 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         if next(self.critic.parameters()).device != self.device:
             self.critic = copy.deepcopy(self.critic).to(self.device)  # others use it where it is
         self.judge = self._own_judge = chances_by(self.critic)
+        self.likely = likely
+        self._above = GraspNetPlanner(
+            gripper, workspace, seed, network=self.network, critic=self.critic
+        )
         self.at_once = self.device.type == "cuda"
+
+    def return_at_least(self, count: int) -> None:
+        super().return_at_least(count)
+        self._above.return_at_least(count)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if not known_depth(frame.depth).any():
             return []
         frame = corrected(frame, self.workspace.table_height)
+        by_critic = self.judge is self._own_judge
+        above = []
+        if by_critic and self.likely <= 1 and not self.covered(frame.fixtures):
+            above = self._above(frame)
+        if above and above[0].quality >= self.likely:
+            grasps = above
+        else:
+            fan = self._from_any_side(frame, by_critic)
+            leaning = [grasp for grasp in fan if grasp.tilt > PLANAR] if above else fan
+            grasps = sorted([*above, *leaning], key=self._worth, reverse=True)
+        return with_chances(grasps, self.calibration, frame.roughness)
+
+    def _from_any_side(self, frame: RGBDFrame, by_critic: bool) -> list[Grasp]:
+        """The grasps of the fan with the critic's chances, best first."""
         seen = NetworkView(self.network, frame, self.workspace, below=True)
         overhead = only_target(seen.heights, frame)
+        if by_critic and self.at_once and not frame.fixtures and frame.second is None:
+            return self._searched_at_once(seen, overhead)
 
         def tilted(T_WV: np.ndarray) -> HeightMap:
             return tilted_height_map(overhead, *seen.holeless, T_WV)
@@ -252,13 +283,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         def of_view(heights: HeightMap, found: Candidates) -> Candidates:
             return self.judged(heights, found, seen, VIEW_JUDGED)
 
-        by_critic = self.judge is self._own_judge
-        if self.at_once and by_critic and not frame.fixtures and frame.second is None:
-            grasps = self._searched_at_once(seen, overhead)
-        else:
-            covered = self.covered(frame.fixtures)
-            grasps = self.search_fan(overhead, tilted, seen.value, of_view, covered)
-        return with_chances(grasps, self.calibration, frame.roughness)
+        covered = self.covered(frame.fixtures)
+        return self.search_fan(overhead, tilted, seen.value, of_view, covered)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace, below=True).heights

@@ -220,11 +220,11 @@ def kind_of_frame(kind: str) -> RGBDFrame:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=GPU)])
 def test_the_grasps_are_those_of_one_view_after_the_other(device: str, kind: str) -> None:
     gripper = GripperGeometry(**KINDS[kind])
-    by_view = GraspNetFanPlanner(gripper, Workspace())
+    by_view = GraspNetFanPlanner(gripper, Workspace(), likely=np.inf)
     assert not by_view.at_once, "on two cores NumPy is quicker"
     saved = by_view.network
     saved = saved._replace(model=copy.deepcopy(saved.model).to(device))
-    planner = GraspNetFanPlanner(gripper, Workspace(), network=saved)
+    planner = GraspNetFanPlanner(gripper, Workspace(), network=saved, likely=np.inf)
     assert planner.at_once == (device == "cuda")
     planner.at_once = True
     frame = kind_of_frame(kind)
@@ -242,7 +242,7 @@ def test_the_grasps_are_those_of_one_view_after_the_other(device: str, kind: str
 
 
 def test_a_camera_in_32_bits_gives_the_same_grasps() -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
     planner.at_once = True
     frame = boxes_frame(BOXES)
     single = replace(frame, K=frame.K.astype(np.float32), T_WC=frame.T_WC.astype(np.float32))
@@ -250,21 +250,21 @@ def test_a_camera_in_32_bits_gives_the_same_grasps() -> None:
 
 
 def test_another_judge_judges_view_by_view() -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
     planner.at_once = True
     planner.judge = lambda heights, found, inputs: np.full(len(found), 0.25)
     assert {grasp.quality for grasp in planner(boxes_frame(BOXES))} == {0.25}
 
 
 def test_an_empty_table_has_no_grasp() -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
     planner.at_once = True
     assert planner(boxes_frame([])) == []
 
 
 def test_a_shelf_is_searched_view_by_view(monkeypatch) -> None:
     """Fixtures and second frames are left to NumPy."""
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
     planner.at_once = True
     monkeypatch.setattr(planner, "_searched_at_once", None)
     frame = shelf_frame([((0.05, 0.05, 0.12), 0.3, (0.5, -0.02))])

@@ -240,14 +240,13 @@ def test_who_ranks_by_the_shipped_critic_and_who_by_one_that_is_given() -> None:
     for kind in (GraspNetPlanner, GraspNetDirectPlanner, GraspNetFanPlanner):
         preferred = [grasp for grasp in kind(*parts, critic=Fixed())(frame) if grasp.tilt < 1e-6]
         assert {round(grasp.quality, 6) for grasp in preferred} == {0.123}
-    for kind in (GraspNetPlanner, GraspNetDirectPlanner, GraspNetFanPlanner):
+    fan_alone = partial(GraspNetFanPlanner, likely=np.inf)
+    for kind in (GraspNetPlanner, GraspNetDirectPlanner, fan_alone):
         planner = kind(*parts)
         inputs, _, _ = critic_examples.judged_by(kind(*parts), frame)
         stated = np.concatenate([shipped_critic().chance(inputs), [0.0]])
         for grasp in planner(frame)[:3]:
-            factor = (
-                JUDGED_FAN.preference(np.array(grasp.tilt)) if kind is GraspNetFanPlanner else 1
-            )
+            factor = JUDGED_FAN.preference(np.array(grasp.tilt)) if kind is fan_alone else 1
             assert np.abs(stated * factor - grasp.quality).min() < 1e-6
 
 

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from utils.errors import UserError
 
 DOWN = (0.0, 0.0, -1.0)  # the approach of a planar grasp
+PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 
 
 @dataclass(frozen=True)
