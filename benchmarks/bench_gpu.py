@@ -2,8 +2,9 @@
 
 GraspNet's training step, its maps of a batch of images, and the plans of those planners that have
 networks, on the GPU and on all cores of the same machine; and MuJoCo's pictures by the OpenGL that
-this machine offers. Of a plan with six degrees of freedom the search, too, runs on the GPU where
-all views are searched at once, of others the networks alone. Without a GPU only the figures of the
+this machine offers. Of a plan with six degrees of freedom the search in the fan, too, runs on the
+GPU where all views are searched at once, of others the networks alone; by default such a plan looks
+from straight above first, and needs the fan in some scenes. Without a GPU only the figures of the
 CPU appear. Images and targets are random, but for the piles that are planned: their content does
 not change the speed.
 """
@@ -95,8 +96,13 @@ def plans(frames: Sequence[RGBDFrame], device: torch.device) -> dict[str, float]
     hand_and_table, critic = (GripperGeometry(), Workspace()), load_critic(CRITIC).to(device)
     planar = GraspNetPlanner(*hand_and_table, network=network, critic=critic)
     fan = GraspNetFanPlanner(*hand_and_table, network=network, critic=critic)
+    likely = fan.likely
     rates = {f"plans of graspnet, pile of {PILE}": 1000 / median_ms(planar, frames)}
-    for way, at_once in (("view by view", False), ("all views at once", True)):
+    for way, at_once, fan.likely in (
+        ("view by view", False, np.inf),
+        ("all views at once", True, np.inf),
+        ("from straight above first", device.type == "cuda", likely),
+    ):
         fan.at_once = at_once
         rates[f"plans of graspnet6d, pile of {PILE}, {way}"] = 1000 / median_ms(fan, frames)
     return rates

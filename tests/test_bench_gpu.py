@@ -38,5 +38,6 @@ def test_plans_are_timed():
     assert list(rates) == [
         "plans of graspnet, pile of 5", "plans of graspnet6d, pile of 5, view by view",
         "plans of graspnet6d, pile of 5, all views at once",
+        "plans of graspnet6d, pile of 5, from straight above first",
     ]  # fmt: skip
     assert min(rates.values()) > 0
