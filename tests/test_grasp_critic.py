@@ -227,6 +227,25 @@ def test_the_ranking_of_a_fan_follows_the_critic() -> None:
     assert first[1] > np.deg2rad(25)
 
 
+@pytest.mark.parametrize(("chance", "leans"), [(0.98, False), (0.97, True)])
+def test_other_sides_are_looked_at_where_no_grasp_from_above_is_likely(chance, leans) -> None:
+    """From a chance of 0.975 on, the plan is the one from straight above, grasp by grasp."""
+
+    class Fixed(GraspCritic):
+        def chance(self, inputs: CriticInputs) -> np.ndarray:
+            return np.full(len(inputs.facts), chance)
+
+    parts = GripperGeometry(), Workspace()
+    above = GraspNetPlanner(*parts, critic=Fixed())(BOX)
+    grasps = GraspNetFanPlanner(*parts, critic=Fixed())(BOX)
+    planar = [grasp.pose for grasp in grasps if grasp.tilt == 0]
+    np.testing.assert_array_equal(planar, [grasp.pose for grasp in above])
+    assert (max(grasp.tilt for grasp in grasps) > np.deg2rad(25)) == leans
+    assert grasps[0].tilt == 0, "of grasps that are as likely, the steep ones come first"
+    alone = GraspNetFanPlanner(*parts, critic=Fixed(), likely=np.inf)(BOX)
+    assert max(grasp.tilt for grasp in alone) > np.deg2rad(25)
+
+
 def test_who_ranks_by_the_shipped_critic_and_who_by_one_that_is_given() -> None:
     frame = boxes_frame([((0.05, 0.06, 0.05), 0.0, (0.5, 0.0))])
 
