@@ -7,7 +7,8 @@ folder of `--examples`, where a run that was stopped finds them again; those in 
 are learned from as well, whatever they were played with. Every tenth scene is held out; on these it
 prints how often the candidate that is ranked first succeeds, of those that were drawn at random, by
 the search alone, by the critic that it began with, and by the new one, how far the stated chances
-of all are from frequencies, and their log loss. Written to checkpoints/critic.pt, the critic is
+of all are from frequencies, and their log loss. It trains on a GPU where there is one
+(`train.device`). Written to checkpoints/critic.pt, the critic is
 what graspnet, graspnet_direct and graspnet6d rank by from then on; their chances of success are
 then fitted again (`benchmarks.calibrate`). With `--folds K` it writes no weights, and compares for
 kinds of hands and cameras the critic that it begins with and what becomes of it: each Kth of the
@@ -28,7 +29,14 @@ import torch
 from torch.nn import functional
 from tqdm import tqdm
 
-from envs.critic_examples import LABEL, PLANNERS, Examples, examples_of, planner_of, usual_sets
+from envs.critic_examples import (
+    LABEL,
+    PLANNERS,
+    Examples,
+    numbered_examples_of,
+    planner_of,
+    usual_sets,
+)
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
@@ -121,7 +129,7 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
         open_executor(config.compute, config.data.workers) as workers,
         tqdm(total=scenes, initial=scenes - len(missing), unit="scene") as progress,
     ):
-        for number, one in completed(workers, partial(_numbered, config), missing):
+        for number, one in completed(workers, partial(numbered_examples_of, config), missing):
             first = number - number % SHARD
             found[first][number] = one
             if len(found[first]) == min(first + SHARD, scenes) - first:
@@ -129,10 +137,6 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
                 Examples.joined([part[number] for number in sorted(part)]).save(files[first])
             progress.update()
     return Examples.joined([Examples.load(path) for path in files.values()])
-
-
-def _numbered(config: Config, number: int) -> tuple[int, Examples]:
-    return number, examples_of(config, number)
 
 
 def shards(folder: Path) -> list[Path]:

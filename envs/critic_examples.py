@@ -143,6 +143,11 @@ def examples_of(config: Config, number: int) -> Examples:
     return Examples.joined(found)
 
 
+def numbered_examples_of(config: Config, number: int) -> tuple[int, Examples]:
+    """The number of a scene and its `examples_of`, in a worker process."""
+    return number, examples_of(config, number)
+
+
 def worth_trying(
     inputs: CriticInputs, most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:

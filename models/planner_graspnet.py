@@ -210,15 +210,15 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 # The critic's chance tells already what a tilt costs; what is left is the room for the arm.
 JUDGED_FAN = FanSettings(tilt_scale=3.0)
 # The critic's chance from which a grasp from straight above is as good as any: chosen on training
-# objects (docs/six_dof.md).
+# objects (docs/results.md).
 LIKELY = 0.975
 
 
 class GraspNetFanPlanner(Judged, FanPlanner):
-    """From straight above as `GraspNetPlanner` plans, where that is likely to succeed; elsewhere in
-    a fan of views, too: a network values the candidates by the image that was taken, and a critic
-    has the last word on each view's: the shipped one, unless `critic` is given. A critic on another
-    device than the network's is copied.
+    """From straight above where that is likely to succeed, as `GraspNetPlanner` plans for a hand
+    with a wrist; elsewhere in a fan of views, too: a network values the candidates by the image
+    that was taken, and a critic has the last word on each view's: the shipped one, unless `critic`
+    is given. A critic on another device than the network's is copied.
 
     likely: the critic's chance of the best grasp from straight above, from which no other side is
     looked at; over 1, the fan alone serves. device: of the network. at_once: whether all views are
@@ -246,7 +246,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         self.judge = self._own_judge = chances_by(self.critic)
         self.likely = likely
         self._above = GraspNetPlanner(
-            gripper, workspace, seed, network=self.network, critic=self.critic
+            self._with_wrist, workspace, seed, network=self.network, critic=self.critic
         )
         self.at_once = self.device.type == "cuda"
 
@@ -268,6 +268,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
             fan = self._from_any_side(frame, by_critic)
             leaning = [grasp for grasp in fan if grasp.tilt > PLANAR] if above else fan
             grasps = sorted([*above, *leaning], key=self._worth, reverse=True)
+            grasps = grasps[: self.fan.returned]
         return with_chances(grasps, self.calibration, frame.roughness)
 
     def _from_any_side(self, frame: RGBDFrame, by_critic: bool) -> list[Grasp]:

@@ -250,24 +250,26 @@ def test_a_camera_in_32_bits_gives_the_same_grasps() -> None:
 
 
 def test_another_judge_judges_view_by_view() -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
     planner.at_once = True
     planner.judge = lambda heights, found, inputs: np.full(len(found), 0.25)
     assert {grasp.quality for grasp in planner(boxes_frame(BOXES))} == {0.25}
 
 
 def test_an_empty_table_has_no_grasp() -> None:
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
     planner.at_once = True
     assert planner(boxes_frame([])) == []
 
 
 def test_a_shelf_is_searched_view_by_view(monkeypatch) -> None:
     """Fixtures and second frames are left to NumPy."""
-    planner = GraspNetFanPlanner(GripperGeometry(), Workspace(), likely=np.inf)
+    planner = GraspNetFanPlanner(GripperGeometry(), Workspace())
     planner.at_once = True
     monkeypatch.setattr(planner, "_searched_at_once", None)
+    monkeypatch.setattr(planner, "_above", None)
     frame = shelf_frame([((0.05, 0.05, 0.12), 0.3, (0.5, -0.02))])
-    assert planner(frame)
+    assert planner(frame), "nor is it looked at from straight above"
+    planner.likely = np.inf
     plain = boxes_frame(BOXES)
     assert planner(replace(plain, second=plain))

@@ -237,13 +237,30 @@ def test_other_sides_are_looked_at_where_no_grasp_from_above_is_likely(chance, l
 
     parts = GripperGeometry(), Workspace()
     above = GraspNetPlanner(*parts, critic=Fixed())(BOX)
-    grasps = GraspNetFanPlanner(*parts, critic=Fixed())(BOX)
+    planner = GraspNetFanPlanner(*parts, critic=Fixed())
+    grasps = planner(BOX)
     planar = [grasp.pose for grasp in grasps if grasp.tilt == 0]
     np.testing.assert_array_equal(planar, [grasp.pose for grasp in above])
     assert (max(grasp.tilt for grasp in grasps) > np.deg2rad(25)) == leans
     assert grasps[0].tilt == 0, "of grasps that are as likely, the steep ones come first"
     alone = GraspNetFanPlanner(*parts, critic=Fixed(), likely=np.inf)(BOX)
     assert max(grasp.tilt for grasp in alone) > np.deg2rad(25)
+    planner.return_at_least(33)
+    assert (planner._above.settings.returned, planner.fan.returned) == (33, 40)
+
+
+def test_the_wrist_keeps_clear_of_what_stands_beside_a_grasp_from_above() -> None:
+    """Within 3 cm of a box 5 cm high stands one that is 22 cm high. The wrist is 12 cm wide and
+    begins 13 cm over the fingertips: no grasp from above is nearer than 6 cm to the high one."""
+    low, high = ((0.05, 0.05, 0.05), 0.0, (0.5, 0.0)), ((0.2, 0.1, 0.22), 0.0, (0.5, 0.105))
+    frame = boxes_frame([low, high])
+    parts = GripperGeometry(), Workspace()
+    nearest = [
+        min(0.055 - grasp.position[1] for grasp in kind(*parts)(frame) if grasp.tilt < 1e-6)
+        for kind in (GraspNetPlanner, GraspNetFanPlanner)
+    ]
+    assert nearest[0] < 0.057, "the planner from above knows no wrist"
+    assert nearest[1] > 0.059
 
 
 def test_who_ranks_by_the_shipped_critic_and_who_by_one_that_is_given() -> None:

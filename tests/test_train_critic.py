@@ -87,7 +87,7 @@ def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
         played.append(number)
         return made_up(1, number)._replace(scene=np.full(12, number))
 
-    monkeypatch.setattr("benchmarks.train_critic.examples_of", examples)
+    monkeypatch.setattr("envs.critic_examples.examples_of", examples)
     monkeypatch.setattr(
         "benchmarks.train_critic.completed", lambda workers, call, numbers: map(call, numbers)
     )
@@ -136,7 +136,7 @@ def test_grasps_of_other_runs_are_learned_from_too(tmp_path, monkeypatch, capsys
     """20 scenes of 12 grasps, 2 of which are held out, and 12 scenes of another run, of which those
     with the numbers of held-out ones, 0 and 10, are left out, too."""
     monkeypatch.setattr(
-        "benchmarks.train_critic.examples_of",
+        "envs.critic_examples.examples_of",
         lambda config, number: made_up(1, number)._replace(scene=np.full(12, number)),
     )
     monkeypatch.setattr(
