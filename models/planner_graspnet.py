@@ -145,7 +145,10 @@ class GraspNetPlanner(Judged, SearchPlanner):
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         if not known_depth(frame.depth).any():  # a blank frame shows nothing to grasp
             return []
-        frame = corrected(frame, self.workspace.table_height)
+        return self.of_corrected(corrected(frame, self.workspace.table_height))
+
+    def of_corrected(self, frame: RGBDFrame) -> list[Grasp]:
+        """The grasps in a frame that is corrected by its table (`utils.depth_correction`)."""
         seen = NetworkView(self.network, frame, self.workspace, crop=True)
         heights = only_target(seen.heights, frame)
         if len(heights.centres) == 0:  # table and walls alone
@@ -261,7 +264,7 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         by_critic = self.judge is self._own_judge
         above = []
         if by_critic and self.likely <= 1 and not self.covered(frame.fixtures):
-            above = self._above(frame)
+            above = self._above.of_corrected(frame)
         if above and above[0].quality >= self.likely:
             grasps = above
         else:
