@@ -221,7 +221,7 @@ def test_parts_are_chosen_by_name():
 
 
 def test_commands_are_valid_and_take_fresh_seeds(capsys):
-    """Seeds used while developing stand in docs/results.md; the tables' is none of them."""
+    """Seeds used while developing stand in docs/choices.md; the tables' is none of them."""
     sealed = load_config(results.SEALED)
     for part in PARTS:
         for command in part.commands:
