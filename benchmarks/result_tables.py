@@ -39,8 +39,8 @@ from utils.result_records import CLEAN
 from utils.runs import write_atomic
 
 PAGES = (
-    "README.md", "README.zh-CN.md", "docs/results.md", "docs/choices.md", "docs/planner.md", "docs/graspnet.md",
-    "docs/six_dof.md", "docs/vgn.md", "docs/ppo.md",
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/choices.md",
+    "docs/planner.md", "docs/graspnet.md", "docs/six_dof.md", "docs/vgn.md", "docs/ppo.md",
     "docs/scaling.md", "docs/reliability.md", "docs/servo.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
@@ -70,6 +70,18 @@ PUBLISHED = (
 PUBLISHED_BESIDE = (
     ("OrbitGrasp (published: floating hand, noisy side view)", ("97 %", "98 %"), ("-", "-")),
 )
+# The parts of the overview, and where their tables stand.
+OVERVIEW = {
+    "six_dof": "[from any side](six_dof.md#figures)",
+    "scenes": "[from the side](six_dof.md#scenes-for-grasps-from-any-side)",
+    "oblique": "[a camera at 45 degrees](six_dof.md#limits)",
+    "unseen": "[new families](#families-that-no-training-sees)",
+    "household": "[household things](#household-things)",
+    "ycb": "[household things](#household-things)",
+    "clutter": "[VGN's objects](#vgns-objects)",
+    "vgn": "[VGN's protocol](vgn.md#figures)",
+}
+OVERVIEW_PLANNERS = "graspnet", "graspnet6d", "oracle6d"
 
 _HEADLINE = (
     "**Result** on unseen objects{}: {} of GraspNet's grasps succeed in piles of 5 objects, {} in "
@@ -180,6 +192,29 @@ def published(say: Say) -> str:
     header = ["published system", "task", "success", "cleared", "source"]
     lines = [[name, say(task), *rest] for name, task, *rest in PUBLISHED]
     return table(list(map(say, header)), lines)
+
+
+def overview(say: Say, *parts: Figures) -> str:
+    """A line for each scene, with noisy depth: how many grasps succeed and how many objects are
+    cleared, in per cent, by the planners that most parts have."""
+    lines = []
+    for part in parts:
+        cells: dict[tuple[str, str, str], dict[str, str]] = {}
+        for row in (row for command in part["commands"].values() for row in command["rows"]):
+            if noise_of(row) != CLEAN and row["attempts"]:
+                scene = row["scenario"], row["objects"].rpartition(":")[2], noise_of(row)
+                shares = (
+                    row["successes"] / row["attempts"],
+                    row["objects_cleared"] / row["objects_total"],
+                )
+                both = ", ".join(f"{100 * share:.0f}" for share in shares)
+                cells.setdefault(scene, {})[row["policy"]] = both
+        page = OVERVIEW[part["part"]]
+        for (scenario, objects, noise), of in cells.items():
+            planners = (of.get(planner, "-") for planner in OVERVIEW_PLANNERS)
+            lines.append([scenario, f"`{objects}`", f"`{noise}`", *planners, page])
+    header = ["scenario", "objects", "depth", *(f"`{name}`" for name in OVERVIEW_PLANNERS), "table"]
+    return table(header, lines)
 
 
 def scoreboard(say: Say, part: Figures) -> str:
@@ -416,6 +451,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "headline": (("scoreboard", "clutter15"), headline),
     "planners": (("scoreboard", "clutter15"), planners),
     "published": ((), published),
+    "overview": (tuple(OVERVIEW), overview),
     "scoreboard": (("scoreboard",), scoreboard),
     "differences": (("scoreboard",), differences),
     "six_dof": (("six_dof",), variants),

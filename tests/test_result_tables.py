@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import results
 from benchmarks.looks import add_look
-from benchmarks.result_tables import PAGES, TABLES, with_tables, write_tables
+from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import PARTS, chosen_parts, main
 from benchmarks.table_cells import cleared, rate, success
 from tests.helpers.records import CONFIG, ROUNDS
@@ -71,6 +71,28 @@ def test_each_scene_has_the_calibration_error_of_each_planner(tmp_path):
     assert lines == [
         "| `random_urdfs` | pile | `none` | 0.025 (10) | 0.100 (10) |",
         "| `random_urdfs` | tall | `none` | - | 0.100 (10) |",
+    ]
+
+
+def test_the_overview_has_a_line_for_each_noisy_scene(tmp_path):
+    noisy, bowls = {"depth_noise": "realsense"}, "benchmarks.bowls:bowls"
+    for part in OVERVIEW:
+        figures(tmp_path, part, [row("graspnet", 1, 2)])  # clean: not in it
+    figures(
+        tmp_path,
+        "six_dof",
+        [
+            row("graspnet", 81, 263) | noisy,
+            row("oracle6d", 250, 250) | noisy,
+            row("graspnet", 0, 0, bowls) | noisy,  # no attempt: no success to state
+            row("graspnet6d", 450, 500, bowls) | noisy,
+        ],
+    )
+    page = with_tables("<!-- results:overview -->\n<!-- /results -->\n", tmp_path)
+    where = "[from any side](six_dof.md#figures)"
+    assert page.splitlines()[3:-1] == [
+        f"| pile | `random_urdfs` | `realsense` | 31, 16 | - | 100, 50 | {where} |",
+        f"| pile | `bowls` | `realsense` | - | 90, 90 | - | {where} |",
     ]
 
 
