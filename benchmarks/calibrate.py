@@ -7,7 +7,7 @@ these same grasps, and how many succeeded of those whose fitted chance is too lo
 (`utils.calibration.LEAST_CHANCE`). With --output the fits are written: into
 checkpoints/calibration.json, they are what the project's planners state from then on; planners that
 the runs do not have keep theirs. A planner of your own reads its fit from a file of your own
-(docs/planner.md). `random`, whose scores tell nothing, and learned policies are left out.
+(docs/calibration.md). `random`, whose scores tell nothing, and learned policies are left out.
 `make calibration` plays all planners but `random` on training objects and fits them all again:
 
     python evaluate.py --config configs/calibration.yaml

@@ -39,8 +39,8 @@ from utils.result_records import CLEAN
 from utils.runs import write_atomic
 
 PAGES = (
-    "README.md", "README.zh-CN.md", "docs/results.md", "docs/choices.md",
-    "docs/planner.md", "docs/graspnet.md", "docs/six_dof.md", "docs/vgn.md", "docs/ppo.md",
+    "README.md", "README.zh-CN.md", "docs/results.md", "docs/choices.md", "docs/planner.md",
+    "docs/calibration.md", "docs/graspnet.md", "docs/six_dof.md", "docs/vgn.md", "docs/ppo.md",
     "docs/scaling.md", "docs/reliability.md", "docs/servo.md",
 )  # fmt: skip
 _BLOCK = re.compile(r"(<!-- results:([\w-]+) -->\n).*?(<!-- /results -->)", re.DOTALL)
