@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from envs.cell import Cell
 from envs.cell_layout import Box, bin_walls, distance_to_box, table_box
@@ -106,7 +106,9 @@ def surface_points(hull: np.ndarray, apart: float) -> np.ndarray:
         fine.append(np.column_stack([i, j - i, count - j]) / count @ corners)
     # In a triangle with sides of at most apart / 2, a corner is within 0.29 apart of any place.
     points, kept = np.concatenate(fine), []
-    while len(points):
-        kept.append(points[0])
-        points = points[np.linalg.norm(points - points[0], axis=1) > 0.7 * apart]
-    return np.array(kept)
+    near, left = cKDTree(points), np.ones(len(points), bool)
+    for number, point in enumerate(points):
+        if left[number]:
+            kept.append(number)
+            left[near.query_ball_point(point, 0.7 * apart)] = False
+    return points[kept]
