@@ -104,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
     if planner.calibration is not None:
         remarks += unlikely_ones([one.quality for one in (*grasps, *(clearing or []))])
-    posed, network = options.camera_pose is not None, options.planner.startswith("graspnet")
+    posed, network = options.camera_pose is not None, options.planner in NETWORK_PLANNERS
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -171,7 +171,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     options.planner = options.planner or PLANNERS[0]
     if options.planner not in PLANNERS:
         raise unknown_choice("--planner", options.planner, PLANNERS)
-    if options.checkpoint is not None and not options.planner.startswith("graspnet"):
+    if options.checkpoint is not None and options.planner not in NETWORK_PLANNERS:
         raise UserError(f"--checkpoint: {options.planner} has no network; omit one of the two")
     options.count = 20 if options.count is None else options.count
     if options.count < 1:

@@ -38,6 +38,7 @@ from envs.critic_examples import (
     usual_sets,
 )
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
+from models.graspnet_io import SHIPPED as SHIPPED_NETWORK
 from models.planner_graspnet import JUDGED_FAN
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
@@ -49,7 +50,7 @@ from utils.result_formats import aligned
 from utils.runs import check_writable, git_state, parse_args, run_script, write_json_atomic
 
 HELD_OUT = 10  # every tenth scene
-SHARD = 50  # scenes of a file
+SHARD, SHARDS = 50, "scenes-*.npz"  # scenes of a file, at most, and the files' names
 EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
 FURTHER_RATE = 3e-4  # from weights that are given: at the rate above they forget what they know
 CPU = torch.device("cpu")
@@ -119,41 +120,53 @@ def collect(config: Config, scenes: int, folder: Path) -> Examples:
     scenes each in a file, and what it has already is not played again. Raises UserError where it
     holds scenes of another seed or a damaged file."""
     check_same_settings(folder, config)
-    files = {
-        first: folder / f"scenes-{first:05d}-{min(first + SHARD, scenes) - 1:05d}.npz"
-        for first in range(0, scenes, SHARD)
-    }
-    missing = [number for number in range(scenes) if not files[number - number % SHARD].exists()]
-    found: dict[int, dict[int, Examples]] = {first: {} for first in files}
+    played = {number for path in folder.glob(SHARDS) for number in numbers_of(path)}
+    missing = [number for number in range(scenes) if number not in played]
+    wanted: dict[int, list[int]] = {}
+    for number in missing:
+        wanted.setdefault(number // SHARD, []).append(number)
+    found: dict[int, dict[int, Examples]] = {shard: {} for shard in wanted}
     with (
         open_executor(config.compute, config.data.workers) as workers,
         tqdm(total=scenes, initial=scenes - len(missing), unit="scene") as progress,
     ):
         for number, one in completed(workers, partial(numbered_examples_of, config), missing):
-            first = number - number % SHARD
-            found[first][number] = one
-            if len(found[first]) == min(first + SHARD, scenes) - first:
-                part = found.pop(first)
-                Examples.joined([part[number] for number in sorted(part)]).save(files[first])
+            shard = number // SHARD
+            found[shard][number] = one
+            numbers = wanted[shard]
+            if len(found[shard]) == len(numbers):
+                part = found.pop(shard)
+                path = folder / f"scenes-{numbers[0]:05d}-{numbers[-1]:05d}.npz"
+                Examples.joined([part[number] for number in numbers]).save(path)
             progress.update()
-    return Examples.joined([Examples.load(path) for path in files.values()])
+    files = [path for path in sorted(folder.glob(SHARDS)) if numbers_of(path).start < scenes]
+    examples = Examples.joined([Examples.load(path) for path in files])
+    return examples.where(examples.scene < scenes)
+
+
+def numbers_of(path: Path) -> range:
+    """The numbers of the scenes in a file, by its name."""
+    first, last = path.stem.split("-")[1:]
+    return range(int(first), int(last) + 1)
 
 
 def shards(folder: Path) -> list[Path]:
     """The files of executed grasps in a folder. Raises UserError where it has none."""
-    found = sorted(folder.glob("scenes-*.npz"))
+    found = sorted(folder.glob(SHARDS))
     if not found:
-        raise UserError(f"--more {folder}: holds no executed grasps (scenes-*.npz)")
+        raise UserError(f"--more {folder}: holds no executed grasps ({SHARDS})")
     return found
 
 
 def check_same_settings(folder: Path, config: Config) -> None:
     """Note in a folder what the examples depend on besides their numbers. Raises UserError where it
     holds examples of something else."""
-    sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera")
+    sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera", "robot")
     settings = {name: getattr(config, name).model_dump(mode="json") for name in sections}
     settings |= {"seed": config.seed, "object_sets": usual_sets(config), "label": LABEL}
-    settings["critic"] = hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
+    settings["simulator"] = config.simulator
+    for name, weights in (("critic", SHIPPED), ("network", SHIPPED_NETWORK)):
+        settings[name] = hashlib.sha256(weights.read_bytes()).hexdigest()
     note = folder / "settings.json"
     if not note.exists():
         write_json_atomic(note, settings)

@@ -27,7 +27,7 @@ from envs.robot_kinematics import (
 from envs.robot_motion import Trajectory
 from utils.transforms import Grasp, top_down_pose
 
-OVER_BIN = np.array([*BIN_CENTRE, BIN_HEIGHT + 0.17])  # m in W, where E releases an object
+_OVER_BIN = BIN_HEIGHT + 0.17  # m over the table, where E releases an object, or higher
 # m over execution.lift_height, to which the lower end of an object is lifted: a heavy one that is
 # gripped beside its middle may turn until it hangs, far below the hand.
 LIFT_MARGIN = 0.15
@@ -171,13 +171,17 @@ def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
     return lifted
 
 
+def place_over_bin(top: float) -> np.ndarray:
+    """(3,) m in W, where E releases an object that has been lifted `top` m high: it may hang far
+    below the hand."""
+    return np.array([*BIN_CENTRE, max(_OVER_BIN, top)])
+
+
 def way_to_bin(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
     """From joint positions q (7,), at which an object has been lifted `top` m high, to the bin; by
     way of home, where the hand is high, if something hangs over the table. Raises
     UnreachableError."""
-    over_bin = OVER_BIN.copy()  # higher where the object may hang far below the hand
-    over_bin[2] = max(over_bin[2], top)
-    posture = choose_posture(top_down_pose(over_bin, -np.pi / 2), cell.home)
+    posture = choose_posture(top_down_pose(place_over_bin(top), -np.pi / 2), cell.home)
     if not cell.hanging:
         return cell.robot.joint_move(q, posture, **scales(cell))
     first = cell.robot.joint_move(q, cell.home, **scales(cell))

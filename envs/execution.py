@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from envs.arm_paths import (
-    OVER_BIN,
+    LIFT_MARGIN,
     all_plans,
     clears,
     farther_than,
@@ -26,6 +26,7 @@ from envs.arm_paths import (
     height_over,
     higher_than,
     line,
+    place_over_bin,
     raised,
     scales,
     standoff,
@@ -112,9 +113,9 @@ class GraspOutcome:
     reason: `success`, or a key of `utils.result_records.FAILURES`: `ik` (the arm cannot reach a
     pose or the line to it), `collision` (a contact stopped the approach), `missed` (the fingers
     closed on nothing, or on what is no wider than gripper.least_held), `slipped` (the object was
-    lost before the lift height), `dropped` (lost after it), `stopped` (by the gate that every
-    command to the arm passes, or because time ran out), and in a closed loop `lost` (the camera no
-    longer saw the object).
+    lost before the lift height), `dropped` (lost after it), `turned` and `slid` (in the hand, where
+    execution.strict asks), `stopped` (by the gate that every command to the arm passes, or because
+    time ran out), and in a closed loop `lost` (the camera no longer saw the object).
     sim_seconds: simulated time from home and back to home, at legal joint speeds.
     object_index: the object that the hand held, even if it lost the object or stopped later; None
     if it held nothing.
@@ -185,16 +186,17 @@ Approach = Callable[[Cell, Grasp], ApproachResult]
 
 
 def check_bin(config: Config) -> None:
-    """Raise UserError where the gate's box ends before the bin: every picked object would end as
-    `stopped` on its way there, and no grasp could succeed."""
-    safety, place = config.safety, OVER_BIN.round(3).tolist()
+    """Raise UserError where the gate's box ends before the lowest place over the bin: every picked
+    object would end as `stopped` on its way there, and no grasp could succeed."""
+    lowest = place_over_bin(config.execution.lift_height + LIFT_MARGIN)
+    safety, place = config.safety, lowest.round(3).tolist()
     box = reaching_down(safety, config.closed_loop.floor)
     if not all(low <= at <= high for low, at, high in zip(box.box_lower, place, box.box_upper)):
         raise UserError(
             f"safety: the box from box_lower {list(safety.box_lower)} to box_upper "
-            f"{list(safety.box_upper)} leaves out {place} m, where the hand releases objects over "
-            "the bin, so that every pick would be stopped on its way there; widen the box until it "
-            "holds that point"
+            f"{list(safety.box_upper)} leaves out {place} m, over which the hand releases objects "
+            "into the bin, so that every pick would be stopped on its way there; widen the box "
+            "until it holds that point"
         )
 
 

@@ -40,6 +40,7 @@ from utils.depth import (
     table_in_holes,
 )
 from utils.depth_correction import corrected
+from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import grasp_depth
 from utils.height_map import (
@@ -212,8 +213,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
 
 # The critic's chance tells already what a tilt costs; what is left is the room for the arm.
 JUDGED_FAN = FanSettings(tilt_scale=3.0)
-# The critic's chance from which a grasp from straight above is as good as any: chosen on training
-# objects (docs/results.md).
+# The critic's chance from which a grasp from straight above is as good as any: between two limits
+# that were compared on training objects (docs/choices.md).
 LIKELY = 0.975
 
 
@@ -221,7 +222,8 @@ class GraspNetFanPlanner(Judged, FanPlanner):
     """From straight above where that is likely to succeed, as `GraspNetPlanner` plans for a hand
     with a wrist; elsewhere in a fan of views, too: a network values the candidates by the image
     that was taken, and a critic has the last word on each view's: the shipped one, unless `critic`
-    is given. A critic on another device than the network's is copied.
+    is given. A critic on another device than the network's is copied. Raises UserError for a file
+    of another network without a critic of its own.
 
     likely: the critic's chance of the best grasp from straight above, from which no other side is
     looked at; over 1, the fan alone serves. device: of the network. at_once: whether all views are
@@ -241,6 +243,11 @@ class GraspNetFanPlanner(Judged, FanPlanner):
         likely: float = LIKELY,
     ):
         super().__init__(gripper, workspace, seed, SEARCH, JUDGED_FAN)
+        if critic is None and network is None and checkpoint.resolve() != SHIPPED:
+            raise UserError(
+                f"{checkpoint}: graspnet6d ranks by a critic, which was trained with the shipped "
+                "network; plan with graspnet, which needs none for a network of your own"
+            )
         self.network = network or loaded(checkpoint)
         self.device = next(self.network.model.parameters()).device
         self.critic = critic or shipped_critic()

@@ -357,7 +357,7 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["camera.up=[0,0,1]"], "camera"),
         (["robot.home=[9,0,0,-2,0,1.5,0]"], "robot.home"),
         (["workspace.center=[7,7]"], "workspace"),
-        (["safety.box_lower=[0.15,-0.3,0.02]"], "leaves out [0.42, -0.48, 0.25] m"),
+        (["safety.box_lower=[0.15,-0.3,0.02]"], "leaves out [0.42, -0.48, 0.3] m"),
         (["cache_dir=/dev/null/x"], "cache_dir"),
         (
             ["evaluate.controllers=[open_loop,ibvs]", "closed_loop.controller=pbvs"],

@@ -534,6 +534,7 @@ def only_a_count_beside_export(files):
             "--planner: got 'oracle', expected one of graspnet, graspnet6d",
         ),
         (options(planner="heuristic"), "heuristic has no network"),
+        (options(planner="graspnet6d"), "graspnet6d ranks by a critic"),
         (options(point=[3, 3]), "--point 3 3: on the table"),
         (options(point=[320, 3]), "outside the image"),
         (options(point=["nan", 3]), "--point nan 3.0: expected pixels"),

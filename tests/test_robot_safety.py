@@ -171,8 +171,11 @@ def test_the_open_loop_does_not_leave_the_workspace(narrow, box_set):
 
 def test_a_box_without_the_bin_is_refused(narrow, config):
     check_bin(config)
-    with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.25\] m.*widen the box"):
+    with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.3\] m.*widen the box"):
         check_bin(narrow.config)
+    high = ["execution.lift_height=0.3", "safety.box_upper=[0.8,0.55,0.44]"]
+    with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.45\] m"):
+        check_bin(load_config(None, high))  # to which what may hang is lifted
     low = ["safety.box_lower=[0.15,-0.55,0.3]", "closed_loop.floor=0.009"]
     check_bin(load_config(None, low))  # planned motions reach down to the floor of grasps
 

@@ -100,8 +100,13 @@ def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
     assert played == list(range(100, 120))
     for one, other in zip((*whole.inputs, *whole[1:]), (*again.inputs, *again[1:])):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(UserError, match="holds grasps of another seed; give another folder"):
-        collect(load_config(None, ["seed=1"]), 120, tmp_path)
+    played.clear()
+    more, fewer = collect(config, 160, tmp_path), collect(config, 60, tmp_path)
+    assert played == list(range(120, 160)), "an unfinished file is gone on with in another"
+    assert [*more.scene[::12]] == list(range(160)) and [*fewer.scene[::12]] == list(range(60))
+    for setting, name in (("seed=1", "seed"), ("simulator=mujoco", "simulator")):
+        with pytest.raises(UserError, match=f"holds grasps of another {name}; give another folder"):
+            collect(load_config(None, ["data.workers=1", setting]), 120, tmp_path)
     (tmp_path / "scenes-00000-00049.npz").write_bytes(b"no archive")
     with pytest.raises(UserError, match=r"scenes-00000-00049\.npz: holds no executed grasps"):
         collect(config, 120, tmp_path)
