@@ -92,22 +92,18 @@ def states_chances(policy: str) -> bool:
 
 
 def fitted_chances(grasps: dict[str, ExecutedGrasps]) -> dict[str, Calibration]:
-    """The calibration of each policy from its executed grasps. Those that the critic judges see the
-    same frames with the same critic: one penalty for rough depth is fitted to all of them. Raises
-    UserError for a policy without grasps."""
+    """The calibration of each policy from its executed grasps. Raises UserError for a policy
+    without grasps."""
+    fits = {}
     for name, own in grasps.items():
         if len(own.successes) == 0:
             raise UserError(f"{name}: executed no grasp in these runs; play more rounds")
-    samples = {
-        name: (own.scores, own.successes, own.roughness, own.failed) for name, own in grasps.items()
-    }
-    judged = [name for name in grasps if is_judged(name)]
-    fits = dict(zip(judged, Calibration.fit_alike([samples[name] for name in judged])))
-    for name in grasps.keys() - fits.keys():
+        judged = is_judged(name)  # the critic sees itself how rough the heights are
+        roughness = np.zeros_like(own.roughness) if judged else own.roughness
         # The search's scores may exceed 1; of another's planner, these grasps alone can tell.
-        bounded = name not in PLANNERS and bool(grasps[name].scores.max() <= 1.0)
-        fits[name] = Calibration.fit(*samples[name], bounded)
-    return {name: fits[name] for name in grasps}
+        bounded = judged or (name not in PLANNERS and bool(own.scores.max() <= 1.0))
+        fits[name] = Calibration.fit(own.scores, own.successes, roughness, own.failed, bounded)
+    return fits
 
 
 def is_judged(policy: str) -> bool:

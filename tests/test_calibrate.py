@@ -134,20 +134,20 @@ def test_planners_of_a_user_are_fitted_and_random_and_policies_are_not(tmp_path,
     assert "my_module:plan" in printed and "random" not in printed and "ppo" not in printed
 
 
-def test_what_the_critic_judges_has_one_penalty(tmp_path) -> None:
+def test_what_the_critic_judges_has_no_penalty(tmp_path) -> None:
+    """Rough frames fail oftener here, and only who does not see it in the score learns it."""
     (tmp_path / "config.yaml").write_text(
         dump_config(load_config(None, ["objects.split=train", "evaluate.abstain=0"]))
     )
     for name in ("graspnet", "graspnet6d", "heuristic"):
         grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
         append_round(tmp_path / "rounds.jsonl", played(name, grasps, roughness=0.0))
-        rough = [(0.9, name != "graspnet"), (0.7, False), (0.6, name == "heuristic"), (0.8, True)]
+        rough = [(0.9, True), (0.7, False), (0.6, False), (0.8, False)]
         append_round(tmp_path / "rounds.jsonl", played(name, rough, roughness=0.002))
     assert main([str(tmp_path), "--output", str(tmp_path / "fits.json")]) == 0
     fits = load_calibrations(tmp_path / "fits.json")
-    assert fits["graspnet"].penalty == fits["graspnet6d"].penalty > 0
-    assert fits["heuristic"].penalty != fits["graspnet"].penalty
-    assert fits["graspnet"].slope != fits["graspnet6d"].slope
+    assert fits["graspnet"].penalty == fits["graspnet6d"].penalty == 0
+    assert fits["heuristic"].penalty > 0
 
 
 CONFIGS = {

@@ -182,22 +182,6 @@ def test_a_fit_finds_what_rough_depth_costs() -> None:
     np.testing.assert_allclose(truth.scores(truth(scores, rough), rough), scores)
 
 
-def test_planners_that_suffer_alike_share_a_penalty_and_nothing_else() -> None:
-    """Two planners, drawn with penalties of 600 and 200 per metre: the shared one lies between, and
-    their slopes and offsets are their own."""
-    rng, samples = np.random.default_rng(0), []
-    for truth in (Calibration(1.5, 2.0, 600.0), Calibration(0.8, 1.0, 200.0)):
-        scores, rough = rng.uniform(0.05, 1.2, 40_000), rng.choice([0.0, 0.0025], 40_000)
-        success = rng.uniform(size=len(scores)) < truth(scores, rough)
-        samples.append((scores, success, rough, np.zeros(len(scores), bool)))
-    first, second = Calibration.fit_alike(samples, bounded=False)
-    assert first.penalty == second.penalty == pytest.approx(400, abs=60)
-    assert first.slope == pytest.approx(1.5, abs=0.15) and second.slope < 1
-    alone = Calibration.fit(*samples[1], bounded=False)
-    assert alone.penalty == pytest.approx(200, abs=25)
-    assert Calibration.fit_alike([]) == []
-
-
 def test_no_fit_states_that_noise_helps() -> None:
     rough = np.repeat([0.0, 0.003], 100)
     fitted = Calibration.fit(np.full(200, 0.5), np.arange(200) % 10 < 6 + 3 * (rough > 0), rough)

@@ -116,36 +116,15 @@ class Calibration:
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
         slopes and DOUBT_SPREAD on the doubt.
         """
-        return Calibration.fit_alike([(scores, successes, roughness, failed)], bounded)[0]
-
-    @staticmethod
-    def fit_alike(
-        samples: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]], bounded: bool = True
-    ) -> list[Calibration]:
-        """Calibrations of planners whose scores suffer from rough depth alike, such as those of one
-        critic: with one penalty, from all of their grasps, and the rest from each one's own.
-
-        samples: for each planner the scores, successes, roughness and failures of `fit`, which also
-        tells the errors.
-        """
-        own = [_Sample.of(*sample, bounded) for sample in samples]
-        if not own:
-            return []
-
-        def loss(numbers: np.ndarray) -> float:
-            penalty, lines = numbers[0], numbers[1:].reshape(-1, 4)
-            losses = [sample.loss(*line, penalty) for sample, line in zip(own, lines)]
-            return sum(losses) / sum(len(sample.low) for sample in own)
-
+        own = _Sample.of(scores, successes, roughness, failed, bounded)
         most = None if bounded else 0.0  # of the upper slope
-        bounds = [(LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, most)] * len(own)
-        start = [0.0, *([1.0, 0.0, 0.0, 0.0] * len(own))]
-        best = minimize(loss, start, method="L-BFGS-B", bounds=[(0.0, None), *bounds]).x
-        lines = best[1:].reshape(-1, 4).tolist()
-        return [
-            Calibration(slope, offset, 1000 * float(best[0]), doubt, upper)
-            for slope, offset, doubt, upper in lines
-        ]
+        bounds = [(LEAST_SLOPE, None), (None, None), (0.0, None), (0.0, most), (0.0, None)]
+        best = minimize(
+            lambda numbers: own.loss(*numbers) / len(own.low), [1.0, 0.0, 0.0, 0.0, 0.0],
+            method="L-BFGS-B", bounds=bounds,
+        )  # fmt: skip
+        slope, offset, doubt, upper, penalty = best.x.tolist()
+        return Calibration(slope, offset, 1000 * penalty, doubt, upper)
 
 
 class _Sample(NamedTuple):
