@@ -2,11 +2,8 @@
 
 The stop rule is VGN's (Breyer et al., CoRL 2020): a round ends when every object is removed, when
 the planner finds no grasp that is likely enough, or after `max_failures` failed grasps in a row. A
-round also ends when its planner raises an exception. What has failed is not tried again at once,
-for often nothing has moved: grasps elsewhere that are more likely to succeed than not (whose
-quality as planned is 0.5 or more) come first, and of the others those that are not alike one that
-has just failed. After a failure, all qualities that are chances count as lower
-(`utils.calibration`): by these it is judged, and recorded, whether a grasp is worth trying.
+round also ends when its planner raises an exception. `envs.next_grasp` tells which grasp of a plan
+is tried.
 
 Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
 would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
@@ -18,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, replace
 from functools import partial
 from typing import Protocol
@@ -28,14 +25,14 @@ import numpy as np
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
-from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop, reaches
-from envs.floating_execution import clears_table, execute_floating
+from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop
+from envs.floating_execution import execute_floating
+from envs.next_grasp import Failures, choose, least_quality
 from envs.objects import fits
 from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
-from utils.calibration import LEAST_CHANCE, Calibration
 from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
@@ -48,12 +45,6 @@ from utils.result_records import (
     policy_name,
 )
 from utils.transforms import PLANAR, Grasp, RGBDFrame, grasp_to_image
-
-# A grasp nearer than both to one that failed is the same one again.
-TRIED_DISTANCE = 0.02  # m
-TRIED_ANGLE = np.deg2rad(30)
-ANOTHER = 0.05  # m from every grasp that failed: most likely another object
-ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 
 
 class GraspFinder(Protocol):
@@ -122,9 +113,7 @@ def run_round(
     if wanted is not None:
         plan = TargetPlanner(plan)
     attempts: list[AttemptRecord] = []
-    failed: list[Grasp] = []  # in a row
-    missed: list[Grasp] = []  # in the round
-    stops: list[np.ndarray | None] = []  # where the hand was when its palm met something
+    failures = Failures()
     plan_seconds, ended, table_height = 0.0, "cleared", Workspace().table_height
 
     def see() -> RGBDFrame:
@@ -134,7 +123,7 @@ def run_round(
     try:
         with planner_errors(policy):
             reset_planner(plan, scene.seed)
-        while cell.remaining and len(failed) < max_failures:
+        while cell.remaining and len(failures.in_a_row) < max_failures:
             frame = look_again(see)
             if wanted is not None:
                 assert frame.segmentation is not None  # a cell's frames have it
@@ -148,26 +137,18 @@ def run_round(
                     )
             finally:
                 plan_seconds = time.perf_counter() - start + look_again.plan_seconds
-            now = partial(after_a_failure, chances=chances if failed else None)
-            worth = [grasp for grasp in grasps if now(grasp).quality >= least]
-            ordered = elsewhere_first(worth, missed) if missed else worth
-            chosen = first_untried(within_reach(cell, ordered), failed)
-            if chosen is None:
-                why = _out_of_reach(worth) if worth else _abstained(map(now, grasps), least)
-                detail = _details(look_again.remark, why)
-                spent = look_again.sim_seconds
+            grasp, why = choose(cell, grasps, failures, least, chances)
+            if grasp is None:
+                detail, spent = _details(look_again.remark, why), look_again.sim_seconds
                 attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
                 ended = NO_PLAN
                 break
-            grasp = now(no_deeper(chosen, failed, stops))
-            approach: Approach = open_loop
+            approach = approach_by or open_loop
             if controller != OPEN_LOOP:
                 seen = frame.without_truth()
                 # The time to process an image counts as if the image had come later.
                 late = conditions.latency + cell.config.closed_loop.compute_seconds
                 approach = ClosedLoop(cell, controller, seen, calibration, taught, late)
-            elif approach_by is not None:
-                approach = approach_by
             aim = nearest_object(cell, grasp) if too_large else None
             with disturbed(cell, conditions.motion(cell, len(attempts))):
                 outcome = (
@@ -178,26 +159,22 @@ def run_round(
             if approach_by is not None and approach_by.closed_at is not None:
                 grasp = approach_by.closed_at
             held = outcome.object_index
-            attempts.append(
-                AttemptRecord(
-                    outcome.success,
-                    outcome.reason,
-                    plan_seconds,
-                    outcome.sim_seconds + look_again.sim_seconds,
-                    grasp_to_image(grasp, frame.K, frame.T_WC),
-                    detail=_details(look_again.remark, outcome.detail),
-                    held=_name_of(scene, held),
-                    turned=None if outcome.motion is None else outcome.motion.turned,
-                    slid=None if outcome.motion is None else outcome.motion.slid,
-                    graspable=(aim if held is None else held) not in too_large,
-                    tilt=grasp.tilt,
-                    roughness=0.0 if privileged else table_roughness(frame, table_height),
-                    **_turn_ms(approach),
-                )
+            record = AttemptRecord(
+                outcome.success,
+                outcome.reason,
+                plan_seconds,
+                outcome.sim_seconds + look_again.sim_seconds,
+                grasp_to_image(grasp, frame.K, frame.T_WC),
+                detail=_details(look_again.remark, outcome.detail),
+                held=None if held is None else scene.placements[held].model.name,
+                graspable=(aim if held is None else held) not in too_large,
+                tilt=grasp.tilt,
+                roughness=0.0 if privileged else table_roughness(frame, table_height),
+                **_in_hand(outcome),
+                **_turn_ms(approach),
             )
-            failed = [] if outcome.success else [*failed, grasp]
-            missed += [] if outcome.success else [grasp]
-            stops = [] if outcome.success else [*stops, outcome.palm_stopped_at]
+            attempts.append(record)
+            failures.note(grasp, outcome)
             if on_attempt is not None:
                 on_attempt(frame, grasp, outcome)
             if wanted is not None:
@@ -226,6 +203,9 @@ def run_round(
         None if chances is None else astuple(chances),
         None if wanted is None else ended == "target",
     )  # fmt: skip
+
+
+# --- Parts of a round ------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -275,8 +255,10 @@ def nearest_object(cell: Cell, grasp: Grasp) -> int:
     return sorted(cell.remaining)[int(np.argmin(gaps))]
 
 
-def _name_of(scene: Scene, index: int | None) -> str | None:
-    return None if index is None else scene.placements[index].model.name
+def _in_hand(outcome: GraspOutcome) -> dict[str, float]:
+    """Fields of an AttemptRecord on how what was held has moved in the hand."""
+    moved = outcome.motion
+    return {} if moved is None else {"turned": moved.turned, "slid": moved.slid}
 
 
 def _turn_ms(approach: Approach) -> dict[str, float]:
@@ -293,91 +275,3 @@ def _turn_ms(approach: Approach) -> dict[str, float]:
 def _details(*sentences: str) -> str:
     """Those that are not empty, in one."""
     return "; ".join(filter(None, sentences))
-
-
-def _abstained(grasps: Iterable[Grasp], least: float) -> str:
-    """Why none of the grasps is tried; empty where there are none."""
-    best = max((grasp.quality for grasp in grasps), default=None)
-    return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
-
-
-def _out_of_reach(grasps: Sequence[Grasp]) -> str:
-    return f"all planned grasps ({len(grasps)}) are out of reach"
-
-
-def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:
-    """Below which quality a planner's grasps are not tried. abstain: as in the config; None leaves
-    out what is more likely to fail, where the planner states chances of success, an arm's."""
-    if abstain is not None:
-        return abstain
-    return LEAST_CHANCE if has_arm and calibration_of(planner) is not None else 0.0
-
-
-def after_a_failure(grasp: Grasp, chances: Calibration | None) -> Grasp:
-    """The grasp with the chance that it has after a failure, by its planner's calibration; itself
-    without one."""
-    if chances is None:
-        return grasp
-    return replace(grasp, quality=chances.after_failure(grasp.quality))
-
-
-def within_reach(cell: Cell, grasps: Sequence[Grasp]) -> Iterator[Grasp]:
-    """The grasps that the arm can go to, in their order; those from straight above are not asked
-    where nothing hangs over the table, because nearly all are. A floating hand reaches all that are
-    above the table."""
-    reachable = reaches if cell.has_arm else clears_table
-    least = 0.0 if cell.hanging else PLANAR
-    for grasp in grasps:
-        if grasp.tilt < least or reachable(cell, grasp):
-            yield grasp
-
-
-def first_untried(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> Grasp | None:
-    """The first grasp that is not near one of those that failed; the first of all where each is;
-    None of none."""
-    first = None
-    for grasp in grasps:
-        first = first or grasp
-        if not any(_alike(grasp, other) for other in failed):
-            return grasp
-    return first
-
-
-def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Grasp]:
-    """The grasps in their order, but first those that are more likely to succeed than not and lie
-    ANOTHER from all that failed."""
-
-    def is_near(grasp: Grasp) -> bool:
-        gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
-        return grasp.quality < LEAST_CHANCE or bool(min(gaps, default=np.inf) < ANOTHER)
-
-    return sorted(grasps, key=is_near)
-
-
-def _alike(grasp: Grasp, other: Grasp) -> bool:
-    """Whether two grasps are so near each other that one of them is enough to try."""
-    along = grasp.approach
-    apart = grasp.position - other.position
-    beside = apart - (apart @ along) * along  # a deeper grasp is the same one
-    cosines = abs(grasp.closing_direction @ other.closing_direction), along @ other.approach
-    return bool(np.linalg.norm(beside) <= TRIED_DISTANCE and min(cosines) >= np.cos(TRIED_ANGLE))
-
-
-def no_deeper(grasp: Grasp, failed: Sequence[Grasp], stops: Sequence[np.ndarray | None]) -> Grasp:
-    """The grasp, drawn back before the places `stops` (m, of E) at which the palm met something.
-
-    A camera may miss a thin part that stands up from an object; the contact with the palm tells how
-    high that part is.
-    """
-    deepest = min(
-        (
-            stop @ grasp.approach - ROOM_OVER_TOUCH
-            for other, stop in zip(failed, stops)
-            if stop is not None and _alike(replace(other, angle=grasp.angle), grasp)
-        ),
-        default=np.inf,
-    )
-    too_deep = grasp.position @ grasp.approach - deepest
-    if too_deep <= 0:
-        return grasp
-    return replace(grasp, position=grasp.position - too_deep * grasp.approach)

@@ -7,10 +7,11 @@ from envs import arm_paths
 from envs.arm_paths import first_plan, height_over, way_out, withdrawn
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Box, Placement, Scene
 from envs.execution import execute_grasp, reaches
+from envs.next_grasp import within_reach
 from envs.object_bodies import native_object
 from envs.object_primitives import NativeShape
 from envs.robot_kinematics import UnreachableError, forward_kinematics
-from envs.rounds import run_round, within_reach
+from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.planners import make_planner
 from tests.helpers.simulators import INSTALLED

@@ -14,7 +14,8 @@ from scipy.stats import binom
 
 from benchmarks.calibrate import grasps_of
 from envs.evaluation_worker import check_everything, work
-from envs.rounds import least_quality, run_round
+from envs.next_grasp import least_quality
+from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.graspnet_io import SHIPPED
 from models.planners import (

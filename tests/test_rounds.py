@@ -8,15 +8,15 @@ import pytest
 
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
-from envs.objects import load_object_set
-from envs.rounds import (
+from envs.next_grasp import (
     ROOM_OVER_TOUCH,
     elsewhere_first,
     first_untried,
     no_deeper,
-    run_round,
     within_reach,
 )
+from envs.objects import load_object_set
+from envs.rounds import run_round
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.geometry import GripperGeometry, Workspace
