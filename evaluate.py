@@ -29,6 +29,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from envs.evaluation_worker import check_everything, privileged_policies, work
+from envs.objects import OBJECT_SETS
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
@@ -148,11 +149,12 @@ def check_options(options: argparse.Namespace) -> None:
 
 
 def announce(config: Config, run: Path) -> None:
-    plan = config.evaluate
+    plan, split = config.evaluate, config.objects.split
+    sets = [f"{name} ({split})" if name in OBJECT_SETS else name for name in plan.object_sets]
     print(
         f"{', '.join(policy_name(*pair) for pair in policies_of(config))} on "
         f"{', '.join(plan.scenarios)} scenes of "
-        f"{', '.join(plan.object_sets)} ({config.objects.split}) with depth noise "
+        f"{', '.join(sets)} with depth noise "
         f"{', '.join(depth_noises_of(config))}, {plan.rounds} rounds each, seed {config.seed}, in "
         f"{config.simulator}, on {describe_workers(config)}; results in {run}",
         flush=True,

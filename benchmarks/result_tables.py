@@ -1,4 +1,4 @@
-"""The tables of README and docs, written from docs/results/*.json: nothing is typed by hand.
+"""The tables of README and docs, written from docs/results/*.json; published figures stand here.
 
 A page says where a table stands by two comments, `<!-- results:NAME -->` and `<!-- /results -->`;
 NAME is a key of TABLES. Pages whose name has `zh` in it get their words in Chinese. A table names

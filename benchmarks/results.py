@@ -16,8 +16,8 @@ docs/results/<part>-<command>.jsonl; the tables are written from these files alo
 rounds each row has. Each part has a file of its own, so that parts may have different scales. Each
 publication adds a look at the sealed scenes to docs/results/looks.json (`benchmarks.looks`).
 
-Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/results.md lists
-the seeds of the development.
+Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/choices.md tells
+on which seeds choices were made.
 """
 
 from __future__ import annotations

@@ -35,11 +35,7 @@ from utils.grasp_quality import RELAXED
 from utils.height_map import height_map_from_scene
 from utils.transforms import pose_matrix
 
-# Their places are part of the scenes' seeds.
-LAYOUTS = (
-    "isolated", "packed", "pile", "dense", "bin", "household", "tall", "wall", "flat", "retrieve",
-    "shelf",
-)  # fmt: skip
+LAYOUTS = tuple(ARRANGEMENTS)
 TARGET_LAYOUT = "retrieve"  # of whose objects one is wanted
 DENSE_COUNT, RETRIEVE_COUNT = 15, 8
 WALL_COUNT, FLAT_COUNT = 3, 2  # wide things, which need room beside each other

@@ -59,7 +59,7 @@ def load_object(
     side = float(np.ptp(source.mesh.vertices, axis=0).max())
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
-    _check_size(path, scale * side, scale)
+    _check_size(path, scale * side, scale, fit)
     cut = decompose(source.mesh, cache_dir, str(path))
     stated = None
     if source.inertial is not None:
@@ -138,12 +138,17 @@ def _unit_of(side: float) -> float:
     return min(units, key=lambda unit: abs(math.log(side * unit / USUAL_OBJECT)))
 
 
-def _check_size(path: Path, side: float, scale: float) -> None:
+def _check_size(path: Path, side: float, scale: float, fit: float | None) -> None:
     if not SMALLEST_OBJECT < side < LARGEST_OBJECT:
+        advice = (
+            f"its lengths may be in another unit: try objects.scale={scale * _unit_of(side):g}, or "
+            "objects.fit=0.06"
+            if fit is None
+            else f"objects.fit={fit:g} is in metres: try objects.fit=0.06"
+        )
         raise ObjectError(
             f"object {path} is {side:.3g} m long, expected {SMALLEST_OBJECT:g} to "
-            f"{LARGEST_OBJECT:g} m; its lengths may be in another unit: try "
-            f"objects.scale={scale * _unit_of(side):g}, or objects.fit=0.06"
+            f"{LARGEST_OBJECT:g} m; {advice}"
         )
 
 

@@ -151,8 +151,8 @@ def load_object_set(
         sealed: others, for the published tables alone; of `random_urdfs` the test objects.
         unseen_families: 100 objects of `primitives` of four families that the others do not have.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
-    fit: rescale each object of `random_urdfs` or of a folder, before `scale` (then 1 by default),
-        so that the second longest side of its oriented bounding box has this many metres.
+    fit: in place of `scale`, rescale each object of `random_urdfs` or of a folder so that the
+        second longest side of its oriented bounding box has this many metres.
     density: kg/m3 of those objects of a folder whose file states no mass; `box` and `primitives`
         have their own. No object weighs less than 0.02 kg.
     max_opening: m, of the gripper; a warning names the first object of a folder that is far too
@@ -168,6 +168,10 @@ def load_object_set(
     for key, value in {"scale": scale, "fit": fit, "density": density}.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ObjectError(f"objects.{key} is {value}; it must be a number above 0")
+    if scale is not None and fit is not None:
+        raise ObjectError(
+            f"objects.scale={scale:g} and objects.fit={fit:g}: each sets the size; leave out one"
+        )
     settings = SetSettings(split, scale, fit, density, max_opening, Path(cache_dir), skip_broken)
     check_object_set(name_or_path, "objects")
     if name_or_path in OBJECT_SETS:
@@ -237,20 +241,21 @@ def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> N
         made = completed(workers, make, indices)
     else:  # no process has to be started
         made = map(make, indices)
-    too_large = {}
+    unfit = {}
     with tqdm(total=len(objects), desc=f"objects {objects.name}") as progress:
         for index, model, fitting, notes in made:
             objects.keep(index, model, notes)
             progress.set_postfix_str(model.name, refresh=False)
             progress.update()
             if not fitting:
-                too_large[index] = model.name
-    if too_large:
-        names = ", ".join(too_large[index] for index in sorted(too_large))
+                unfit[index] = model.name
+    if unfit:
+        names = ", ".join(unfit[index] for index in sorted(unfit))
         warnings.warn(
-            f"{len(too_large)} of {len(objects)} objects of {objects.name} do not fit a hand that "
-            f"opens {gripper.max_opening} m and comes from straight above, however they lie: "
-            f"{names}; tables count the others apart, too",
+            f"{len(unfit)} of {len(objects)} objects of {objects.name} are too large or too small "
+            f"for a hand that opens {gripper.max_opening} m and comes from straight above, however "
+            f"they lie: "
+            f"{names}; tables also give the rates without them",
             stacklevel=2,
         )
 

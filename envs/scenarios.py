@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.board import Board
 from envs.cell import Cell, Intrinsics, require_arm, wrist_mount
+from envs.cell_scenes import LAYOUTS
 from envs.robot_kinematics import forward_kinematics
 from utils.table_plane import fit_table_plane
 from utils.transforms import RGBDFrame, inverse_pose, planar
@@ -274,17 +275,7 @@ def conveyor(
 
 
 SCENARIOS = {
-    "isolated": Scenario("isolated"),
-    "packed": Scenario("packed"),
-    "pile": Scenario("pile"),
-    "dense": Scenario("dense"),
-    "bin": Scenario("bin"),
-    "household": Scenario("household"),
-    "tall": Scenario("tall"),
-    "wall": Scenario("wall"),
-    "flat": Scenario("flat"),
-    "shelf": Scenario("shelf"),
-    "retrieve": Scenario("retrieve"),
+    **{layout: Scenario(layout) for layout in LAYOUTS},
     "static": Scenario("isolated"),
     "moved": Scenario("isolated", moved=True),
     "moving_5cm": Scenario("isolated", speed=0.05),

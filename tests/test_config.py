@@ -133,7 +133,7 @@ def test_override_values(text, expected):
         ("evaluate.scenarios=pile,pile", ["repeated"]),
         ("randomization.parts=physic", ["parts[0]", "one of physics, vision", "mean physics?"]),
         ("objects.scale=-1", ["got -1", "a number > 0, or null"]),
-        ("evaluate.rounds", ["KEY=VALUE", "did you mean evaluate.rounds?"]),
+        ("evaluate.rounds", ["KEY=VALUE without spaces"]),
         ("=5", ["KEY=VALUE"]),
         ("camera.position=[0,", ["camera.position", "YAML", "a list of 3 numbers"]),
         ("camera.position=0,]", ["camera.position", "YAML"]),

@@ -261,8 +261,10 @@ def test_fit_makes_the_middle_side_what_it_says(tmp_path):
     folder = str(tmp_path / "things")
     model = load_object_set(folder, fit=0.06, cache_dir=tmp_path / "cache")[1]
     assert np.sort(model.extents) == pytest.approx([0.045, 0.06, 0.12], abs=1e-6)
-    model = load_object_set(folder, fit=0.06, scale=0.5, cache_dir=tmp_path / "cache")[1]
-    assert np.sort(model.extents) == pytest.approx([0.0225, 0.03, 0.06], abs=1e-6)
+    with pytest.raises(UserError, match=r"scale=0.5 and objects.fit=0.06: .* leave out one"):
+        load_object_set(folder, fit=0.06, scale=0.5, cache_dir=tmp_path / "cache")
+    with pytest.raises(UserError, match=r"expected .* to 3 m; objects.fit=60 is in metres"):
+        load_object_set(folder, fit=60, cache_dir=tmp_path / "cache")[1]
 
 
 def test_objects_too_large_for_the_hand_warn_once(tmp_path):

@@ -141,7 +141,9 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     pairs = compare(ROUNDS, seed=0)
     text = format_comparisons(pairs).splitlines()
     assert text[2].startswith("random - heuristic  pile      box")
-    assert text[2].endswith("-30.0 [-40.0, -20.0]  2")
+    assert text[2].endswith("-30.0 (few rounds)  2")
+    many = [replace(one, cleared=replace(one.cleared, rounds=20)) for one in pairs]
+    assert format_comparisons(many).splitlines()[2].endswith("-30.0 [-40.0, -20.0]  2")
     assert format_comparisons([]) == ""
     write_comparisons_csv(tmp_path / "pairs.csv", pairs)
     with (tmp_path / "pairs.csv").open(encoding="utf-8", newline="") as file:
@@ -156,5 +158,7 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     renamed = [replace(pairs[0], objects="random_urdfs")]
     write_comparisons_latex(tmp_path / "pairs.tex", renamed)
     lines = (tmp_path / "pairs.tex").read_text().splitlines()
-    assert lines[4].startswith(r"random $-$ heuristic & pile & random\_urdfs & -50.0 [")
-    assert lines[4].endswith(r"& -30.0 [-40.0, -20.0] & 2 \\") and lines[-1] == r"\end{tabular}"
+    assert lines[4].startswith(
+        r"random $-$ heuristic & pile & random\_urdfs & -50.0 (few rounds) & "
+    )
+    assert lines[4].endswith(r"& -30.0 (few rounds) & 2 \\") and lines[-1] == r"\end{tabular}"

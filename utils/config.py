@@ -314,8 +314,8 @@ def _parse_override(text: str) -> dict[str, Any]:
     key = key.strip()
     if not equals or not key:
         raise ConfigError(
-            f"{text!r}: not an override, expected KEY=VALUE such as evaluate.rounds=50"
-            f"{did_you_mean(key, known_keys())}"
+            f"{text!r}: not an override, expected KEY=VALUE without spaces around =, such as "
+            f"evaluate.rounds=50{'' if key in known_keys() else did_you_mean(key, known_keys())}"
         )
     schema = schema_at(key)
     if schema is None:

@@ -28,11 +28,10 @@ from utils.result_formats import columns_of, depth_in_words, failures_in_words
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stated_chances, stop_reasons
 from utils.runs import figure_bytes, git_state, write_atomic
-from utils.statistics import Difference
+from utils.statistics import FEW_ROUNDS, Difference
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image, project
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
-FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from utils.config import Config
 from utils.result_records import CLEAN, FAILURES
 from utils.results import Comparison, Row, StopReason
 from utils.runs import save_results, write_atomic
-from utils.statistics import Difference
+from utils.statistics import FEW_ROUNDS, Difference
 
 
 def write_results(
@@ -241,10 +241,12 @@ def _difference_cells(
 
 
 def _points(difference: Difference | None) -> str:
-    """'+12.5 [+3.1, +21.9]' in percentage points."""
+    """'+12.5 [+3.1, +21.9]' in percentage points; an interval of few rounds would be too narrow."""
     if difference is None:
         return "-"
     value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
+    if difference.rounds < FEW_ROUNDS:
+        return f"{value:+.1f} (few rounds)"
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 

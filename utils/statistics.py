@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
+FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
+
 
 def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a success rate, (low, high) in [0, 1]; n = 0 gives (0, 1).
