@@ -166,7 +166,7 @@ def headline(say: Say, scoreboard: Figures, clutter: Figures) -> str:
 
 
 def planners(say: Say, scoreboard: Figures, clutter: Figures) -> str:
-    """The README's: four planners on piles of 5 and of 15 objects, noisy rows first, and published
+    """The README's: planners on piles of 5 and of 15 objects, noisy rows first, and published
     systems."""
     few, many = (
         {(noise_of(row), row["policy"]): [success(row), cleared(row)] for row in rows}

@@ -110,7 +110,8 @@ class Part:
     needs: tuple[str, ...] = ()  # of SOURCES
 
 
-EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,oracle"
+EVALUATE, ALL = "evaluate.py", "random,heuristic,graspnet,graspnet6d,oracle"
+FROM_ABOVE = "random,heuristic,graspnet,oracle"
 ANY_SIDE = "graspnet,graspnet6d,oracle,oracle6d"
 JUDGED = "heuristic,graspnet,graspnet_direct,graspnet6d,oracle"
 NOISY_FIRST = "realsense,none"
@@ -141,12 +142,12 @@ def _single_objects(name: str, policies: str, objects: str, more: str = "") -> C
 
 
 PARTS = (
-    Part("scoreboard", "four planners on single objects, packed scenes and piles", 100, (
+    Part("scoreboard", "five planners on single objects, packed scenes and piles", 100, (
         _evaluation("scoreboard", 50, f"evaluate.policies={ALL} "
                     "evaluate.scenarios=isolated,packed,pile "
                     "evaluate.object_sets=random_urdfs,primitives", noises=NOISY_FIRST),
     )),
-    Part("clutter15", "four planners on piles of 15 objects", 50, (
+    Part("clutter15", "five planners on piles of 15 objects", 50, (
         _evaluation("clutter15", 30, f"scene.count=15 evaluate.policies={ALL} "
                     "evaluate.scenarios=pile evaluate.object_sets=random_urdfs",
                     noises=NOISY_FIRST),
@@ -228,7 +229,7 @@ PARTS = (
     )),
     Part("mujoco_only", "the default objects without PyBullet, beside those with it", 90, tuple(
         _evaluation(simulator, 100, f"simulator={simulator} scene.simulator={simulator} "
-                    f"evaluate.policies={ALL} evaluate.scenarios=isolated,packed,pile "
+                    f"evaluate.policies={FROM_ABOVE} evaluate.scenarios=isolated,packed,pile "
                     "evaluate.object_sets=primitives", kept=2)
         for simulator in ("mujoco", "pybullet")
     )),
