@@ -259,6 +259,20 @@ def variants(say: Say, part: Figures) -> str:
     return "\n\n".join([scoreboard(say, part), beside])
 
 
+def second_look(say: Say, once: Figures, twice: Figures) -> str:
+    """Planners with one image and with a second one, on the same scenes."""
+    first = {(*_key(row), noise_of(row)): row for row in rows_of(once)}
+    rows = rows_of(twice)
+    lines = [
+        [f"`{row['objects']}`", f"`{row['policy']}`", looks, *planner_cells(of)[1:]]
+        for row in rows
+        for looks, of in (("one", first[(*_key(row), noise_of(row))]), ("two", row))
+    ]
+    header = ["objects", "planner", "images", "success", "cleared", "picks an hour"]
+    noises = [noise for noise in noises_of(rows) for _ in range(2)]
+    return "\n\n".join([with_depths(header, lines, noises, 1), origin(say, once, twice)])
+
+
 def retrieve(say: Say, part: Figures) -> str:
     rows = rows_of(part)
     lines = [
@@ -458,6 +472,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
     "direct": (("direct",), variants),
     "scenes": (("scenes",), variants),
     "oblique": (("oblique",), variants),
+    "second_look": (("oblique", "second_look"), second_look),
     "unseen": (("unseen",), variants),
     "household": (("household",), variants),
     "ycb": (("ycb",), variants),

@@ -115,6 +115,7 @@ FROM_ABOVE = "random,heuristic,graspnet,oracle"
 ANY_SIDE = "graspnet,graspnet6d,oracle,oracle6d"
 JUDGED = "heuristic,graspnet,graspnet_direct,graspnet6d,oracle"
 NOISY_FIRST = "realsense,none"
+OBLIQUE = "'camera.position=[0.5,-0.566,0.566]' 'camera.up=[0,0,1]'"  # 45 degrees
 
 
 def _evaluation(
@@ -167,8 +168,12 @@ PARTS = (
     Part("oblique", "a camera 45 degrees off the vertical", 15, (
         _evaluation("oblique", 20, "evaluate.policies=heuristic,graspnet,graspnet6d,oracle6d "
                     "evaluate.scenarios=pile evaluate.object_sets=random_urdfs,primitives "
-                    "'camera.position=[0.5,-0.566,0.566]' 'camera.up=[0,0,1]'",
-                    noises=NOISY_FIRST, kept=3),
+                    f"{OBLIQUE}", noises=NOISY_FIRST, kept=3),
+    )),
+    Part("second_look", "the same with a second image from the wrist", 10, (
+        _evaluation("second_look", 20, "evaluate.policies=graspnet,graspnet6d "
+                    "evaluate.scenarios=pile evaluate.object_sets=random_urdfs,primitives "
+                    f"{OBLIQUE} evaluate.second_look=20", noises=NOISY_FIRST, kept=3),
     )),
     Part("unseen", "primitives of families that no training sees", 15, (
         _evaluation("unseen", 30, "evaluate.policies=heuristic,graspnet,graspnet_direct,graspnet6d,"

@@ -96,6 +96,18 @@ def test_the_overview_has_a_line_for_each_noisy_scene(tmp_path):
     ]
 
 
+def test_a_second_image_stands_below_the_first_one(tmp_path):
+    for part, successes in (("oblique", 80), ("second_look", 90)):
+        rows = [row(name, successes, 100) for name in ("graspnet", "heuristic")]
+        figures(tmp_path, part, rows[: 2 if part == "oblique" else 1])
+    page = with_tables("<!-- results:second_look -->\n<!-- /results -->\n", tmp_path)
+    assert page.splitlines()[3:5] == [
+        f"| `random_urdfs` | `graspnet` | {name} | {rate(n, 100)} | {rate(n, 500)} | 536 |"
+        for name, n in (("one", 80), ("two", 90))
+    ]
+    assert page.splitlines()[5] == ""
+
+
 def test_loops_have_successes_of_all_objects_and_the_median_time_of_a_turn(tmp_path):
     def rows(controller: str, mean: float | None, most: float | None) -> list[dict]:
         times = {"turn_ms_mean": mean, "turn_ms_p95": most, "controller": controller}
