@@ -1,8 +1,8 @@
 """Which grasp of a plan the arm tries next, and which it leaves.
 
-What has failed is not tried again at once, for often nothing has moved: grasps elsewhere that are
-more likely to succeed than not (whose quality as planned is 0.5 or more) come first, and of the
-others those that are not alike one that has just failed. After a failure, all qualities that are
+What has failed is not tried again at once, for often nothing has moved. Of planners that state
+chances, grasps elsewhere that are more likely to succeed than not (whose quality as planned is 0.5
+or more) come first; of all, those that are not alike one that has just failed. After a failure, all
 chances count as lower (`utils.calibration`): by these it is judged, and recorded, whether a grasp
 is worth trying.
 """
@@ -42,6 +42,8 @@ class Failures:
         """Remember what has been executed."""
         if outcome.success:
             self.in_a_row, self.palm_stops = [], []
+            # What lay there is gone.
+            self.in_round = [one for one in self.in_round if not _is_near(one, grasp)]
             return
         self.in_a_row.append(grasp)
         self.palm_stops.append(outcome.palm_stopped_at)
@@ -64,8 +66,9 @@ def choose(
     worth = [grasp for grasp in grasps if now(grasp).quality >= least]
     if not worth:
         return None, _abstained(map(now, grasps), least)
-    ordered = elsewhere_first(worth, failures.in_round) if failures.in_round else worth
-    chosen = first_untried(within_reach(cell, ordered), failures.in_a_row)
+    if failures.in_round and chances is not None:
+        worth = elsewhere_first(worth, failures.in_round)
+    chosen = first_untried(within_reach(cell, worth), failures.in_a_row)
     if chosen is None:
         return None, f"all planned grasps ({len(worth)}) are out of reach"
     return now(no_deeper(chosen, failures.in_a_row, failures.palm_stops)), ""
@@ -119,11 +122,15 @@ def elsewhere_first(grasps: Iterable[Grasp], failed: Sequence[Grasp]) -> list[Gr
     """The grasps in their order, but first those that are more likely to succeed than not and lie
     ANOTHER from all that failed."""
 
-    def is_near(grasp: Grasp) -> bool:
-        gaps = [np.linalg.norm(grasp.position - other.position) for other in failed]
-        return grasp.quality < LEAST_CHANCE or bool(min(gaps, default=np.inf) < ANOTHER)
+    def is_last(grasp: Grasp) -> bool:
+        return grasp.quality < LEAST_CHANCE or any(_is_near(grasp, other) for other in failed)
 
-    return sorted(grasps, key=is_near)
+    return sorted(grasps, key=is_last)
+
+
+def _is_near(grasp: Grasp, other: Grasp) -> bool:
+    """Whether two grasps are most likely of the same object."""
+    return bool(np.linalg.norm(grasp.position - other.position) < ANOTHER)
 
 
 def _alike(grasp: Grasp, other: Grasp) -> bool:
