@@ -8,8 +8,10 @@ import pytest
 
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
+from envs.execution import GraspOutcome
 from envs.next_grasp import (
     ROOM_OVER_TOUCH,
+    Failures,
     elsewhere_first,
     first_untried,
     no_deeper,
@@ -19,6 +21,7 @@ from envs.objects import load_object_set
 from envs.rounds import run_round
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
+from utils.calibration import Calibration
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_formats import format_table
 from utils.results import summarise
@@ -124,16 +127,26 @@ def test_a_round_goes_on_elsewhere_after_a_failure(cell, box_set) -> None:
         replace(cube_grasp(offset=(0.13, y, 0)), angle=angle, quality=0.9)
         for y, angle in ((0, 0.0), (0, 1.0), (0.03, 0.0))
     ]
-    tried = []
-    record = run_round(
-        cell, cube_scene(box_set), planner_of([*beside, replace(cube_grasp(), quality=0.6)]),
-        policy="x", objects="box", max_failures=2,
-        on_attempt=lambda frame, grasp, outcome: tried.append(grasp.quality),
-    )  # fmt: skip
-    assert (record.ended, tried) == ("cleared", [0.9, 0.6])
-    poor = planner_of([*beside, replace(cube_grasp(), quality=0.4)])
-    record = run_round(cell, cube_scene(box_set), poor, policy="x", objects="box", max_failures=2)
-    assert (record.ended, record.executed) == ("failures", 2)
+
+    def ended(quality: float, calibration: Calibration | None) -> tuple[str, int]:
+        plan = planner_of([*beside, replace(cube_grasp(), quality=quality)])
+        plan.calibration = calibration
+        scene = cube_scene(box_set)
+        record = run_round(cell, scene, plan, policy="x", objects="box", max_failures=2)
+        return record.ended, record.executed
+
+    chances = Calibration(1.0, 0.0)
+    assert ended(0.6, chances) == ("cleared", 2)
+    assert ended(0.4, chances) == ("failures", 2), "more likely to fail"
+    assert ended(0.6, None) == ("failures", 2), "a score tells nothing of likelihood"
+
+
+def test_a_miss_is_forgotten_where_something_was_picked() -> None:
+    failures = Failures()
+    for x, reason in ((0.40, "missed"), (0.50, "slipped"), (0.54, "success")):
+        failures.note(Grasp(np.array([x, 0.0, 0.05]), 0.0, 0.08, 1.0), GraspOutcome(reason, 3.0))
+    assert [float(one.position[0]) for one in failures.in_round] == [0.40]
+    assert failures.in_a_row == failures.palm_stops == []
 
 
 def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
