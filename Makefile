@@ -38,7 +38,7 @@ cluster: $(VENV)/.installed-cluster
 	echo "in another terminal: .venv/bin/python evaluate.py compute.scheduler=tcp://127.0.0.1:8786 (Ctrl-C here ends the cluster)"; \
 	$(BIN)/dask worker tcp://127.0.0.1:8786 --nworkers $(WORKERS) --nthreads 1
 
-# The chances of success of all planners, fitted again to executed grasps: half an hour on two cores.
+# The chances of success of all planners, fitted again to executed grasps: half an hour or more on two cores.
 calibration: $(INSTALLED)
 	$(BIN)/python evaluate.py --config configs/calibration.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_household.yaml

@@ -77,7 +77,7 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
             raise UserError(
                 f"evaluate.abstain: {name} states no chances of success (it has no `calibration`); "
                 f"allowed with it are {', '.join(calibrations())}, a planner of your own that has "
-                "one (docs/planner.md), or evaluate.abstain=null"
+                "one (docs/calibration.md), or evaluate.abstain=null"
             )
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")

@@ -32,7 +32,7 @@ ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 @dataclass
 class Failures:
     """The grasps that failed: in a row, with the places (3,), m in W, of the hand where its palm
-    met something, None elsewhere; and in the round."""
+    met something, None elsewhere; and in the round, where nothing was picked since."""
 
     in_a_row: list[Grasp] = field(default_factory=list)
     palm_stops: list[np.ndarray | None] = field(default_factory=list)

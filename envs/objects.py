@@ -254,8 +254,7 @@ def prepare(objects: ObjectSet, workers: Workers, gripper: GripperGeometry) -> N
         warnings.warn(
             f"{len(unfit)} of {len(objects)} objects of {objects.name} are too large or too small "
             f"for a hand that opens {gripper.max_opening} m and comes from straight above, however "
-            f"they lie: "
-            f"{names}; tables also give the rates without them",
+            f"they lie: {names}; tables also give the rates without them",
             stacklevel=2,
         )
 
