@@ -40,8 +40,9 @@ def test_executed_are_grasps_of_a_scene_at_rest() -> None:
 
 @pytest.mark.slow
 def test_examples_of_a_scene_are_a_function_of_its_number() -> None:
+    """Of a pile of three, seen with noise in pictures of both sizes: larger scenes take longer."""
     config = load_config(None, ["data.object_sets=primitives"])
-    first, again = examples_of(config, 4), examples_of(config, 4)
+    first, again = examples_of(config, 12), examples_of(config, 12)
     assert len(first.success) > 20
     assert 0 < first.success.mean() < 1
     for one, other in zip((*first.inputs, *first[1:]), (*again.inputs, *again[1:])):

@@ -240,6 +240,17 @@ def test_each_depth_noise_is_the_same_as_when_it_is_scored_alone(
     assert "2 of 2 rounds are the same" in capsys.readouterr().out
 
 
+@pytest.fixture(scope="module")
+def undisturbed(finished, tmp_path_factory):
+    """The run of `finished`, its journal continued to four rounds with nothing killed."""
+    run = tmp_path_factory.mktemp("undisturbed") / "run"
+    shutil.copytree(only_run(finished[0]), run)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(run.parent)
+        assert evaluate.main(["--resume", str(run), "evaluate.rounds=4"]) == 0
+    return run
+
+
 @pytest.fixture(params=["local", "cluster"])
 def engine(request):
     """Overrides that choose the engine, and a function that lists its worker processes."""
@@ -252,14 +263,10 @@ def engine(request):
 
 
 @pytest.mark.slow
-def test_rounds_are_the_same_when_a_worker_is_killed(finished, engine, tmp_path, monkeypatch):
-    """With kill -9 in the middle of a scene. The journal of `finished` is continued with nothing
-    killed, for the rounds to compare with."""
-    (first, _), (overrides, workers) = finished, engine
-    undisturbed = tmp_path / "undisturbed"
-    shutil.copytree(only_run(first), undisturbed)
+def test_rounds_are_the_same_when_a_worker_is_killed(undisturbed, engine, tmp_path, monkeypatch):
+    """With kill -9 in the middle of a scene."""
+    overrides, workers = engine
     monkeypatch.chdir(tmp_path)
-    assert evaluate.main(["--resume", str(undisturbed), "evaluate.rounds=4"]) == 0
 
     def kill_one():
         deadline = time.monotonic() + 300

@@ -15,9 +15,15 @@ from utils.config import load_config
 from utils.errors import UserError
 
 
-@pytest.mark.parametrize("by_patch", [False, True])
-def test_a_rule_is_learned(by_patch) -> None:
-    critic = fit(made_up(300, 0, by_patch), seed=0, epochs=25)
+@pytest.fixture(scope="module")
+def known() -> GraspCritic:
+    """One that has learned the rule of the cover."""
+    return fit(made_up(300, 0), seed=0, epochs=15)
+
+
+@pytest.mark.parametrize(("by_patch", "epochs"), [(False, 25), (True, 15)])
+def test_a_rule_is_learned(by_patch, epochs) -> None:
+    critic = fit(made_up(300, 0, by_patch), seed=0, epochs=epochs)
     scores = judged(critic, made_up(100, 1, by_patch))
     for name in PLANNERS:
         assert scores[f"{name} by search"] < 0.2  # and as many nothing else
@@ -37,17 +43,17 @@ def test_the_same_examples_give_the_same_critic() -> None:
     np.testing.assert_array_equal(one.chance(inputs), other.chance(inputs))
 
 
-def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn() -> None:
+def test_the_first_of_a_plan_is_sought_among_those_that_were_drawn(known) -> None:
     """Of each plan, the candidate of highest cover was chosen by a critic: it does not count."""
-    examples, critic = made_up(60, 1), fit(made_up(300, 0), seed=0, epochs=15)
+    examples = made_up(60, 1)
     chosen = first_of_plans(
         examples._replace(success=np.arange(720)), column(examples.inputs, "cover")
     )
     examples.drawn[chosen] = False
     examples.success[:] = False
     examples.success[chosen] = True
-    assert judged(critic, examples)["graspnet6d by critic"] == 0
-    assert judged(critic, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
+    assert judged(known, examples)["graspnet6d by critic"] == 0
+    assert judged(known, examples._replace(drawn=~examples.drawn))["graspnet6d by critic"] == 1
 
 
 def test_a_comparison_judges_each_scene_by_what_learned_from_the_others(monkeypatch) -> None:
@@ -115,9 +121,8 @@ def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
         collect(config, 120, tmp_path)
 
 
-def test_a_critic_goes_on_from_another_ones_weights() -> None:
+def test_a_critic_goes_on_from_another_ones_weights(known) -> None:
     """Of a rule that is known already, few examples take nothing away."""
-    known = fit(made_up(300, 0), seed=0, epochs=15)
     few = made_up(20, 2)
     again, anew = fit(few, seed=0, epochs=1, initial=known), fit(few, seed=0, epochs=1)
     torch.testing.assert_close(again.mean, known.mean)

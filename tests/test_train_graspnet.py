@@ -70,7 +70,8 @@ def test_the_best_epoch_is_kept(tiny_data, tmp_path, monkeypatch):
         "models.graspnet_data.score_labels",
         lambda model, images: LabelScores(next(qualities), 0.5, 0.1, 0.01, 1.0, 32),
     )
-    assert train_graspnet.main([*tiny_data[1], *SMALL]) == 0
+    # The quickest network: which of its weights are kept does not depend on it.
+    assert train_graspnet.main([*tiny_data[1], *SMALL, "train.backbone=ggcnn"]) == 0
     (run,) = Path("runs/train_graspnet").iterdir()
     best, last = (load_checkpoint(run / f"{name}.pt", KIND) for name in ("best", "last"))
     assert (best["step"], last["step"]) == (8, 12)
