@@ -481,7 +481,8 @@ def without_places(figures: dict[str, Any], folders: Folders) -> dict[str, Any]:
         return objects
 
     for one in (*figures.get("rows", ()), *figures.get("comparisons", ())):
-        one["objects"] = " + ".join(map(told, one["objects"].split(" + ")))
+        if "objects" in one:  # rows of a transfer report have none
+            one["objects"] = " + ".join(map(told, one["objects"].split(" + ")))
     return figures
 
 

@@ -288,6 +288,8 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
         "path/to/clutter/pile", "ycb", "path/to/ycb + b",
     ]  # fmt: skip
     assert told["run"] == "runs/ycb"
+    report = {"policy": "heuristic", "scenes": "pile of random_urdfs"}  # a transfer report's row
+    assert results.without_places({"rows": [dict(report)]}, here)["rows"] == [report]
     (cornell,) = chosen_parts("cornell")
     line = cornell.commands[0].line(None, {"cornell": Path("YCB/cornell")})
     assert line.endswith("transfer.columns=cornell,cornell_as_taken transfer.cornell=YCB/cornell")
