@@ -23,6 +23,7 @@ from envs.simulators import make_cell
 from utils.config import Config, load_config
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import GraspLabels, Trial, dense_labels, label_truth
+from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
 LAYOUTS = ("pile", "packed", "isolated", "pile", "packed")
@@ -99,4 +100,4 @@ def truth_metrics(trials: Sequence[Trial]) -> list[Metric]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,6 +24,7 @@ from benchmarks.metrics import Metric, benchmark_parser, report
 from envs.object_files import object_files, read_object
 from envs.object_meshes import decompose, load_mesh
 from envs.object_parts import MAX_PARTS, hull_of, solid_of, to_trimesh, union
+from utils.errors import UserError
 from utils.runs import run_script
 
 # Points on what one body has beyond the other, and on the surface of the latter: a distance comes
@@ -70,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> None:
                 print(f"{m.name:32}{m.method:10}{m.triangles:10,}{m.seconds:8.2f}{m.parts:7}"
                       f"{m.vertices:9}{m.ratio:8.3f}{m.hausdorff:9.2f} %  {m.remark}",
                       flush=True)  # fmt: skip
+    if not found:
+        raise UserError(f"{options.folder}: no URDF there has a visual mesh; leave out --visual")
     report([one for method in methods for one in _summary(method, found)], options.json)
 
 

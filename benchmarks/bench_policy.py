@@ -18,6 +18,7 @@ from envs.vector_env import full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo_rollouts import FRESH, derived_seeds
 from utils.config import Config, load_foreign
+from utils.errors import UserError
 from utils.runs import run_script
 from utils.statistics import wilson_interval
 
@@ -28,6 +29,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="e.g. objects.split=test")
     parser.add_argument("--episodes", type=int, default=200)
     options = parser.parse_args(argv)
+    if options.episodes < 1:
+        raise UserError(f"--episodes: got {options.episodes}, expected at least 1")
     count = min(options.episodes, 5) if options.quick else options.episodes
     config = config_of(options.checkpoint, options.overrides)
     episodes = run_episodes(load_policy(options.checkpoint), config, count)

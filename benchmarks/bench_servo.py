@@ -15,6 +15,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
+from utils.runs import run_script
 from utils.servo_reference import (
     CAMERA,
     FOCAL,
@@ -168,4 +169,4 @@ def law_metrics(starts: Sequence[np.ndarray]) -> list[Metric]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

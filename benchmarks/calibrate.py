@@ -38,7 +38,7 @@ from utils.errors import UserError
 from utils.plugins import is_import_path
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord, read_rounds
-from utils.runs import git_state, run_script, write_json_atomic
+from utils.runs import check_writable, git_state, run_script, write_json_atomic
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("runs", type=Path, nargs="+", help="run folders of evaluate.py")
     parser.add_argument("--output", type=Path, help="JSON file for the fits")
     options = parser.parse_args(argv)
-    played = {run.name: rounds_of(run, options.output) for run in options.runs}
+    check_writable("--output", options.output)
+    played = {run.resolve(): rounds_of(run, options.output) for run in options.runs}
     rounds = [record for own in played.values() for record in own]
     commit = git_state().commit
     lines, found = [], {}
@@ -67,7 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             "grasps": len(successes),
             "successes": int(successes.sum()),
             "after_failure": int(failed.sum()),
-            "runs": [run for run, of in played.items() if any(one.policy == name for one in of)],
+            "runs": [
+                run.name for run, of in played.items() if any(one.policy == name for one in of)
+            ],
             "commit": commit,
         }
         for kind in [None, *dict.fromkeys((one.scenario, one.depth_noise) for one in own)]:

@@ -18,7 +18,7 @@ import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from utils.errors import UserError
-from utils.runs import run_script
+from utils.runs import check_writable, run_script
 
 SMOOTHED = 5000  # steps
 
@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("runs", nargs="+", metavar="RUN")
     options = parser.parse_args(argv)
+    check_writable("FILE.png", options.output)
     matplotlib.use("Agg")
     figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
     for text in options.runs:
@@ -49,6 +50,8 @@ def draw(axis: plt.Axes, run: Path, label: str) -> None:
 
 def training_success(run: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps (N,) and the share of episodes that succeeded (N,) in the rollout before each."""
+    if not (run / "tensorboard").is_dir():
+        raise UserError(f"{run}: no run folder of train_rl.py, which holds `tensorboard`")
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
     if "training/success_share" not in events.Tags()["scalars"]:

@@ -394,7 +394,8 @@ def finished_file(part: Part, command: Command, commit: str, scale: float) -> Pa
 
 
 def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> str:
-    """Other arguments have another name, so that no run is taken for one of theirs."""
+    """Other arguments have another name, so that no run is taken for one of theirs. The folders of
+    SOURCES have none: who exchanges one deletes runs/results."""
     digest = hashlib.sha256(command.line(rounds).encode()).hexdigest()[:6]
     return "-".join(["results", part.name, command.name, str(rounds or "all"), commit[:10], digest])
 

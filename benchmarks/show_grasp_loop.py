@@ -26,7 +26,9 @@ from envs.simulators import make_cell
 from envs.studio import Studio
 from models.planners import make_planner
 from utils.config import load_config
+from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
+from utils.runs import check_writable, run_script
 from utils.transforms import inverse_pose, transform_points
 
 MOMENTS = (0.4, 1.4, 2.2, 2.7)  # s after the arm has set out
@@ -38,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     overrides = [a for a in argv if "=" in a]
     names = [a for a in argv if "=" not in a]
     file, scenario = [*names, *("servo.png", "turning_5cm")[len(names) :]][:2]
+    if scenario not in SCENARIOS:
+        raise unknown_choice("scenario", scenario, SCENARIOS)
+    check_writable("FILE", Path(file))
     config = load_config(None, overrides)
     objects = load_object_set(
         "random_urdfs", cache_dir=config.cache_folder, **config.objects.model_dump()
@@ -45,8 +50,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
     plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
     with make_cell(config) as cell:
-        taught, conditions = teach(cell), SCENARIOS[scenario]
-        cell.load(make_scene(conditions.layout, objects, config.seed, config))
+        conditions = SCENARIOS[scenario]
+        scene = make_scene(conditions.layout, objects, config.seed, config)
+        taught = teach(cell, scene)
+        cell.load(scene)
         calibration, frame = conditions.calibration(cell), cell.frame()
         loop = ClosedLoop(cell, "ibvs", frame, calibration, taught, conditions.latency)
         pictures, camera, start = [], loop.camera, cell.seconds
@@ -82,4 +89,4 @@ def _both(picture: np.ndarray, sight: WristImage, loop: ClosedLoop) -> np.ndarra
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

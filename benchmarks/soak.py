@@ -30,7 +30,7 @@ from benchmarks.soak_tally import Tally
 from envs.simulators import SIMULATORS
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
-from utils.runs import environment, run_script, write_json_atomic
+from utils.runs import check_writable, environment, run_script, write_json_atomic
 
 SEED = 2027
 
@@ -79,6 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             minutes = max(1, round(PARTS[name].minutes * options.scale))
             print(f"{name}: {PARTS[name].about}; about {minutes} minutes")
         return 0
+    kept_in(options.json)  # a file that cannot be added to is found out now
     with stop_on_interrupt("stopping: what was tried until now counts") as stop:
         for name in names:
             if stop.is_set():
@@ -100,10 +101,23 @@ def in_words(tally: Tally) -> str:
     )
 
 
+def kept_in(path: Path | None) -> dict[str, Any]:
+    """The rows of other parts in a file, which need not exist. Raises UserError."""
+    check_writable("--json", path)
+    if path is None or not path.exists():
+        return {}
+    try:
+        kept = json.loads(path.read_text())
+    except ValueError as error:
+        raise UserError(f"--json {path}: holds no JSON ({error}); choose another file") from None
+    if not isinstance(kept, dict):
+        raise UserError(f"--json {path}: holds no table of this command; choose another file")
+    return kept
+
+
 def keep(path: Path, part: str, scale: float, minutes: float, tallies: Sequence[Tally]) -> None:
     """Write a part's rows to a file, beside those of other parts."""
-    kept: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    facts = environment()
+    kept, facts = kept_in(path), environment()
     kept[part] = {
         "command": f"python -m benchmarks.soak --parts {part} --scale {scale:g}",
         "commit": facts["commit"],

@@ -182,9 +182,9 @@ class Cell(ABC):
         """
         self._rebuild(scene)
 
-    def show_board(self, board: Board, T_WO: np.ndarray) -> None:
-        """Rebuild the cell without objects, with a board that stays at T_WO (4, 4)."""
-        self._rebuild(EMPTY, board, T_WO)
+    def show_board(self, board: Board, T_WO: np.ndarray, scene: Scene = EMPTY) -> None:
+        """Rebuild the cell with a board that stays at T_WO (4, 4), and no objects but a scene's."""
+        self._rebuild(scene, board, T_WO)
 
     def _rebuild(
         self, scene: Scene, board: Board | None = None, T_WO: np.ndarray | None = None

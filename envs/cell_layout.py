@@ -105,7 +105,8 @@ class ObjectModel:
     in the source.
 
     parts: vertex arrays (V, 3) of the convex parts.
-    mass: kg. inertia: (3,) moments about the body axes, kg m2.
+    mass: kg. inertia: (3,) principal moments, kg m2, about the body axes, or about those that the
+    quaternion `principal` (4,) turns the body axes into.
     friction: lateral coefficient. rolling_friction, spinning_friction: metres.
     color: RGBA in 0..1.
     collision: a native shape, or an OBJ file with one `o` group for each convex part.
@@ -125,6 +126,7 @@ class ObjectModel:
     extents: np.ndarray
     rolling_friction: float = 0.0
     spinning_friction: float = 0.0
+    principal: tuple[float, float, float, float] | None = None
     remarks: tuple[str, ...] = ()
 
     def geometry(self) -> tuple[ConvexSolid, ...]:

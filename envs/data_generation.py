@@ -26,7 +26,7 @@ from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.simulators import cell_class
-from utils.config import Config, dump_config, with_settings
+from utils.config import Config, dump_config, load_config, with_settings
 from utils.config_types import changed, draw
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
@@ -76,10 +76,15 @@ def _content(config: Config) -> str:
     chosen["data"] = {
         key: data[key] for key in ("object_sets", "max_objects", "randomise", "executed_share")
     }
+    usual = load_config(None)
     if config.data.executed_share > 0:
+        if config.closed_loop.floor != usual.closed_loop.floor:  # valid as above
+            chosen["floor"] = everything["closed_loop"]["floor"]
         chosen |= {key: everything[key] for key in ("robot", "execution", "safety")}
         chosen["robot"].pop("arm")
         chosen["execution"].pop("on_contact")
+    elif config.robot.home != usual.robot.home:  # valid as above: the arm is in the images
+        chosen["home"] = everything["robot"]["home"]
     if config.data.randomise_physics:
         physics = everything["randomization"]["physics"]
         chosen["physics"] = {key: physics[key] for key in _PHYSICS}

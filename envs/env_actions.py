@@ -10,6 +10,7 @@ arm's reach.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -175,13 +176,14 @@ _GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
 _MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
+_START_SLACK = 0.01  # rad or m
 
 
 def checked_options(
-    options: dict[str, Any] | None,
+    options: dict[str, Any] | None, max_opening: float
 ) -> tuple[int | None, str | dict[str, Any] | None]:
     """The scene's seed that reset's options ask for, and where to start; None for what they leave
-    open. Raises UserError."""
+    open. max_opening: m, of the gripper. Raises UserError."""
     options = dict(options or {})
     seed, start = options.pop("scene_seed", None), options.pop("start", None)
     if options:
@@ -195,11 +197,35 @@ def checked_options(
             f"reset: start must be 'home', 'near', 'pretraining' or an episode's own (q, opening "
             f"and command), got {start!r}"
         )
+    if isinstance(start, dict):
+        _check_start(start, max_opening)
     if seed is None:
         return None, start
     if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
         raise UserError(f"reset: scene_seed must be a whole number of at least 0, got {seed!r}")
     return int(seed), start
+
+
+def _check_start(start: Mapping[str, Any], max_opening: float) -> None:
+    """Raise UserError for a start in which no arm can be. A recorded one may be beyond a limit by
+    a little."""
+    try:
+        q = np.array(start["q"], dtype=float)
+        openings = np.array([start["opening"], start["command"]], dtype=float)
+    except (TypeError, ValueError):
+        q, openings = np.empty(0), np.empty(0)
+    possible = q.shape == JOINT_LOWER.shape and openings.shape == (2,)
+    if possible:
+        beyond = np.concatenate([
+            q - np.clip(q, JOINT_LOWER, JOINT_UPPER), openings - np.clip(openings, 0, max_opening)
+        ])  # fmt: skip
+        possible = bool((np.abs(beyond) <= _START_SLACK).all())
+    if not possible:
+        raise UserError(
+            f"reset: start must have seven joint positions q in {JOINT_LOWER.tolist()} to "
+            f"{JOINT_UPPER.tolist()} rad, and opening and command in 0 to {max_opening:g} m; got "
+            f"{dict(start)!r}"
+        )
 
 
 def near_pose(

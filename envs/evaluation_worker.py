@@ -167,6 +167,6 @@ def work(config: Config, task: Task) -> TaskResult:
 def film_name(task: Task, policy: str, noise: str, suffix: str) -> str:
     """A file's name on every system: policies, noises and object sets may be paths or
     MODULE:NAME."""
-    kind = [task.scenario, Path(task.objects).name, *([] if noise == CLEAN else [noise])]
+    kind = [task.scenario, task.objects, *([] if noise == CLEAN else [noise])]
     stem = "-".join([*kind, policy, str(task.seed)])
     return re.sub(r"[^\w.+-]", "_", stem) + f".{suffix}"

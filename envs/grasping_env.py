@@ -204,7 +204,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self._running = False
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
-        asked, start = checked_options(options)
+        asked, start = checked_options(options, self.config.gripper.max_opening)
         if start is None:
             share = self.settings.near_share
             start = "near" if share > 0 and self.np_random.random() < share else "home"

@@ -124,6 +124,8 @@ def add_object(
     )
     body.add_freejoint(name=name)
     body.mass, body.inertia, body.ipos = model.mass, model.inertia, [0, 0, 0]
+    if model.principal is not None:
+        body.iquat = np.roll(model.principal, 1).tolist()
     body.explicitinertial = True
     for geom in _add_shapes(spec, body, name, model):
         geom.rgba = list(model.color)

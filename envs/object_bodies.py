@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from envs.cell_layout import ObjectModel
 from envs.object_files import DEFAULT_DENSITY, Inertial, colour, fine_visual, read_object
@@ -26,6 +27,8 @@ IMPOSSIBLE_INERTIA = (
     "states an inertia that no body of its mass and shape can have; that of an even density is "
     "taken instead"
 )
+# Products of inertia below this share of the smallest moment are no reason to turn its axes.
+LEAST_PRODUCT = 0.01
 # Bullet solves contacts badly between bodies whose masses differ much, and a finger pushes hard.
 MIN_MASS = 0.02
 SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 3.0  # m
@@ -69,6 +72,7 @@ def load_object(
     inertial = body_of(stated, cut.solid, source.mesh, density)
     parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
     mass = max(inertial.mass * scale**3, MIN_MASS)
+    moments, principal = principal_axes(inertial.inertia)
     remarks = [cut.remark] if cut.remark else []
     if stated is not None and inertial is not stated:
         remarks.append(IMPOSSIBLE_INERTIA)
@@ -76,7 +80,8 @@ def load_object(
         name=name,
         parts=parts,
         mass=mass,
-        inertia=np.diag(inertial.inertia) * scale**2 * (mass / inertial.mass),
+        inertia=moments * scale**2 * (mass / inertial.mass),
+        principal=principal,
         friction=source.friction,
         color=colour(path, source) or random_color(np.random.default_rng(list(name.encode()))),
         collision=write_parts_obj(parts, cache_dir),
@@ -116,17 +121,32 @@ def compound_object(shape: Primitive, cache_dir: Path) -> ObjectModel:
     solid = trimesh.util.concatenate(hulls)  # the parts touch but do not overlap
     centre = np.asarray(solid.center_mass)
     parts = tuple(part - centre for part in shape.parts)
+    moments, principal = principal_axes(shape.density * solid.moment_inertia)
     return ObjectModel(
         name=shape.name,
         parts=parts,
         mass=shape.density * float(solid.volume),
-        inertia=shape.density * np.diag(solid.moment_inertia),
+        inertia=moments,
+        principal=principal,
         friction=shape.friction,
         color=shape.color,
         collision=write_parts_obj(parts, cache_dir),
         fine_visual=None,
         extents=np.ptp(np.concatenate(parts), axis=0),
     )
+
+
+def principal_axes(
+    inertia: np.ndarray,
+) -> tuple[np.ndarray, tuple[float, float, float, float] | None]:
+    """Moments (3,) of an inertia (3, 3), and the quaternion that turns its axes into the principal
+    ones; None where its own are, or nearly."""
+    moments, axes = np.linalg.eigh(inertia)
+    if np.abs(inertia - np.diag(np.diag(inertia))).max() < LEAST_PRODUCT * moments[0]:
+        return np.diag(inertia).copy(), None
+    axes[:, 0] *= np.linalg.det(axes)  # right-handed
+    x, y, z, w = Rotation.from_matrix(axes).as_quat().tolist()
+    return moments, (x, y, z, w)
 
 
 # --- What a file states ---------------------------------------------------------------------------

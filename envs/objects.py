@@ -333,19 +333,21 @@ class PrimitiveSet(ObjectSet):
 
 class FileSet(ObjectSet):
     """URDF, MJCF and mesh files, one object each. scale: factor on their lengths, in place of the
-    settings' own."""
+    settings' own. any_mass: as in `load_object`."""
 
     def __init__(
-        self, name: str, files: Sequence[Path], scale: float, settings: SetSettings
+        self,
+        name: str,
+        files: Sequence[Path],
+        scale: float,
+        settings: SetSettings,
+        any_mass: bool = False,
     ) -> None:
         super().__init__(name)
-        self.files, self.scale = tuple(files), scale
+        self.files, self.scale, self.any_mass = tuple(files), scale, any_mass
         self.fit, self.density = settings.fit, settings.density
         self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
         self.skip_broken = settings.skip_broken
-        # random_urdfs is known to hold a few that no hand can take, placeholders for inertias, and
-        # 0.1 kg for each, however thin; of a folder all of it is a surprise.
-        self.told = name == "random_urdfs"
 
     def __len__(self) -> int:
         return len(self.files)
@@ -369,7 +371,7 @@ class FileSet(ObjectSet):
     def _load(self, path: Path) -> ObjectModel:
         model = load_object(
             path, scale=self.scale, fit=self.fit, density=self.density,
-            any_mass=self.told, cache_dir=self.cache_dir,
+            any_mass=self.any_mass, cache_dir=self.cache_dir,
         )  # fmt: skip
         for remark in model.remarks:
             self._notes.setdefault(remark, f"object {path}: {remark} (and so may others)")
@@ -392,7 +394,11 @@ def _random_urdfs(settings: SetSettings) -> ObjectSet:
         )
     nominal = RANDOM_URDFS_SCALE if settings.fit is None else 1.0
     files = _random_urdf_files(settings.split)
-    return FileSet("random_urdfs", files, settings.scale or nominal, settings)
+    # It is known to hold a few that no hand can take, placeholders for inertias, and 0.1 kg for
+    # each, however thin; of a folder all of it is a surprise.
+    found = FileSet("random_urdfs", files, settings.scale or nominal, settings, any_mass=True)
+    found.told = True
+    return found
 
 
 def _random_urdf_files(split: str) -> list[Path]:

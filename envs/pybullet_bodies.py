@@ -39,6 +39,8 @@ from utils.transforms import position_quaternion
 # (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more
 # than the root of this. PyBullet's default.
 SOLVER_RESIDUAL = 1e-7
+Quaternion = Sequence[float]  # x, y, z, w
+_HERE = (0.0, 0.0, 0.0)
 
 
 def set_up_physics(client: int, sim: SimConfig) -> None:
@@ -140,6 +142,7 @@ def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = Fa
         ),
         basePosition=np.asarray(position, dtype=float).tolist(),
         baseOrientation=np.asarray(quaternion, dtype=float).tolist(),
+        baseInertialFrameOrientation=model.principal or (0.0, 0.0, 0.0, 1.0),
         physicsClientId=client,
     )
     pybullet.changeDynamics(
@@ -158,6 +161,22 @@ def spawn(client: int, model: ObjectModel, position, quaternion, fine: bool = Fa
         # Bullet grows hulls by 1 mm: objects would hover above what the camera sees.
         pybullet.changeDynamics(body, -1, collisionMargin=0.0, physicsClientId=client)
     return body
+
+
+def body_quaternion(quaternion: Quaternion, principal: Quaternion | None) -> Quaternion:
+    """The quaternion in W of a body's own axes. quaternion: that which Bullet states of it, of the
+    principal axes (`ObjectModel.principal`)."""
+    if principal is None:
+        return quaternion
+    x, y, z, w = principal
+    return pybullet.multiplyTransforms(_HERE, quaternion, _HERE, (-x, -y, -z, w))[1]
+
+
+def bullet_quaternion(quaternion: Quaternion, principal: Quaternion | None) -> Quaternion:
+    """The inverse of `body_quaternion`."""
+    if principal is None:
+        return quaternion
+    return pybullet.multiplyTransforms(_HERE, quaternion, _HERE, principal)[1]
 
 
 def _collision_shape(client: int, shape: NativeShape | Path) -> int:
@@ -289,6 +308,7 @@ class PybulletTable(LayoutTable):
 
     def __init__(self, config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()):
         self._config, self._walls = config, walls
+        self._principal: dict[int, Quaternion | None] = {}  # of each body, see `ObjectModel`
 
     def __enter__(self) -> Self:
         PybulletTable._turn.acquire()
@@ -313,7 +333,9 @@ class PybulletTable(LayoutTable):
         PybulletTable._client = None
 
     def put(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
-        return spawn(self._client, model, position, quaternion)
+        body = spawn(self._client, model, position, quaternion)
+        self._principal[body] = model.principal
+        return body
 
     def put_walls(self, walls: Iterable[Box]) -> list[int]:
         return add_walls(self._client, walls)
@@ -328,7 +350,7 @@ class PybulletTable(LayoutTable):
         position, quaternion = pybullet.getBasePositionAndOrientation(
             body, physicsClientId=self._client
         )
-        return np.array(position), np.array(quaternion)
+        return np.array(position), np.array(body_quaternion(quaternion, self._principal[body]))
 
     def is_near(self, body: int, others: Sequence[int], distance: float) -> bool:
         return any(

@@ -20,6 +20,8 @@ from envs.pybullet_bodies import (
     add_bin,
     add_board,
     add_table,
+    body_quaternion,
+    bullet_quaternion,
     set_up_physics,
     settle,
     spawn,
@@ -89,8 +91,9 @@ class PybulletCell(Cell):
 
     def randomizable(self) -> PybulletRandomizable:
         if self._randomizable is None:
+            principal = [placed.model.principal for placed in self.scene.placements]
             self._randomizable = PybulletRandomizable(
-                self.client, self.dt, self.robot, self.table, self.bodies, self.remaining
+                self.client, self.dt, self.robot, self.table, self.bodies, self.remaining, principal
             )
         return self._randomizable
 
@@ -163,7 +166,7 @@ class PybulletCell(Cell):
         )
         if not all(map(math.isfinite, position)):
             raise PhysicsError(f"object {index} has a non-finite position: {position}")
-        return position, quaternion
+        return position, body_quaternion(quaternion, self.scene.placements[index].model.principal)
 
     def speed(self, index: int) -> float:
         velocity, _ = pybullet.getBaseVelocity(self.bodies[index], physicsClientId=self.client)
@@ -172,6 +175,7 @@ class PybulletCell(Cell):
     def carry(self, index: int, T_WO: np.ndarray, velocity: np.ndarray, turn_rate: float) -> None:
         body, client = self.bodies[index], self.client
         position, quaternion = position_quaternion(T_WO)
+        quaternion = bullet_quaternion(quaternion, self.scene.placements[index].model.principal)
         pybullet.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
         pybullet.resetBaseVelocity(body, velocity, [0, 0, turn_rate], physicsClientId=client)
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pybullet
 
+from envs.pybullet_bodies import Quaternion, body_quaternion
 from envs.pybullet_panda import ARM, FINGERS, PybulletPanda
 from utils.config_types import Change, changed_in
 from utils.transforms import pose_matrix
@@ -45,17 +46,18 @@ class PybulletRandomizable:
     """A `utils.domain_randomization.Randomizable` of a cell's scene as built.
 
     dt: s, a physics step. table, bodies: PyBullet's numbers. remaining: the cell's own set of the
-    objects that are not retired. What is nominal is read here, but for joint damping, which
-    PyBullet does not report: nominal is what the robot's file says.
+    objects that are not retired. principal: of each body, see `ObjectModel`. What is nominal is
+    read here, but for joint damping, which PyBullet does not report: nominal is what the robot's
+    file says.
     """
 
     def __init__(
         self, client: int, dt: float, robot: PybulletPanda, table: int, bodies: Sequence[int],
-        remaining: Set[int],
+        remaining: Set[int], principal: Sequence[Quaternion | None],
     ):  # fmt: skip
         self._client, self._dt, self._robot = client, dt, robot
         self._table, self._bodies, self._remaining = table, list(bodies), remaining
-        self.surfaces = [table, *bodies]
+        self.surfaces, self._principal = [table, *bodies], dict(zip(bodies, principal))
         links = [(body, -1) for body in (*bodies, table)]
         links += [(robot.body, link) for link in (*ARM, *FINGERS)]
         self._dynamics: dict[Link, tuple] = {
@@ -100,9 +102,10 @@ class PybulletRandomizable:
             )
 
     def pose(self, body: int) -> np.ndarray:
-        return pose_matrix(
-            *pybullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        position, quaternion = pybullet.getBasePositionAndOrientation(
+            body, physicsClientId=self._client
         )
+        return pose_matrix(position, body_quaternion(quaternion, self._principal.get(body)))
 
     def _quantities(self, changes: Mapping[str, Change]) -> dict[Link, dict[str, Any]]:
         """Arguments of `changeDynamics` by link: every quantity that any parameter changes."""

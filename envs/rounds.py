@@ -95,7 +95,7 @@ def run_round(
     if chances is not None and not cell.has_arm:
         chances = replace(chances, doubt=0.0)  # an arm's
     least = least_quality(plan, abstain, cell.has_arm)
-    taught = None if controller == OPEN_LOOP else teach(cell)
+    taught = None if controller == OPEN_LOOP else teach(cell, scene)
     cell.load(scene)
     calibration = conditions.calibration(cell)
     too_large = {

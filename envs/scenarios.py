@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from envs.board import Board
 from envs.cell import Cell, Intrinsics, require_arm, wrist_mount
+from envs.cell_layout import EMPTY, Scene
 from envs.cell_scenes import LAYOUTS
 from envs.robot_kinematics import forward_kinematics
 from utils.table_plane import fit_table_plane
@@ -91,17 +92,21 @@ def level(frame: RGBDFrame) -> RGBDFrame:
     return replace(frame, T_WC=T_WC)
 
 
-def teach(cell: Cell) -> np.ndarray:
+def teach(cell: Cell, scene: Scene = EMPTY) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: from the board's pose in one image, taken
     while the jig holds the board at a known pose in E. The first call with a cell empties it and
-    keeps the pose as `cell.taught`; later calls return that."""
+    keeps the pose as `cell.taught`; later calls return that. A cell that differs from scene to
+    scene (`evaluate.randomise`) is built each time as for `scene`, with the camera that it has there;
+    the jig holds the board over the objects."""
     require_arm(cell.config, "a closed loop")
+    if cell.on_build is not None:
+        return _measure_mount(cell, scene)
     if cell.taught is None:
-        cell.taught = _measure_mount(cell)
+        cell.taught = _measure_mount(cell, EMPTY)
     return cell.taught
 
 
-def _measure_mount(cell: Cell) -> np.ndarray:
+def _measure_mount(cell: Cell, scene: Scene) -> np.ndarray:
     servo, camera = cell.config.servo, cell.config.camera
     intrinsics = Intrinsics(
         servo.width, servo.height, camera.wrist_fov_deg, camera.near, camera.far
@@ -110,7 +115,7 @@ def _measure_mount(cell: Cell) -> np.ndarray:
     T_EB[:3, :3] = wrist_mount(camera)[:3, :3] @ _BOARD_TURN
     T_EB[:3, 3] = np.add(camera.wrist_position, [0.0, 0.0, _BOARD_DEPTH])
     board = Board(cell=0.009)
-    cell.show_board(board, forward_kinematics(cell.home) @ T_EB)
+    cell.show_board(board, forward_kinematics(cell.home) @ T_EB, scene)
     rgb = cell.look(intrinsics, cell.camera_pose("wrist")).rgb
     T_CB = board.pose(board.find(rgb), intrinsics.K)
     return T_CB @ inverse_pose(T_EB)

@@ -31,7 +31,8 @@ PHASES = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Play one scripted episode and show it."""
     config, options = parse_args(argv, "Lift a cube by a script; `seed` chooses it.", _add_options)
-    config = with_settings(config, "env", {"control": "ee_planar", "gripper": "opening"})
+    actions = {"control": "ee_planar", "gripper": "opening", "frame": "world"}
+    config = with_settings(config, "env", actions)
     env = RobotGraspingEnv("human" if options.gui else "rgb_array", config)
     observation, info = env.reset(seed=config.seed)
     print("observation:", {name: value.shape for name, value in observation.items()})

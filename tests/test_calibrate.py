@@ -107,6 +107,11 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
     fits = content["planners"]
     assert fits["heuristic"]["runs"] == ["train"] and fits["heuristic"]["successes"] == 3
     assert fits["oracle"] == {"slope": 1.5, "offset": 2.5}  # the runs have no such planner
+    shutil.copytree(tmp_path / "train", tmp_path / "another" / "train")  # of the same name
+    runs = [str(tmp_path / "train"), str(tmp_path / "another" / "train")]
+    assert main([*runs, *runs[:1], "--output", str(tmp_path / "both.json")]) == 0
+    both = json.loads((tmp_path / "both.json").read_text())["planners"]["heuristic"]
+    assert both["grasps"] == 8 and both["runs"] == ["train", "train"]
     with pytest.raises(UserError, match="train.*config.yaml: exists and holds no fits"):
         main([str(tmp_path / "train"), "--output", str(tmp_path / "train" / "config.yaml")])
     with pytest.raises(UserError, match="split is test.*training objects alone"):

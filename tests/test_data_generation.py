@@ -81,6 +81,14 @@ def test_the_folder_of_a_config_that_skips_nothing_is_that_of_before_there_was_t
     assert folder_of("objects.skip_broken=true") != folder_of()
 
 
+def test_a_lower_floor_and_another_pose_at_home_make_other_data():
+    """The floor stops the arm where labels are executed; the arm at home is in the images."""
+    without, home = "data.executed_share=0", "robot.home=[0,-0.5,0,-2.2,0,2,0.8]"
+    assert folder_of("closed_loop.floor=0.03") != folder_of()
+    assert folder_of(without, "closed_loop.floor=0.03") == folder_of(without)
+    assert folder_of(without, home) != folder_of(without)
+
+
 def test_data_made_before_there_were_side_views_and_floating_hands_stay_valid():
     content = yaml.safe_load(
         data_generation._content(load_config(None, ["data.executed_share=0.5"]))

@@ -28,6 +28,11 @@ def test_episodes_can_begin_near_an_object(make_env):
         UserError, match="start must be 'home', 'near', 'pretraining' or .*, got 'here'"
     ):
         env.reset(options={"start": "here"})
+    mine = {"q": env.cell.home.tolist(), "opening": 0.04, "command": 0.05}
+    env.reset(seed=0, options={"start": mine})
+    for wrong in ({"q": [0.0] * 3}, {"q": "x"}, {"q": [math.nan] * 7}, {"opening": -1.0}):
+        with pytest.raises(UserError, match="start must have seven joint positions q in .* m; got"):
+            env.reset(seed=0, options={"start": mine | wrong})
 
 
 def test_pretraining_states_are_many_at_each_scene(make_env):

@@ -13,7 +13,7 @@ from utils.evaluation import Task
     [
         ("heuristic+ibvs", "primitives", "none", "pile-primitives-heuristic+ibvs-7.mp4"),
         ("m:plan", "m:objects", "m:noise", "pile-m_objects-m_noise-m_plan-7.mp4"),
-        ("ppo:nets/a.pt", "meshes/mine", "gamma", "pile-mine-gamma-ppo_nets_a.pt-7.mp4"),
+        ("ppo:nets/a.pt", "meshes/mine", "gamma", "pile-meshes_mine-gamma-ppo_nets_a.pt-7.mp4"),
         (r"C:\nets\a.pt", "box", "none", "pile-box-C__nets_a.pt-7.mp4"),
     ],
 )

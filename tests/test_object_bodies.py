@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from envs.object_bodies import load_object
 from envs.object_meshes import ObjectError
@@ -134,3 +135,23 @@ def test_a_mass_that_no_body_of_that_size_has_is_refused(tmp_path, mass, message
     path = urdf_box(tmp_path, mass, urdf_inertia(box_moments(0.4)))
     with pytest.raises(ObjectError, match=message):
         load_object(path, cache_dir=tmp_path)
+
+
+def test_products_of_inertia_turn_the_axes_of_the_moments(tmp_path):
+    """A rod that lies at 30 degrees in its file has the moments of one that lies straight."""
+    turn = trimesh.transformations.rotation_matrix(np.pi / 6, (0, 0, 1))
+    rod = trimesh.creation.box((0.2, 0.02, 0.03))
+    rod.export(tmp_path / "straight.stl")
+    rod.apply_transform(turn)
+    rod.export(tmp_path / "turned.stl")
+    straight, turned = (
+        load_object(tmp_path / f"{name}.stl", density=700, cache_dir=tmp_path)
+        for name in ("straight", "turned")
+    )
+    a, b, c = 0.2**2, 0.02**2, 0.03**2
+    closed_form = np.diag(0.7 * 0.12 / 12 * np.array([b + c, a + c, a + b]))
+    assert straight.principal is None
+    assert np.diag(straight.inertia) == pytest.approx(closed_form, rel=1e-4)
+    axes = Rotation.from_quat(turned.principal).as_matrix()
+    whole = axes @ np.diag(turned.inertia) @ axes.T
+    assert whole == pytest.approx(turn[:3, :3] @ closed_form @ turn[:3, :3].T, rel=1e-3, abs=1e-9)

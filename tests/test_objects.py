@@ -15,7 +15,7 @@ from envs.object_bodies import load_object
 from envs.object_primitives import FAMILIES, HOUSEHOLD_MASSES, UNSEEN_FAMILIES
 from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object_set, prepare
 from envs.pybullet_files import data_folder
-from tests.helpers.object_files import urdf_box, urdf_inertia
+from tests.helpers.object_files import box_moments, urdf_box, urdf_inertia
 from tests.helpers.simulators import needs_pybullet, pybullet
 from utils.config import load_config
 from utils.errors import UserError
@@ -327,6 +327,20 @@ def test_skipped_files_and_mended_ones_are_named_once_for_a_set(tmp_path, count)
     assert sum("inside out" in text and "(and so may others)" in text for text in said) == 1
     assert [model.name for model in objects] == ["b", "b", "c", "e", "e", "f", "b"]
     assert all(model.extents == pytest.approx([0.03, 0.04, 0.08]) for model in objects)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_what_no_material_weighs_is_left_out_in_worker_processes_too(tmp_path, told):
+    """And in a folder that is called as a built-in set."""
+    folder = tmp_path / "random_urdfs"
+    for name, mass in (("grams", "400"), ("fine", "0.4")):
+        (folder / name).mkdir(parents=True)
+        urdf_box(folder / name, mass, urdf_inertia(box_moments(float(mass))))
+    objects = load_object_set(str(folder), skip_broken=True, cache_dir=tmp_path)
+    objects.told = told  # of its notes, as in a worker
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert [model.mass for model in objects] == [0.4, 0.4]
 
 
 def test_a_set_of_broken_files_alone_is_refused(tmp_path):

@@ -22,6 +22,7 @@ from envs.scenarios import (
     teach,
     wrong_calibration,
 )
+from envs.simulators import make_cell
 from utils.config import load_config
 from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, top_down_pose
@@ -140,6 +141,21 @@ def test_levelling_finds_the_table_and_leaves_the_place(cell):
     np.testing.assert_allclose(levelled.T_WC[:3, :3] @ normal, [0, 0, 1], atol=1e-9)
     assert levelled.T_WC[2, 3] == pytest.approx(0.8, abs=1e-3)  # as high as it truly is
     np.testing.assert_allclose(levelled.T_WC[:2, 3], wrong[:2, 3])  # as far off as it was
+
+
+@pytest.mark.parametrize("seed", [100001, 100002])
+def test_a_randomised_cell_is_taught_with_the_camera_of_its_scene(scene, seed):
+    """Its field of view differs, too, which the board shows as another distance."""
+    changes = ["evaluate.randomise=true", "sim.renderer=tiny", "randomization.parts=[vision]"]
+    of_seed = replace(scene, seed=seed)
+    with make_cell(load_config(None, changes)) as cell:
+        taught = teach(cell, of_seed)
+        cell.build(of_seed)
+        assert len(cell.bodies) == 1
+        cell.view.begin_frame()
+        away = taught @ wrist_mount(CONFIG) @ cell.view.T_CC  # identity
+    assert np.linalg.norm(away[:2, 3]) < 2e-3 and abs(away[2, 3]) < 0.02
+    assert np.degrees(Rotation.from_matrix(away[:3, :3]).magnitude()) < 1
 
 
 def test_what_is_taught_is_the_true_mount(cell):

@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from envs.cell import TABLE_OR_BACKGROUND, Camera, Cell
 from envs.cell_layout import Placement, Scene, square_walls
 from envs.execution import execute_grasp
+from envs.object_bodies import load_object
 from envs.objects import load_object_set
 from envs.robot import Robot
 from envs.simulators import SIMULATORS, cell_class, check_simulator, make_cell, make_layout_table
@@ -20,7 +23,7 @@ from utils.config import load_config
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import WALL_LABEL, height_map_from_frame, height_map_from_scene
-from utils.transforms import Grasp, project
+from utils.transforms import Grasp, inverse_pose, project
 
 WIDE = 0.10  # m
 SIDE = 0.09  # m, of a cube that the Panda's own hand cannot take
@@ -182,3 +185,23 @@ def test_a_simulator_without_randomisation_is_refused(monkeypatch):
     monkeypatch.setattr(cell_class(INSTALLED[0]), "randomizable", Cell.randomizable)
     with pytest.raises(UserError, match="its cell cannot be randomised"):
         check_simulator(load_config(None, ["evaluate.randomise=true"]))
+
+
+def test_a_body_tumbles_alike_however_it_lies_in_its_file(taught_cell, tmp_path):
+    """A rod flung with a spin about none of its axes, from a file in which it is straight and from
+    one in which it is not. Without products of inertia the two end 150 degrees apart."""
+    turn = trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0))
+    rod, ends = trimesh.creation.box((0.12, 0.02, 0.02)), []
+    for name, T in (("straight", np.eye(4)), ("turned", turn)):
+        rod.copy().apply_transform(T).export(tmp_path / f"{name}.stl")
+        model = load_object(tmp_path / f"{name}.stl", cache_dir=tmp_path)
+        place = turn @ inverse_pose(T)  # the rod itself starts alike
+        place[:3, 3] = 0.5, 0.0, 0.6
+        quaternion = Rotation.from_matrix(place[:3, :3]).as_quat()
+        taught_cell.load(Scene("isolated", 0, (Placement(model, place[:3, 3], quaternion),)))
+        taught_cell.carry(0, place, np.array([0.0, 0.0, 1.0]), 20.0)
+        np.testing.assert_allclose(taught_cell.object_pose(0), place, atol=1e-6)
+        taught_cell.step(round(0.2 / taught_cell.dt))
+        ends.append(taught_cell.object_pose(0) @ T)
+    apart = Rotation.from_matrix(ends[0][:3, :3].T @ ends[1][:3, :3]).magnitude()
+    assert np.degrees(apart) < 2

@@ -40,6 +40,14 @@ def test_parts_are_kept_beside_each_other_and_drawn(parts, tmp_path, capsys):
     assert "`python -m benchmarks.soak --parts two --scale 0.2`" in lines[-1]
 
 
+def test_a_file_that_holds_something_else_is_refused_before_anything_is_tried(parts, tmp_path):
+    for content in ("not JSON", "[1]"):
+        (tmp_path / "notes.txt").write_text(content)
+        with pytest.raises(UserError, match=r"--json .*notes\.txt: holds no .*choose another file"):
+            main(["--parts", "one", "--json", str(tmp_path / "notes.txt")])
+        assert (tmp_path / "notes.txt").read_text() == content
+
+
 def test_parts_are_listed_and_unknown_ones_refused(parts, capsys):
     assert main(["--list", "--scale", "0.5"]) == 0
     assert capsys.readouterr().out.splitlines()[0] == "one: the first; about 5 minutes"
