@@ -52,13 +52,12 @@ from utils.result_formats import (
     format_comparisons,
     format_stop_reasons,
     format_table,
-    write_comparisons_csv,
-    write_comparisons_latex,
+    write_comparisons,
     write_csv,
     write_results,
 )
 from utils.result_records import differing_rounds, policy_name, read_sample
-from utils.results import Comparison, compare, compare_runs, stop_reasons, summarise
+from utils.results import compare, compare_runs, stop_reasons, summarise
 from utils.runs import (
     check_resume,
     check_writable,
@@ -100,10 +99,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     stops = format_stop_reasons(stop_reasons(outcome.rounds))
     print(*filter(None, [format_table(rows), stops, format_comparisons(comparisons)]), sep="\n\n")
     unfinished, device = interruption(len(outcome.rounds), config), describe_workers(config)
-    for path in filter(None, [run / "results.json", options.results]):
-        write_results(path, rows, comparisons, config, device, unfinished is None)
+    results = rows, comparisons, config, device, unfinished is None
+    write_results(run / "results.json", *results)
     write_csv(run / "results.csv", rows)
-    write_comparisons(comparisons, options)
     gallery = balanced(outcome.gallery, config.evaluate.gallery)
     write_report(
         run / "report.html", rows, outcome.rounds, comparisons, config, gallery, outcome.films,
@@ -113,6 +111,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"report: {run / 'report.html'}")
     if unfinished is not None:
         print(f"{unfinished}; go on with --resume {run}")
+    # Last, so that the run's own files are there even where these cannot be written.
+    if options.results is not None:
+        write_results(options.results, *results)
+    write_comparisons(comparisons, options.csv, options.latex)
     if outcome.error is not None:
         raise outcome.error
     return 130 if outcome.interrupted else 0
@@ -168,19 +170,12 @@ def report_comparison(options: argparse.Namespace) -> int:
     """Print the paired differences of two runs, first - second."""
     comparisons = compare_runs(*options.compare)
     print(format_comparisons(comparisons))
-    write_comparisons(comparisons, options)
+    write_comparisons(comparisons, options.csv, options.latex)
     if options.results is not None:
         content = {"runs": [str(run) for run in options.compare]}
         content["comparisons"] = [asdict(pair) for pair in comparisons]
         save_results(options.results, content)
     return 0
-
-
-def write_comparisons(comparisons: Sequence[Comparison], options: argparse.Namespace) -> None:
-    if options.csv is not None:
-        write_comparisons_csv(options.csv, comparisons)
-    if options.latex is not None:
-        write_comparisons_latex(options.latex, comparisons)
 
 
 def report_replay(file: Path, overrides: Sequence[str]) -> int:

@@ -216,7 +216,7 @@ def locate_workspace(
     if options.workspace is None:
         marked = marked_pixels(frame.depth.shape, options.point, options.box, options.mask)
         return workspace_of(frame, table.height, marked)
-    return given_workspace(options.workspace, table.height), []
+    return given_workspace(frame, table.height, options.workspace)
 
 
 def new_planner(

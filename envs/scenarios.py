@@ -96,8 +96,8 @@ def teach(cell: Cell, scene: Scene = EMPTY) -> np.ndarray:
     """(4, 4) T_CE as the wrist camera itself shows it: from the board's pose in one image, taken
     while the jig holds the board at a known pose in E. The first call with a cell empties it and
     keeps the pose as `cell.taught`; later calls return that. A cell that differs from scene to
-    scene (`evaluate.randomise`) is built each time as for `scene`, with the camera that it has there;
-    the jig holds the board over the objects."""
+    scene (`evaluate.randomise`) is built each time as for `scene`, with the camera that it has
+    there; the jig holds the board over the objects."""
     require_arm(cell.config, "a closed loop")
     if cell.on_build is not None:
         return _measure_mount(cell, scene)

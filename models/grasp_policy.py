@@ -358,8 +358,31 @@ def make_ppo(
     torch.manual_seed(config.seed)
     network = policy_for(layout, action_space, settings)
     if settings.initial is not None:
-        load_weights(network, load_checkpoint(settings.initial, KIND), settings.initial)
+        load_initial(network, layout, settings.initial)
     return GraspPPO(network, layout, settings, team)
+
+
+def load_initial(network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str) -> None:
+    """Load a checkpoint's weights into a network that sees by `layout`, which keeps the bounds of
+    its own actions. Raises UserError where the checkpoint's policy sees something else, and for
+    weights that are not finite."""
+    checkpoint = load_checkpoint(path, KIND)
+    with reading(path):
+        seen = ObservationLayout.from_plain(checkpoint["extra"]["layout"])
+    if seen.entries() != layout.entries():
+        raise UserError(
+            f"rl.initial {path}: its policy sees {_listed(seen)}, this one {_listed(layout)}; set "
+            "rl.policy_observations and its like as in its training, or rl.initial=null"
+        )
+    own = {"action_low": network.action_low.clone(), "action_high": network.action_high.clone()}
+    weights = checkpoint["model"] | own
+    if not all(bool(weights[name].isfinite().all()) for name in weights.keys() - own.keys()):
+        raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
+    load_weights(network, checkpoint | {"model": weights}, path)
+
+
+def _listed(layout: ObservationLayout) -> str:
+    return ", ".join(f"{part.key} {part.shape}" for part in layout.parts())
 
 
 class SavedPolicy(NamedTuple):

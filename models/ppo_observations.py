@@ -134,6 +134,11 @@ class ObservationLayout:
     def parts(self) -> Iterator[Part]:
         yield from (*self.images, *self.state, *self.privileged)
 
+    def entries(self) -> list[list[tuple[str, tuple[int, ...]]]]:
+        """Key and shape of each image, of each part of the state, and of what is privileged."""
+        kinds = self.images, self.state, self.privileged
+        return [[(part.key, part.shape) for part in kind] for kind in kinds]
+
     def empty(self, *shape: int) -> Observations:
         """Room for a batch of this shape, to be filled by `write`."""
         return Observations(

@@ -220,6 +220,8 @@ def play_episodes(
             _read(observation, layout, room, place)
             action = actor.action(actor.latent(room))
             observation, reward, terminated, truncated, info = env.step(action)
+            if not math.isfinite(reward):
+                raise NotFinite(f"the reward {place}")
             total, length, ended = total + float(reward), length + 1, terminated or truncated
         yield
         episodes.append(Episode(total, length, _success(info)))

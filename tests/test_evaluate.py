@@ -22,9 +22,11 @@ from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.planners import make_planner
 from tests.helpers.cluster import local_cluster
+from tests.helpers.records import ROUNDS
 from tests.helpers.simulators import needs_pybullet
 from utils.config import DEFAULTS
 from utils.errors import UserError
+from utils.evaluation import Outcome
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
 from utils.runs import run_script as end_like_a_script
@@ -361,6 +363,7 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["--config", "missing.yaml"], "missing.yaml"),
         (["--resume", "nowhere"], "nowhere"),
         (["--results", "no/such/folder/x.json"], "no/such/folder"),
+        (["--results", "/proc/x.json"], "--results /proc/x.json: cannot be written"),
         (["camera.up=[0,0,1]"], "camera"),
         (["robot.home=[9,0,0,-2,0,1.5,0]"], "robot.home"),
         (["workspace.center=[7,7]"], "workspace"),
@@ -381,6 +384,27 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
 def test_bad_input_is_one_clear_line(arguments, message, tmp_path, monkeypatch, capsys):
     assert message in refusal(arguments, tmp_path, monkeypatch, capsys)
     assert not (tmp_path / "runs").exists(), "nothing is started before the input is checked"
+
+
+@pytest.mark.parametrize("option", ["--results", "--csv", "--latex"])
+def test_a_copy_that_cannot_be_written_takes_nothing_from_the_run(
+    option, tmp_path, monkeypatch, capsys
+):
+    """Its folder is gone when the rounds have been played."""
+    (tmp_path / "away").mkdir()
+
+    def played(config, run, work):
+        (tmp_path / "away").rmdir()
+        (tmp_path / "away").touch()
+        return Outcome(ROUNDS)
+
+    monkeypatch.setattr(evaluate, "play", played)
+    monkeypatch.setattr(evaluate, "check_everything", lambda config: None)
+    arguments = ["evaluate.policies=heuristic,random", "evaluate.scenarios=pile", *SMALL]
+    line = refusal([*arguments, option, "away/copy"], tmp_path, monkeypatch, capsys)
+    assert "away/copy: cannot be written" in line
+    names = {path.name for path in only_run(tmp_path).iterdir()}
+    assert names >= {"results.json", "results.csv", "report.html"}
 
 
 def test_a_folder_without_meshes_is_refused(tmp_path, monkeypatch, capsys):

@@ -1,5 +1,7 @@
 """The plan of an evaluation, and playing it."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -21,7 +23,7 @@ from utils.evaluation import (
     with_depth_noise,
 )
 from utils.result_records import Sample, append_round, read_rounds
-from utils.runs import new_run_folder
+from utils.runs import REPOSITORY, new_run_folder
 
 
 def test_tasks_cover_the_plan_once(config):
@@ -141,6 +143,31 @@ def test_a_resumed_evaluation_plays_the_rest(tmp_path):
     outcome = play(config, tmp_path, known_round)
     assert outcome.rounds == ROUNDS and outcome.error is None and not outcome.interrupted
     assert len(read_rounds(tmp_path / "rounds.jsonl")) == 4
+
+
+def test_a_round_that_was_played_twice_is_refused(tmp_path):
+    for record in (*ROUNDS[:2], ROUNDS[0]):
+        append_round(tmp_path / "rounds.jsonl", record)
+    with pytest.raises(UserError, match="round of heuristic on box in .* the seed 0, 2 times"):
+        play(one_worker(), tmp_path, known_round)
+
+
+def test_two_processes_do_not_play_the_same_run(tmp_path):
+    journal = tmp_path / "rounds.jsonl"
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom utils.result_records import writing\n"
+        "with writing(Path(sys.argv[1])):\n    print('at it', flush=True)\n    input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(journal)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True, cwd=REPOSITORY,
+    ) as other:  # fmt: skip
+        assert other.stdout.readline() == "at it\n"
+        with pytest.raises(UserError, match="rounds.jsonl: another process is adding rounds"):
+            play(one_worker(), tmp_path, known_round)
+        assert not journal.exists()
+        other.kill()
+    assert play(one_worker(), tmp_path, known_round).rounds == ROUNDS
 
 
 def test_a_round_with_a_noise_that_the_config_does_not_play_is_refused(tmp_path):

@@ -17,6 +17,7 @@ from models.grasp_policy import (
     ActionDistribution,
     GraspPolicyNetwork,
     load_policy,
+    make_ppo,
     policy_for,
     relief_of,
     save_policy,
@@ -28,6 +29,7 @@ from tests.helpers.ppo_parts import (
     ppo_of,
     settings_of,
 )
+from utils.config import load_config
 from utils.distributed import ALONE
 from utils.errors import UserError
 
@@ -207,6 +209,57 @@ def test_a_policy_in_half_precision_acts_nearly_the_same(tmp_path):
     ]
     assert any((one != other).any() for one, other in actions)
     np.testing.assert_allclose(*np.swapaxes(actions, 0, 1), atol=0.01)
+
+
+SEEN = spaces.Dict({name: spaces.Box(-1, 1, (2,)) for name in ("place", "speed")})
+
+
+@pytest.fixture
+def continued(tmp_path):
+    """A function that makes a PPO for spaces, with the weights of a policy that has seen SEEN and
+    acted between -1 and 1; change: what is done to the checkpoint first."""
+    small = ["rl.hidden_dim=16", "rl.squash=true", "rl.normalise_observations=true"]
+    path = tmp_path / "policy.pt"
+    act = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    make_ppo(SEEN, act, load_config(None, [*small, "seed=1"])).save(path)
+
+    def make(observation_space, action_space, change=lambda stored: None):
+        stored = torch.load(path, weights_only=True)
+        change(stored)
+        torch.save(stored, path)
+        config = load_config(None, [*small, f"rl.initial={path}"])
+        return make_ppo(observation_space, action_space, config).network, stored["model"]
+
+    return make
+
+
+def test_a_policy_that_is_continued_acts_within_the_new_environment_s_bounds(continued):
+    network, stored = continued(SEEN, spaces.Box(-0.3, 0.5, (2,), np.float32))
+    assert (network.action_low == -0.3).all() and (network.action_high == 0.5).all()
+    torch.testing.assert_close(network.mean_head.weight, stored["mean_head.weight"])
+
+
+def _diverged(stored):
+    stored["model"]["mean_head.bias"][0] = math.nan
+
+
+def _without_layout(stored):
+    del stored["extra"]["layout"]
+
+
+@pytest.mark.parametrize(
+    ("names", "change", "message"),
+    [
+        (("speed", "place"), lambda stored: None, r"sees place \(2,\), speed .*this one speed"),
+        (("place", "force"), lambda stored: None, r"this one place \(2,\), force \(2,\); set rl.p"),
+        (("place", "speed"), _diverged, "weights that are not finite"),
+        (("place", "speed"), _without_layout, "the checkpoint's entries do not fit"),
+    ],
+)
+def test_a_policy_that_cannot_be_continued_is_refused(continued, names, change, message):
+    space = spaces.Dict([(name, spaces.Box(-1, 1, (2,))) for name in names])
+    with pytest.raises(UserError, match=message):
+        continued(space, spaces.Box(-1.0, 1.0, (2,), np.float32), change)
 
 
 def test_a_checkpoint_of_an_older_version_speaks_today_s_names(tmp_path):

@@ -88,6 +88,27 @@ def test_depth_files_of_every_kind_hold_the_same(tmp_path, name, unit, scale):
     assert (depth[0, :2] == 0).all()
 
 
+@pytest.mark.parametrize("name", ["big.npy", "little.npy", "big.tiff", "depth.png", "depth.pgm"])
+def test_the_largest_number_of_16_bits_is_unknown_in_every_file(tmp_path, name):
+    millimetres, path = np.array([[500, 65535, 0], [65534, 1, 800]], np.uint16), tmp_path / name
+    big = millimetres.astype(">u2")
+    if path.suffix == ".npy":
+        np.save(path, big if name == "big.npy" else millimetres)
+    elif path.suffix == ".pgm":
+        path.write_bytes(b"P5\n3 2\n65535\n" + big.tobytes())
+    else:
+        mode = "I;16B" if name == "big.tiff" else "I;16"
+        data = big if name == "big.tiff" else millimetres
+        Image.frombytes(mode, (3, 2), data.tobytes()).save(path)
+    expected = [[0.5, 0, 0], [65.534, 0.001, 0.8]]
+    np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6)
+
+
+def test_a_length_of_65535_is_known_where_numbers_have_more_bits(tmp_path):
+    np.save(tmp_path / "depth.npy", np.full((2, 3), 65535, np.int32))
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.npy", 1e-5), 0.65535)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [

@@ -60,6 +60,20 @@ def test_numbers_that_are_not_finite_are_refused(bad):
         collector.collect(ppo.network, ppo.generator, first_step=100)
 
 
+@pytest.mark.parametrize("bad", ["observation", "reward"])
+def test_numbers_of_an_evaluation_that_are_not_finite_are_refused(bad):
+    class Broken(Count):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            if bad == "observation":
+                observation[:] = np.nan
+            return observation, np.inf if bad == "reward" else reward, *rest
+
+    envs = Several(Broken(3, True))
+    with pytest.raises(NotFinite, match=f"{bad}.* in an evaluation, of the episode with seed 7"):
+        evaluate_policy(ppo_of().network, envs, COUNTED, [7], Stopwatch())
+
+
 def test_evaluation_gives_each_seed_its_episode():
     class Seeded(Count):
         """The reward is the seed, the length differs between environments."""

@@ -109,6 +109,26 @@ def test_a_line_that_is_no_round_is_named(journal):
         read_rounds(journal)
 
 
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        ("attempt", {"turn_ms": []}), ("attempt", {"turn_ms_mean": "8"}),
+        ("attempt", {"turned": "x"}), ("attempt", {"slid": True}), ("attempt", {"tilt": None}),
+        ("attempt", {"held": 3}), ("attempt", {"detail": None}), ("attempt", {"roughness": {}}),
+        ("attempt", {"sim_seconds": 10**400}),
+        ("round", {"target_in_hand": "x"}), ("round", {"randomization": [1]}),
+    ],
+)  # fmt: skip
+def test_an_entry_of_another_type_is_named(journal, place, change):
+    first, *others = journal.read_text().splitlines()
+    content = json.loads(first)
+    (content if place == "round" else content["attempts"][0]).update(change)
+    journal.write_text("\n".join([json.dumps(content), *others]) + "\n")
+    said = rf"rounds.jsonl, line 1: not a recorded round \({next(iter(change))} is "
+    with pytest.raises(UserError, match=said):
+        read_rounds(journal)
+
+
 def test_a_sample_holds_the_first_rounds_of_each_row_and_their_origin(tmp_path):
     run = new_run_folder("evaluate", None, CONFIG, tmp_path)
     for record in reversed(ROUNDS):  # the workers' speed decides the order of a journal

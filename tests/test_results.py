@@ -194,6 +194,24 @@ def test_the_rounds_of_an_older_run_have_the_noise_of_its_config(tmp_path):
     assert (pair.depth_noise, pair.cleared.value) == ("kinect", 0.0)
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("scene: null", "scene is None, so that it is not the config of a run"),
+        ("objects: [1]", r"objects is \[1\], so that"),
+        ("sim: 3", "sim is 3, so that"),
+        ("camera: none", "camera is 'none', so that"),
+        ("seed: -5", "holds no seed"),
+    ],
+)
+def test_a_damaged_config_is_named(tmp_path, line, message):
+    whole, damaged = a_run(tmp_path / "whole", ROUNDS), a_run(tmp_path / "damaged", ROUNDS)
+    text = "seed: 0\n" * (not line.startswith("seed")) + line
+    (damaged / "config.yaml").write_text(text)
+    with pytest.raises(UserError, match=f"damaged/config.yaml: {message}"):
+        compare_runs(whole, damaged)
+
+
 def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):
     before = a_run(tmp_path / "before", ROUNDS)
     crowded = load_config(None, ["scene.count=15"])

@@ -5,6 +5,7 @@ import math
 import os
 import re
 import signal
+import stat
 import subprocess
 import sys
 import warnings
@@ -20,6 +21,7 @@ from utils.errors import UserError
 from utils.runs import (
     REPOSITORY,
     check_resume,
+    check_writable,
     environment,
     git_state,
     new_run_folder,
@@ -98,6 +100,56 @@ def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, mo
     monkeypatch.setattr(os, "fsync", fsync)
     write_atomic(path, b"afterwards")
     assert on_disk == [(path.stat().st_ino, 10, b"before")]
+
+
+def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_the_system(tmp_path):
+    shared, new = tmp_path / "shared.json", tmp_path / "new.json"
+    shared.write_text("before")
+    shared.chmod(0o664)
+    before = os.umask(0o027)
+    try:
+        write_atomic(shared, "afterwards")
+        write_atomic(new, "{}")
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (shared, new)]
+    assert modes == [0o664, 0o640] and shared.read_text() == "afterwards"
+
+
+def test_a_link_still_leads_to_the_file_that_is_replaced(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    for link, target in (("old", "elsewhere/old.csv"), ("new", "elsewhere/new.csv")):
+        (tmp_path / link).symlink_to(target)
+    (tmp_path / "elsewhere" / "old.csv").write_text("before")
+    for link in ("old", "new"):
+        check_writable("--csv", tmp_path / link)
+        write_atomic(tmp_path / link, "afterwards")
+        assert (tmp_path / link).is_symlink()
+        assert (tmp_path / "elsewhere" / f"{link}.csv").read_text() == "afterwards"
+
+
+def test_what_is_no_file_is_refused_and_stays(tmp_path):
+    """A pipe, as /dev/stdout may be one, stands for all devices."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    for name in ("folder", "pipe", "link"):
+        with pytest.raises(UserError, match=f"--csv .*{name}: not a file in an existing folder"):
+            check_writable("--csv", tmp_path / name)
+        with pytest.raises(UserError, match=f"{name}: exists and is no file; choose another"):
+            write_atomic(tmp_path / name, "a,b")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", "pipe", "link"}
+
+
+def test_a_file_that_could_not_be_written_at_the_end_is_refused_at_once(tmp_path):
+    check_writable("--csv", None)
+    check_writable("--csv", tmp_path / "x.csv")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UserError, match="--csv /proc/x.csv: cannot be written"):
+        check_writable("--csv", Path("/proc/x.csv"))
+    with pytest.raises(UserError, match="none/x.csv: not a file in an existing folder"):
+        check_writable("--csv", tmp_path / "none" / "x.csv")
 
 
 @pytest.mark.parametrize(
@@ -278,6 +330,37 @@ def test_a_script_that_is_stopped_saves_and_says_so(what, number, status):
     assert process.returncode == status
     assert (output == "saved\n") is (what == "loop")
     assert error in ("", "interrupted\n", "terminated\n")
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_script_whose_output_nobody_reads_any_more_ends_without_a_word(unbuffered):
+    code = (
+        "from utils.runs import run_script\n"
+        "def main(argv):\n"
+        "    print('first', flush=True)\n"
+        "    input()\n"
+        "    print('second')\n"
+        "run_script(main)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, cwd=REPOSITORY,
+        env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "first\n"
+        process.stdout.close()
+        process.stdin.write("\n")
+        process.stdin.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+
+
+def test_a_broken_pipe_to_anything_but_a_reader_is_a_bug():
+    def main(argv):
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        run_script(main)
 
 
 def limited(limit: str, size: int, code: str) -> subprocess.CompletedProcess:

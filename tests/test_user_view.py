@@ -106,10 +106,22 @@ def test_a_rough_table_is_remarked_upon() -> None:
 
 
 def test_a_given_workspace() -> None:
-    assert given_workspace((0.5, 0.1, 0.3), 0.02) == Workspace((0.5, 0.1), 0.3, 0.02)
+    frame = scene()
+    found = given_workspace(frame, 0.02, (0.5, 0.1, 0.3))
+    assert found == (Workspace((0.5, 0.1), 0.3, 0.02), [])
     for size in (0.1, 1.2, np.nan):
         with pytest.raises(UserError, match="a side of 0.15 to 1 m"):
-            given_workspace((0.5, 0.1, size), 0.02)
+            given_workspace(frame, 0.02, (0.5, 0.1, size))
+
+
+@pytest.mark.parametrize(("x", "outside"), [(0.9, 0), (1.0, 0), (1.15, 38), (1.35, 88)])
+def test_a_given_workspace_that_the_image_hardly_shows_is_remarked_upon(x, outside) -> None:
+    """The image shows the table up to x = 1.2 m, in front of the camera alone."""
+    workspace, remarks = given_workspace(scene(), 0.0, (x, 0.0, 0.4))
+    expected = [f"{outside}% of --workspace lies outside the image, where nothing is found"]
+    assert remarks == (expected if outside else []) and workspace.centre == (x, 0.0)
+    behind = replace(scene(), T_WC=look_at((0.0, 0.0, -1.0), (0.0, 0.0, -2.0), (0.0, 1.0, 0.0)))
+    assert given_workspace(behind, 0.0, (0.0, 0.0, 0.4))[1][0].startswith("100% of --workspace")
 
 
 @pytest.mark.parametrize(("degrees", "remarks"), [(0, 0), (40, 0), (60, 1), (80, None)])

@@ -195,6 +195,35 @@ def test_missing_depths_are_refused_and_never_assumed():
     np.testing.assert_array_equal(assumed, direct)
 
 
+@pytest.mark.parametrize("interaction", ["current", "desired", "mean"])
+def test_depths_are_learned_from_the_camera_s_motion_and_not_from_the_goal_s_points(interaction):
+    """The way to a goal without depths is as long as with the true ones, and the estimates end at
+    the goal's 0.75 m."""
+    exact = ImageBasedVisualServo(CAMERA, interaction=interaction).simulate(SQUARE, START, GOAL)
+    servo = ImageBasedVisualServo(CAMERA, interaction=interaction, depth=DepthFromMotion(0.4))
+    T_CO = START
+
+    def seen(T):
+        p = transform_points(T, SQUARE)
+        return ServoView(servo.camera.to_pixels(p[:, :2] / p[:, 2:]))
+
+    def move(velocity):
+        nonlocal T_CO
+        T_CO = pose_exp(-servo.dt * velocity) @ T_CO
+
+    history = servo.run(lambda: seen(T_CO), move, seen(GOAL))
+    assert history.converged and history.iterations == pytest.approx(exact.iterations, abs=10)
+    xy = servo.camera.normalise(history.points[-1])
+    np.testing.assert_allclose(servo.depth.update(xy, np.zeros(6), servo.dt), 0.75, rtol=0.005)
+
+
+def test_an_estimator_keeps_what_it_knows_when_a_single_point_is_asked_for():
+    servo = ImageBasedVisualServo(CAMERA, depth=DepthFromMotion(0.4))
+    with pytest.raises(DepthError, match="none"):
+        servo.compute_interaction_matrix((404, 408))
+    assert servo.compute_interaction_matrix((404, 408), Z=0.5).shape == (2, 6)
+
+
 @pytest.mark.parametrize(
     ("seen", "wanted", "error"),
     [(CORNERS, CORNERS[:3], FeatureCountError), (CORNERS[:2], CORNERS[:2], FeatureCountError),

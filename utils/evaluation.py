@@ -8,6 +8,7 @@ is an argument: this module knows neither cells nor planners.
 from __future__ import annotations
 
 import platform
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,6 +31,7 @@ from utils.result_records import (
     append_round,
     policy_name,
     read_rounds,
+    writing,
 )
 from utils.runs import usable_cpus, write_atomic
 
@@ -116,7 +118,7 @@ def tasks(config: Config, done: Sequence[RoundRecord]) -> Iterator[Task]:
     """The tasks that are not in `done` yet; every policy gets the same seeds."""
     plan = config.evaluate
     noises = depth_noises_of(config)
-    known = {(r.policy, *r.kind, r.seed) for r in done}
+    known = set(map(_identity, done))
     for number in range(plan.rounds):
         seed = config.seed * 100_000 + number
         for objects in plan.object_sets:
@@ -171,6 +173,23 @@ def check_recorded(rounds: Sequence[RoundRecord], config: Config, source: str) -
                 f"with the depth noise {record.depth_noise}, which its config does not play; it "
                 "was changed by hand, start a new run"
             )
+
+
+def check_played_once(rounds: Sequence[RoundRecord], source: str) -> None:
+    """Raise UserError for a round that is there twice: it would count twice, and hide one that is
+    missing."""
+    for (policy, scenario, objects, noise, seed), count in Counter(map(_identity, rounds)).items():
+        if count > 1:
+            raise UserError(
+                f"{source}: holds the round of {policy} on {objects} in the scenario {scenario}, "
+                f"with the depth noise {noise} and the seed {seed}, {count} times; delete all "
+                "lines of it but one, or start a new run"
+            )
+
+
+def _identity(record: RoundRecord) -> tuple[str, str, str, str, int]:
+    """Policy, scenario, object set, depth noise and seed, which no two rounds of a run share."""
+    return (record.policy, *record.kind, record.seed)
 
 
 def interruption(rounds_done: int, config: Config) -> str | None:
@@ -239,10 +258,19 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
     work: plays one task, in a worker process.
     Ctrl-C, a scene that cannot be made and a task that no process survives end the work early; the
     tasks under way are finished after Ctrl-C, and the outcome holds everything that was played.
+    Raises UserError where another process plays the same run, or has played a round twice.
     """
     journal = run / "rounds.jsonl"
+    with writing(journal):
+        return _play(config, run, journal, work)
+
+
+def _play(
+    config: Config, run: Path, journal: Path, work: Callable[[Config, Task], TaskResult]
+) -> Outcome:
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
+    check_played_once(outcome.rounds, str(journal))
     todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:

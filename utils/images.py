@@ -117,7 +117,9 @@ def open_image(path: Path) -> Image.Image:
         with Image.open(path, formats=IMAGE_FORMATS) as image:
             _check_size(path, image.size)
             image.load()
-            return image.copy()
+            whole = image.copy()
+            whole.format = image.format  # a copy has none
+            return whole
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except UserError:
@@ -155,7 +157,7 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     """
     if scale is not None and not 0 < scale < np.inf:
         raise UserError(f"--depth-scale: got {scale:g}, expected a positive number such as 0.001")
-    values = _load_array(path) if path.suffix.lower() == ".npy" else np.asarray(open_image(path))
+    values = _load_array(path) if path.suffix.lower() == ".npy" else _depth_values(path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2:
@@ -170,9 +172,16 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     if scale is None:
         scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
     known = known_depth(values)
-    if values.dtype == np.uint16:
+    if values.dtype.kind == "u" and values.dtype.itemsize == 2:  # of either byte order
         known &= values != SATURATED
     return np.where(known, values * np.float64(scale), 0).astype(np.float32)
+
+
+def _depth_values(path: Path) -> np.ndarray:
+    image = open_image(path)
+    values = np.asarray(image)
+    # Pillow reads the 16 bits of a PGM as 32.
+    return values.astype(np.uint16) if (image.format, image.mode) == ("PPM", "I") else values
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:

@@ -250,6 +250,16 @@ def _points(difference: Difference | None) -> str:
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
+def write_comparisons(
+    comparisons: Sequence[Comparison], spreadsheet: Path | None, latex: Path | None
+) -> None:
+    """Write paired differences as CSV and as LaTeX, each where a file is named."""
+    if spreadsheet is not None:
+        write_comparisons_csv(spreadsheet, comparisons)
+    if latex is not None:
+        write_comparisons_latex(latex, comparisons)
+
+
 def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None:
     """Write a spreadsheet of paired differences as shares of 1, with their 95 % intervals."""
     flat = []

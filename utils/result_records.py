@@ -11,15 +11,22 @@ import errno
 import json
 import math
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from utils.config import changed_keys, load_config, values_of
 from utils.errors import UserError
 from utils.runs import cannot_write, write_atomic
 from utils.transforms import ImageGrasp
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 SUCCESS = "success"
 OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way to the grasp
@@ -178,6 +185,36 @@ class RoundRecord:
 # --- The journal: one round a line, so that an interrupted evaluation can be resumed -----------
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Within this context, no other process enters it for the same journal. Raises UserError where
+    one is in it; a file system that knows no locks lets all in."""
+    place = path.with_name(f".{path.name}.lock")  # `read_rounds` may replace the journal itself
+    try:
+        file = place.open("ab")
+    except OSError as error:
+        raise cannot_write(place, error) from error
+    with file:
+        try:
+            _lock(file)
+        except (BlockingIOError, PermissionError):
+            raise UserError(
+                f"{path}: another process is adding rounds to it; wait until it has ended, or "
+                "start a new run"
+            ) from None
+        except OSError:
+            pass
+        yield
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Take a lock that ends with this process, however that ends."""
+    if sys.platform == "win32":
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
 def append_round(path: Path, record: RoundRecord) -> None:
     """Add a finished round to the journal, on the disk, or nothing. Raises UserError where that
     cannot be done, as on a full disk."""
@@ -240,9 +277,7 @@ def _round(content: dict[str, Any]) -> RoundRecord:
     _check_types(content, _ROUND_TYPES)
     for attempt in attempts:
         _check_types(attempt, _ATTEMPT_TYPES)
-        roughness, grasp = attempt.get("roughness"), attempt["grasp"]
-        if roughness is not None and not _is_number(roughness):
-            raise ValueError(f"roughness is {roughness!r:.40}")
+        grasp = attempt["grasp"]
         if grasp is not None:
             numbers = [*grasp["pixel"], *(grasp[name] for name in _GRASP_NUMBERS)]
             if len(numbers) != 2 + len(_GRASP_NUMBERS) or not all(map(_is_number, numbers)):
@@ -261,24 +296,36 @@ def _round(content: dict[str, Any]) -> RoundRecord:
 _ROUND_TYPES = {
     "policy": str, "scenario": str, "objects": str, "seed": int, "objects_total": int,
     "objects_cleared": int, "ended": str, "controller": str, "ungraspable": int,
-    "depth_noise": str,
+    "depth_noise": str, "target_in_hand": bool, "randomization": dict,
 }  # fmt: skip
 _ATTEMPT_TYPES = {
     "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
+    "turn_ms": float, "turn_ms_mean": float, "detail": str, "held": str, "turned": float,
+    "slid": float, "tilt": float, "roughness": float,
 }  # fmt: skip
-_ADDED = {"controller": OPEN_LOOP, "ungraspable": 0, "graspable": True}  # missing in older files
+_ADDED = {  # missing in older files
+    "controller": OPEN_LOOP, "ungraspable": 0, "target_in_hand": None, "randomization": None,
+    "graspable": True, "turn_ms": None, "turn_ms_mean": None, "detail": "", "held": None,
+    "turned": None, "slid": None, "tilt": 0.0, "roughness": None,
+}  # fmt: skip
+_MAY_BE_NONE = [name for name, value in _ADDED.items() if value is None]
 _GRASP_NUMBERS = ("angle", "depth", "width", "quality")
 
 
 def _check_types(content: dict[str, Any], types: dict[str, type]) -> None:
     for name, kind in types.items():
         value = content.get(name, _ADDED[name]) if name in _ADDED else content[name]
+        if value is None and name in _MAY_BE_NONE:
+            continue
         if not (_is_number(value) if kind is float else type(value) is kind):
             raise ValueError(f"{name} is {value!r:.40}")
 
 
+_LARGEST = sys.float_info.max  # JSON's whole numbers have no end
+
+
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and type(value) is not bool and abs(value) < math.inf
+    return isinstance(value, int | float) and type(value) is not bool and abs(value) <= _LARGEST
 
 
 def _no_number(name: str) -> None:

@@ -353,11 +353,16 @@ def _read_run(folder: Path) -> tuple[dict[str, Any], list[RoundRecord]]:
             "rounds.jsonl, such as runs/evaluate/20250131-120000"
         )
     plain = read_config(config)
-    if type(plain.get("seed")) is not int:
+    seed = plain.get("seed")
+    if type(seed) is not int or seed < 0:
         raise UserError(f"{config}: holds no seed, so that it is not the config of a run")
-    camera = plain.get("camera")
-    noise = camera.get("depth_noise") if isinstance(camera, dict) else None
-    return plain, read_rounds(journal, noise or CLEAN)
+    for section in ("camera", *(key.partition(".")[0] for key in SCENE_KEYS)):
+        if not isinstance(plain.get(section, {}), dict):
+            raise UserError(
+                f"{config}: {section} is {plain[section]!r:.40}, so that it is not the config of a "
+                "run"
+            )
+    return plain, read_rounds(journal, plain.get("camera", {}).get("depth_noise") or CLEAN)
 
 
 def _scenes(rounds: Iterable[RoundRecord]) -> set[tuple[str, str, str, int]]:

@@ -16,10 +16,11 @@ import math
 import os
 import platform
 import re
+import secrets
 import signal
+import stat
 import subprocess
 import sys
-import tempfile
 import time
 import warnings
 from collections import defaultdict
@@ -29,7 +30,7 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, NoReturn
 
 from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError, one_line
@@ -46,6 +47,7 @@ PACKAGES = (  # whose versions may change a result
 SCHEMA = 1  # version of results.json
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of the container, where it has one
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
+UNREAD = 128 + 13  # as of SIGPIPE, which Windows has not
 NO_MEMORY = re.compile("can't allocate memory|CUDA out of memory")  # torch's RuntimeErrors
 # What a full disk, a folder that may not be written and a damaged disk give.
 DISK_ERRORS = (
@@ -130,7 +132,8 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     that the script starts: by itself Python adds the script's own folder only.
     A user error becomes one line on stderr and status 2, and so do a disk that is full, a folder
     that cannot be written and memory that does not suffice. Ctrl-C ends with status 130; SIGTERM,
-    by which schedulers end a job, does the same as Ctrl-C and ends with status 143.
+    by which schedulers end a job, does the same as Ctrl-C and ends with status 143. Where whoever
+    reads the output has ended before, as `head` does, nothing is said and the status is 141.
     Any other exception is a bug and keeps its traceback.
     """
     if str(Path.cwd()) not in sys.path:
@@ -147,11 +150,16 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         status = main(sys.argv[1:])
+        sys.stdout.flush()  # here, where an error can still be handled
     except UserError as error:
         # A process that loads images sends an error as a traceback, with the sentence at its end.
         sentence = one_line(error).rpartition(f".{UserError.__name__}: ")[2]
         print(f"error: {sentence}", file=sys.stderr)
         status = 2
+    except BrokenPipeError:
+        if not _drop_unread():
+            raise
+        status = UNREAD
     except OSError as error:
         if error.errno not in DISK_ERRORS:
             raise
@@ -170,32 +178,79 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     sys.exit(TERMINATED if terminated and status == INTERRUPTED else status or 0)
 
 
+def _drop_unread() -> bool:
+    """Whether nobody reads stdout or stderr any more: what is left of both then goes nowhere, or
+    Python's own flush at the end would fail once more."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            print(file=stream, flush=True)  # a flush alone has nothing to write where none buffers
+        except BrokenPipeError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for dropped in (sys.stdout, sys.stderr):
+                os.dup2(nowhere, dropped.fileno())
+            return True
+    return False
+
+
 # --- Files ------------------------------------------------------------------------------------
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
     """Write a whole file or nothing, even if the power fails: into a temporary neighbour that is on
-    the disk before it is renamed into place.
+    the disk before it is renamed into place. A link stays one, and a file keeps its permissions.
 
-    Raises UserError where that cannot be done, as on a full disk or in a read-only folder.
+    Raises UserError where that cannot be done, as on a full disk or in a read-only folder, and for
+    what is no file, such as /dev/null.
     """
     path = Path(path)
     data = content.encode() if isinstance(content, str) else content
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        if _no_file(path):
+            raise UserError(f"{path}: exists and is no file; choose another")
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file = _neighbour(target)
         try:
-            with os.fdopen(handle, "wb") as file:
+            with file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
+            if target.exists():
+                os.chmod(file.name, stat.S_IMODE(target.stat().st_mode))
+            os.replace(file.name, target)
         except BaseException:
-            os.unlink(temporary)
+            os.unlink(file.name)
             raise
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def _no_file(path: Path) -> bool:
+    """Whether a path leads to something else than a file, such as a folder or a device."""
+    return path.exists() and not path.is_file()
+
+
+def _neighbour(path: Path) -> BinaryIO:
+    """A new file beside another one. Unlike those of `tempfile`, it has the permissions that the
+    system gives to new files."""
+    return (path.parent / f".{path.name}.{secrets.token_hex(4)}").open("xb")
+
+
+def check_writable(option: str, path: Path | None) -> None:
+    """Raise UserError if a file that an option names could not be written at the end."""
+    if path is None:
+        return
+    target = Path(os.path.realpath(path))
+    if _no_file(path) or not target.parent.is_dir():
+        raise UserError(f"{option} {path}: not a file in an existing folder; choose another")
+    try:
+        file = _neighbour(target)
+        file.close()
+        os.unlink(file.name)
+    except OSError as error:
+        raise UserError(
+            f"{option} {path}: cannot be written ({error.strerror}); choose another folder"
+        ) from error
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:
@@ -337,12 +392,6 @@ def save_results(path: Path, content: Mapping[str, Any]) -> None:
     origin = {"schema": SCHEMA, "commit": facts["commit"], "dirty": facts["dirty"]}
     origin["versions"] = {"python": facts["python"], **facts["packages"]}
     write_json_atomic(path, origin | dict(content))
-
-
-def check_writable(option: str, path: Path | None) -> None:
-    """Raise UserError if a file that an option names could not be written at the end."""
-    if path is not None and (path.is_dir() or not path.parent.is_dir()):
-        raise UserError(f"{option} {path}: not a file in an existing folder; choose another")
 
 
 def _make_new(parent: Path, stem: str) -> Path:

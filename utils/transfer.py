@@ -215,9 +215,10 @@ def write_transfer(
     """
     content = {"complete": complete, "device": device, "config": config.model_dump(mode="json")}
     content |= transfer_content(lines, columns)
-    for path in filter(None, [run / "results.json", copy]):
-        save_results(path, content)
+    save_results(run / "results.json", content)
     write_atomic(run / "transfer.png", draw_transfer(lines, columns))
+    if copy is not None:  # last: where it cannot be written, the run is whole
+        save_results(copy, content)
 
 
 def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:

@@ -15,7 +15,7 @@ from utils.depth import depth_of_plane
 from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
-from utils.transforms import RGBDFrame, deproject, known_depth
+from utils.transforms import RGBDFrame, deproject, known_depth, project
 
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
 SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
@@ -28,6 +28,7 @@ _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as ma
 OBLIQUE, MOST_OBLIQUE = 45.0, 70.0  # degrees
 MOST_MARKED = 0.5  # share of an image that one object's mask is expected to mark
 MANY_UNSEEN, MOST_UNSEEN = 0.25, 0.5  # shares of the workspace's pixels whose depth is unknown
+_SAMPLES = 100  # along each side of a workspace, to see how much of it is in the image
 
 
 def workspace_of(
@@ -87,16 +88,34 @@ def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, li
     return after, remarks
 
 
-def given_workspace(numbers: Sequence[float], table_height: float) -> Workspace:
-    """The square of [x, y, size], metres in W. Raises UserError for one of another size than
-    SMALLEST / 2 to LARGEST."""
+def given_workspace(
+    frame: RGBDFrame, table_height: float, numbers: Sequence[float]
+) -> tuple[Workspace, list[str]]:
+    """The square of [x, y, size], metres in W, and a remark where much of it is outside the image.
+    Raises UserError for one of another size than SMALLEST / 2 to LARGEST."""
     x, y, size = numbers
     if not np.isfinite([x, y, size]).all() or not SMALLEST / 2 <= size <= LARGEST:
         raise UserError(
             f"--workspace {x:g} {y:g} {size:g}: expected the centre and a side of "
             f"{SMALLEST / 2:g} to {LARGEST:g} m"
         )
-    return Workspace((x, y), size, table_height)
+    workspace = Workspace((x, y), size, table_height)
+    outside = _outside_share(frame, workspace)
+    if outside <= MANY_UNSEEN:
+        return workspace, []
+    remark = f"{outside:.0%} of --workspace lies outside the image, where nothing is found"
+    return workspace, [remark]
+
+
+def _outside_share(frame: RGBDFrame, workspace: Workspace) -> float:
+    """Share of a square of the table that lies outside the image."""
+    across = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    xy = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    points = np.insert(xy * workspace.size + workspace.centre, 2, workspace.table_height, axis=1)
+    pixels, _ = project(points, frame.K, frame.T_WC)  # NaN behind the camera, which is outside
+    height, width = frame.depth.shape
+    inside = (pixels >= -0.5) & (pixels < (width - 0.5, height - 0.5))
+    return float(1 - inside.all(axis=1).mean())
 
 
 def check_mask(mask: np.ndarray | None) -> list[str]:

@@ -99,8 +99,9 @@ class ImageBasedVisualServo(VisualServo):
         **options: Any,
     ) -> None:
         """interaction: L at the current view, at the desired one, or the mean of both.
-        depth: used where a view has no depths: metres for all points, or an estimator; with None a
-        view without depths is a DepthError. options: see `VisualServo`.
+        depth: used where a view has no depths: metres for all points, or an estimator, whose depths
+        in the current view then serve for the desired one, too; with None a view without depths is
+        a DepthError. options: see `VisualServo`.
         """
         if interaction not in INTERACTIONS:
             raise unknown_choice("interaction", interaction, INTERACTIONS)
@@ -120,7 +121,9 @@ class ImageBasedVisualServo(VisualServo):
         xy = self.camera.normalise_unchecked(np.array([point], dtype=float))
         if not np.isfinite(xy).all():
             raise PointError(f"point: not finite: {point}")
-        return interaction_matrix(xy, self._depths(xy, Z))
+        # An estimator knows the depths of a step's points alone.
+        known = None if isinstance(self.depth, DepthFromMotion) else self.depth
+        return interaction_matrix(xy, _depths(Z, known, 1))
 
     def compute_velocity(
         self,
@@ -141,24 +144,32 @@ class ImageBasedVisualServo(VisualServo):
     def _correct(self, view: ServoView, goal: ServoView) -> tuple[np.ndarray, np.ndarray, float]:
         xy, xy_goal = self._matched_points(view, goal)
         error = (xy - xy_goal).ravel()
-        if self.interaction == "desired":
-            L = interaction_matrix(xy_goal, self._depths(xy_goal, goal.depths))
+        known: np.ndarray | float | None
+        if isinstance(self.depth, DepthFromMotion):
+            # Once in every step and never with the goal: what has moved since the last call counts
+            # as moved by the camera.
+            known = self.depth.update(xy, self._velocity, self.dt)
         else:
-            L = interaction_matrix(xy, self._depths(xy, view.depths))
+            known = self.depth
+        if self.interaction == "desired":
+            L = interaction_matrix(xy_goal, _depths(goal.depths, known, len(xy)))
+        else:
+            L = interaction_matrix(xy, _depths(view.depths, known, len(xy)))
             if self.interaction == "mean":
-                L += interaction_matrix(xy_goal, self._depths(xy_goal, goal.depths))
+                L += interaction_matrix(xy_goal, _depths(goal.depths, known, len(xy)))
                 L *= 0.5
         inverse, condition = pseudo_inverse(L, self.damping, self.truncation)
         return error, inverse @ error, condition
 
-    def _depths(self, xy: np.ndarray, given: np.ndarray | float | None) -> np.ndarray:
-        if given is not None:
-            return check_depths(given, len(xy))
-        if isinstance(self.depth, DepthFromMotion):
-            return self.depth.update(xy, self._velocity, self.dt)
-        if self.depth is None:
-            raise DepthError("depths: the view has none; give depths, or `depth` to the servo")
-        return check_depths(self.depth, len(xy))
+
+def _depths(
+    given: np.ndarray | float | None, known: np.ndarray | float | None, count: int
+) -> np.ndarray:
+    """(count,) the depths of a view, or else those that the servo knows, metres."""
+    depths = known if given is None else given
+    if depths is None:
+        raise DepthError("depths: the view has none; give depths, or `depth` to the servo")
+    return check_depths(depths, count)
 
 
 class PositionBasedVisualServo(VisualServo):
