@@ -33,6 +33,7 @@ from envs.objects import OBJECT_SETS
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
+from utils.atomic_files import check_writable
 from utils.config import Config, load_foreign, values_of
 from utils.errors import UserError
 from utils.evaluation import (
@@ -58,15 +59,7 @@ from utils.result_formats import (
 )
 from utils.result_records import differing_rounds, policy_name, read_sample
 from utils.results import compare, compare_runs, stop_reasons, summarise
-from utils.runs import (
-    check_resume,
-    check_writable,
-    environment,
-    open_run,
-    parse_args,
-    run_script,
-    save_results,
-)
+from utils.runs import check_resume, environment, open_run, parse_args, run_script, save_results
 from utils.transfer import format_transfer, score_of, transfer_notes, write_transfer
 
 

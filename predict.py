@@ -56,19 +56,14 @@ from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached
 from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
+from utils.atomic_files import write_atomic
 from utils.calibration import unlikely_ones
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_files import (
-    FORMAT,
-    VERSION,
-    check_output,
-    grasps_as_plain,
-    scene_as_plain,
-)
+from utils.grasp_files import FORMAT, VERSION, check_output, grasps_as_plain, scene_as_plain
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
-from utils.runs import run_script, timed_folder, write_atomic
+from utils.runs import run_script, timed_folder
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame

@@ -61,18 +61,13 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
+from utils.atomic_files import check_writable
 from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
-from utils.runs import (
-    check_resume,
-    check_writable,
-    parse_args,
-    run_script,
-    save_results,
-)
+from utils.runs import check_resume, parse_args, run_script, save_results
 
 WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch

@@ -63,10 +63,11 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
+from utils.atomic_files import check_writable
 from utils.config import Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
-from utils.runs import Stopwatch, check_resume, check_writable, parse_args, run_script
+from utils.runs import Stopwatch, check_resume, parse_args, run_script
 
 FREE_TO_CHANGE = (
     "rl.name",

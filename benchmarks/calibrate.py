@@ -32,13 +32,14 @@ import numpy as np
 from envs.policy_approach import is_learned
 from models.planner_graspnet import Judged
 from models.planners import PLANNERS
+from utils.atomic_files import check_writable, write_json_atomic
 from utils.calibration import LEAST_CHANCE, Calibration, calibration_error
 from utils.config import load_config
 from utils.errors import UserError
 from utils.plugins import is_import_path
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord, read_rounds
-from utils.runs import check_writable, git_state, run_script, write_json_atomic
+from utils.runs import git_state, run_script
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -17,8 +17,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from utils.atomic_files import check_writable
 from utils.errors import UserError
-from utils.runs import check_writable, run_script
+from utils.runs import run_script
 
 SMOOTHED = 5000  # steps
 

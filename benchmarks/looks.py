@@ -18,8 +18,8 @@ import json
 from pathlib import Path
 
 from benchmarks.table_cells import Figures, Say, noise_of, table
+from utils.atomic_files import write_json_atomic
 from utils.result_records import CLEAN
-from utils.runs import write_json_atomic
 
 FILE = "looks.json"
 PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from utils.runs import write_json_atomic
+from utils.atomic_files import write_json_atomic
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from benchmarks.table_cells import (
     table,
     with_depths,
 )
+from utils.atomic_files import write_atomic
 from utils.result_records import CLEAN
-from utils.runs import write_atomic
 
 PAGES = (
     "README.md", "README.zh-CN.md", "docs/results.md", "docs/choices.md", "docs/planner.md",

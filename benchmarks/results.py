@@ -39,13 +39,14 @@ from typing import Any
 
 from benchmarks.looks import add_look
 from benchmarks.result_tables import write_tables
+from utils.atomic_files import write_json_atomic
 from utils.calibration import calibration_error, error_by_chance
 from utils.config import load_config
 from utils.errors import UserError
 from utils.evaluation import in_order
 from utils.result_records import RoundRecord, read_rounds, write_sample
 from utils.results import compare, stated_chances
-from utils.runs import environment, run_script, write_json_atomic
+from utils.runs import environment, run_script
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SEALED = REPOSITORY / "configs" / "sealed.yaml"  # what is kept for the tables

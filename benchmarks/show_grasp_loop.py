@@ -25,10 +25,11 @@ from envs.scenarios import SCENARIOS, disturbed, teach
 from envs.simulators import make_cell
 from envs.studio import Studio
 from models.planners import make_planner
+from utils.atomic_files import check_writable
 from utils.config import load_config
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
-from utils.runs import check_writable, run_script
+from utils.runs import run_script
 from utils.transforms import inverse_pose, transform_points
 
 MOMENTS = (0.4, 1.4, 2.2, 2.7)  # s after the arm has set out

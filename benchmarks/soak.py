@@ -28,9 +28,10 @@ from benchmarks.soak_files import soak_files
 from benchmarks.soak_processes import soak_disk, soak_stopped, soak_workers
 from benchmarks.soak_tally import Tally
 from envs.simulators import SIMULATORS
+from utils.atomic_files import check_writable, write_json_atomic
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
-from utils.runs import check_writable, environment, run_script, write_json_atomic
+from utils.runs import environment, run_script
 
 SEED = 2027
 

@@ -31,6 +31,7 @@ from models.grasp_policy import GraspPolicyNetwork, load_policy
 from models.graspnet import create_model
 from models.graspnet_io import load_graspnet, save_graspnet
 from models.ppo import KIND as POLICY
+from utils.atomic_files import write_atomic
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
 from utils.errors import UserError, one_line
@@ -46,7 +47,7 @@ from utils.result_records import (
     read_sample,
     write_sample,
 )
-from utils.runs import new_run_folder, write_atomic
+from utils.runs import new_run_folder
 from utils.transforms import ImageGrasp, RGBDFrame, look_at
 
 TRIES = 2_000  # of each kind

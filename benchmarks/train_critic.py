@@ -40,6 +40,7 @@ from envs.critic_examples import (
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.graspnet_io import SHIPPED as SHIPPED_NETWORK
 from models.planner_graspnet import JUDGED_FAN
+from utils.atomic_files import check_writable, write_json_atomic
 from utils.calibration import calibration_error
 from utils.checkpoint import save_checkpoint
 from utils.config import Config
@@ -47,7 +48,7 @@ from utils.distributed import choose_device
 from utils.errors import UserError
 from utils.executor import completed, open_executor
 from utils.result_formats import aligned
-from utils.runs import check_writable, git_state, parse_args, run_script, write_json_atomic
+from utils.runs import git_state, parse_args, run_script
 
 HELD_OUT = 10  # every tenth scene
 SHARD, SHARDS = 50, "scenes-*.npz"  # scenes of a file, at most, and the files' names

@@ -35,13 +35,13 @@ from models.planner_graspnet import (
     GraspNetPlanner,
     Judged,
 )
+from utils.atomic_files import write_atomic
 from utils.config import Config, with_settings
 from utils.depth import make_depth_noise
 from utils.depth import measure as measured
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import HeightMap
-from utils.runs import write_atomic
 from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 

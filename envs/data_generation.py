@@ -26,6 +26,7 @@ from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
 from envs.objects import ObjectPart, ObjectSet, load_object_set
 from envs.simulators import cell_class
+from utils.atomic_files import write_atomic
 from utils.config import Config, dump_config, load_config, with_settings
 from utils.config_types import changed, draw
 from utils.errors import UserError
@@ -33,7 +34,6 @@ from utils.executor import LostWorkerError, completed, open_executor
 from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
-from utils.runs import write_atomic
 from utils.worker_process import kept
 
 SPLITS = ("train", "validation")

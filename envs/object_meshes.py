@@ -22,8 +22,8 @@ import trimesh
 
 from envs import object_parts
 from envs.object_parts import MassProperties, convex_parts, solid_of
+from utils.atomic_files import write_atomic
 from utils.errors import UserError
-from utils.runs import write_atomic
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".dae")
 MOST_FACES, MOST_PIECES = 2_000_000, 2_000

@@ -16,8 +16,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from envs.panda_model import Inertial, Joint, Link, Shape, Surface, floating_links, panda_links
+from utils.atomic_files import write_atomic
 from utils.geometry import GripperGeometry
-from utils.runs import write_atomic
 from utils.transforms import transform_points
 
 WHITE = (1.0, 1.0, 1.0, 1.0)

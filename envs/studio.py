@@ -28,8 +28,9 @@ from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.simulators import make_cell
+from utils.atomic_files import check_writable
 from utils.errors import UserError
-from utils.runs import check_writable, parse_args, run_script
+from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W

@@ -41,6 +41,7 @@ from utils.adaptation import (
     reversal_weight,
     select_domain,
 )
+from utils.atomic_files import write_atomic
 from utils.augmentation import Augmentation, ColourJitter, LabelledImages
 from utils.checkpoint import load_weights
 from utils.config import AdaptationConfig, Config, TrainConfig
@@ -48,7 +49,6 @@ from utils.distributed import Team
 from utils.errors import UserError
 from utils.real_data import KEY, UnlabelledImages
 from utils.rectangles import RealSample, View
-from utils.runs import write_atomic
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 
 STATE = "adaptation"  # the entry of a checkpoint's `extra` that a resumed training needs

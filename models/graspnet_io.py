@@ -19,6 +19,7 @@ from torch.export import Dim
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from models.graspnet import GraspNet
+from utils.atomic_files import write_atomic
 from utils.checkpoint import (
     build_model,
     load_checkpoint,
@@ -28,7 +29,6 @@ from utils.checkpoint import (
 )
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
-from utils.runs import write_atomic
 
 SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "graspnet.pt"
 KIND = "graspnet"  # also of training checkpoints, which hold an optimiser as well

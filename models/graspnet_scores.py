@@ -15,10 +15,10 @@ import torch
 
 from models.graspnet import GraspNet, to_input
 from models.graspnet_decoding import Peaks, PeakSettings, find_peaks
+from utils.atomic_files import save_figure
 from utils.augmentation import LabelledImage, LabelledImages
 from utils.errors import UserError
 from utils.grasp_labels import LabelSettings
-from utils.runs import save_figure
 from utils.transforms import angle_difference, known_depth
 
 if TYPE_CHECKING:

@@ -21,6 +21,7 @@ from torch.utils.data import Dataset
 from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_input
 from models.graspnet_data import Example
 from models.graspnet_decoding import PeakSettings, find_peaks
+from utils.atomic_files import save_figure
 from utils.augmentation import Augmentation, LabelledImage
 from utils.rectangles import (
     GraspRectangle,
@@ -30,7 +31,6 @@ from utils.rectangles import (
     rasterise,
     rectangle_match,
 )
-from utils.runs import save_figure
 from utils.transforms import angle_difference
 
 if TYPE_CHECKING:

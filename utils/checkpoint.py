@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from utils.atomic_files import write_atomic
 from utils.errors import UserError, one_line
-from utils.runs import write_atomic
 
 MAGIC = "robot-grasping checkpoint"
 FORMAT_VERSION = 1  # raise when the meaning of an entry changes

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
+from utils.atomic_files import write_atomic
 from utils.config import COMPUTE_KEYS, Config, load_config
 from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
@@ -33,7 +34,7 @@ from utils.result_records import (
     read_rounds,
     writing,
 )
-from utils.runs import usable_cpus, write_atomic
+from utils.runs import usable_cpus
 
 # Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
 FREE_TO_CHANGE = (

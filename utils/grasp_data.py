@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from utils.atomic_files import write_atomic
 from utils.augmentation import LabelledImage
 from utils.errors import UserError, one_line
 from utils.grasp_labels import GraspLabels, Trial
-from utils.runs import write_atomic
 from utils.transforms import RGBDFrame, project
 
 # Raise it with every change of the files' format or of the code that makes scenes, images, labels.

@@ -20,6 +20,7 @@ import imageio.v3 as iio
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from utils.atomic_files import figure_bytes, write_atomic
 from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
@@ -27,7 +28,7 @@ from utils.image_overlay import contact_sheet, draw_grasp
 from utils.result_formats import columns_of, depth_in_words, failures_in_words
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stated_chances, stop_reasons
-from utils.runs import figure_bytes, git_state, write_atomic
+from utils.runs import git_state
 from utils.statistics import FEW_ROUNDS, Difference
 from utils.transforms import Grasp, RGBDFrame, grasp_to_image, project
 

@@ -13,10 +13,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
+from utils.atomic_files import write_atomic
 from utils.config import Config
 from utils.result_records import CLEAN, FAILURES
 from utils.results import Comparison, Row, StopReason
-from utils.runs import save_results, write_atomic
+from utils.runs import save_results
 from utils.statistics import FEW_ROUNDS, Difference
 
 

@@ -18,9 +18,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
+from utils.atomic_files import cannot_write, write_atomic
 from utils.config import changed_keys, load_config, values_of
 from utils.errors import UserError
-from utils.runs import cannot_write, write_atomic
 from utils.transforms import ImageGrasp
 
 if sys.platform == "win32":

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from utils.atomic_files import write_atomic
 from utils.config import Config, TransferPolicy
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord
-from utils.runs import save_results, write_atomic
+from utils.runs import save_results
 from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
 
 if TYPE_CHECKING:

@@ -1,0 +1,80 @@
+"""Files that are written whole or not at all."""
+
+import math
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from utils.atomic_files import check_writable, write_atomic, write_json_atomic
+from utils.errors import UserError
+
+
+def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, monkeypatch):
+    """Otherwise an empty file may be left where the power fails after the renaming."""
+    path, on_disk = tmp_path / "last.pt", []
+    path.write_bytes(b"before")
+
+    def fsync(number):
+        on_disk.append((os.fstat(number).st_ino, os.fstat(number).st_size, path.read_bytes()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_atomic(path, b"afterwards")
+    assert on_disk == [(path.stat().st_ino, 10, b"before")]
+
+
+def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_the_system(tmp_path):
+    shared, new = tmp_path / "shared.json", tmp_path / "new.json"
+    shared.write_text("before")
+    shared.chmod(0o664)
+    before = os.umask(0o027)
+    try:
+        write_atomic(shared, "afterwards")
+        write_atomic(new, "{}")
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (shared, new)]
+    assert modes == [0o664, 0o640] and shared.read_text() == "afterwards"
+
+
+def test_a_link_still_leads_to_the_file_that_is_replaced(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    for link, target in (("old", "elsewhere/old.csv"), ("new", "elsewhere/new.csv")):
+        (tmp_path / link).symlink_to(target)
+    (tmp_path / "elsewhere" / "old.csv").write_text("before")
+    for link in ("old", "new"):
+        check_writable("--csv", tmp_path / link)
+        write_atomic(tmp_path / link, "afterwards")
+        assert (tmp_path / link).is_symlink()
+        assert (tmp_path / "elsewhere" / f"{link}.csv").read_text() == "afterwards"
+
+
+def test_what_is_no_file_is_refused_and_stays(tmp_path):
+    """A pipe, as /dev/stdout may be one, stands for all devices."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    for name in ("folder", "pipe", "link"):
+        with pytest.raises(UserError, match=f"--csv .*{name}: not a file in an existing folder"):
+            check_writable("--csv", tmp_path / name)
+        with pytest.raises(UserError, match=f"{name}: exists and is no file; choose another"):
+            write_atomic(tmp_path / name, "a,b")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", "pipe", "link"}
+
+
+def test_a_file_that_could_not_be_written_at_the_end_is_refused_at_once(tmp_path):
+    check_writable("--csv", None)
+    check_writable("--csv", tmp_path / "x.csv")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UserError, match="--csv /proc/x.csv: cannot be written"):
+        check_writable("--csv", Path("/proc/x.csv"))
+    with pytest.raises(UserError, match="none/x.csv: not a file in an existing folder"):
+        check_writable("--csv", tmp_path / "none" / "x.csv")
+
+
+def test_json_refuses_nan(tmp_path):
+    with pytest.raises(ValueError):
+        write_json_atomic(tmp_path / "x.json", {"a": math.inf})
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,110 @@
+"""Files that are written whole or not at all, whatever ends the program or fills the disk."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import secrets
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from utils.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# What a full disk, a folder that may not be written and a damaged disk give.
+DISK_ERRORS = (
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO
+)  # fmt: skip
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write a whole file or nothing, even if the power fails: into a temporary neighbour that is on
+    the disk before it is renamed into place. A link stays one, and a file keeps its permissions.
+
+    Raises UserError where that cannot be done, as on a full disk or in a read-only folder, and for
+    what is no file, such as /dev/null.
+    """
+    path = Path(path)
+    data = content.encode() if isinstance(content, str) else content
+    try:
+        if _no_file(path):
+            raise UserError(f"{path}: exists and is no file; choose another")
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file = _neighbour(target)
+        try:
+            with file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            if target.exists():
+                os.chmod(file.name, stat.S_IMODE(target.stat().st_mode))
+            os.replace(file.name, target)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def _no_file(path: Path) -> bool:
+    """Whether a path leads to something else than a file, such as a folder or a device."""
+    return path.exists() and not path.is_file()
+
+
+def _neighbour(path: Path) -> BinaryIO:
+    """A new file beside another one. Unlike those of `tempfile`, it has the permissions that the
+    system gives to new files."""
+    return (path.parent / f".{path.name}.{secrets.token_hex(4)}").open("xb")
+
+
+def check_writable(option: str, path: Path | None) -> None:
+    """Raise UserError if a file that an option names could not be written at the end."""
+    if path is None:
+        return
+    target = Path(os.path.realpath(path))
+    if _no_file(path) or not target.parent.is_dir():
+        raise UserError(f"{option} {path}: not a file in an existing folder; choose another")
+    try:
+        file = _neighbour(target)
+        file.close()
+        os.unlink(file.name)
+    except OSError as error:
+        raise UserError(
+            f"{option} {path}: cannot be written ({error.strerror}); choose another folder"
+        ) from error
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """The error for a file that the operating system does not let us write."""
+    return UserError(
+        f"{path}: cannot be written ({error.strerror or error}); make room or choose a folder that "
+        "can be written, what was there before is unchanged"
+    )
+
+
+def write_json_atomic(path: Path, content: Mapping) -> None:
+    """Indented strict JSON; raises ValueError on NaN or infinity before touching the file."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    write_atomic(path, text + "\n")
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a matplotlib figure as a PNG file and close it."""
+    write_atomic(path, figure_bytes(figure))
+
+
+def figure_bytes(figure: Figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG file; the figure is closed."""
+    import matplotlib.pyplot as plt  # slow to import, and few callers need it
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    return buffer.getvalue()
