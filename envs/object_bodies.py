@@ -72,7 +72,7 @@ def load_object(
     inertial = body_of(stated, cut.solid, source.mesh, density)
     parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
     mass = max(inertial.mass * scale**3, MIN_MASS)
-    moments, principal = principal_axes(inertial.inertia)
+    moments, principal = principal_moments(inertial.inertia)
     remarks = [cut.remark] if cut.remark else []
     if stated is not None and inertial is not stated:
         remarks.append(IMPOSSIBLE_INERTIA)
@@ -121,7 +121,7 @@ def compound_object(shape: Primitive, cache_dir: Path) -> ObjectModel:
     solid = trimesh.util.concatenate(hulls)  # the parts touch but do not overlap
     centre = np.asarray(solid.center_mass)
     parts = tuple(part - centre for part in shape.parts)
-    moments, principal = principal_axes(shape.density * solid.moment_inertia)
+    moments, principal = principal_moments(shape.density * solid.moment_inertia)
     return ObjectModel(
         name=shape.name,
         parts=parts,
@@ -136,11 +136,11 @@ def compound_object(shape: Primitive, cache_dir: Path) -> ObjectModel:
     )
 
 
-def principal_axes(
+def principal_moments(
     inertia: np.ndarray,
 ) -> tuple[np.ndarray, tuple[float, float, float, float] | None]:
-    """Moments (3,) of an inertia (3, 3), and the quaternion that turns its axes into the principal
-    ones; None where its own are, or nearly."""
+    """Principal moments (3,) of an inertia (3, 3), kg m2, and the quaternion (x, y, z, w) that
+    turns its axes into the principal ones; None where its own are, or nearly."""
     moments, axes = np.linalg.eigh(inertia)
     if np.abs(inertia - np.diag(np.diag(inertia))).max() < LEAST_PRODUCT * moments[0]:
         return np.diag(inertia).copy(), None
