@@ -152,7 +152,7 @@ def train(
             f"{config.train.epochs} epochs, seed {config.seed}; results in {run}",
             flush=True,
         )
-    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step) if is_main else None
+    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step + 1) if is_main else None
     bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not is_main)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:

@@ -44,6 +44,8 @@ from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
     Curves,
     ProgressRow,
+    after_not_finite,
+    after_worker_error,
     load_progress,
     reached,
     row_in_words,
@@ -86,6 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_names(config)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
+    if config.rl.films:  # one that draws no pictures is told of now
+        make_env(config, render_mode="rgb_array").close()
     with (
         team(config.rl.device, os.environ, "rl.device") as processes,
         training_envs(config, envs_of_each(config, processes)) as envs,
@@ -101,11 +105,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             # A policy that is half trained must not replace one that is not.
             best = save_training(run, history, options.weights if finished else None)
             print(f"best evaluation: {row_in_words(best)}")
-            film(config, run, ppo)
             if not finished:
                 more = "" if options.weights is None else f" --weights {options.weights}"
                 done = history[-1]["step"]
                 print(f"stopped; go on after {done:,} steps with --resume {run}{more}")
+            film(config, run, ppo)
     return 0 if finished else 130
 
 
@@ -190,12 +194,9 @@ def train(
                 if processes.any(interrupted.is_set()):
                     return False
     except NotFinite as error:
-        raise UserError(
-            f"{error}; the weights of {run / 'last.pt'} are sound: continue from them with "
-            "rl.initial, perhaps with a lower rl.lr"
-        ) from error
+        raise UserError(f"{error}; {after_not_finite(run)}") from error
     except WorkerError:
-        print(f"after this error, go on with --resume {run}", file=sys.stderr)
+        print(f"after this error, {after_worker_error(run)}", file=sys.stderr)
         raise
     finally:
         curves.close()

@@ -33,7 +33,7 @@ from envs.policy_approach import is_learned
 from models.planner_graspnet import Judged
 from models.planners import PLANNERS
 from utils.atomic_files import check_writable, write_json_atomic
-from utils.calibration import LEAST_CHANCE, Calibration, calibration_error
+from utils.calibration import LEAST_CHANCE, ROUNDING, Calibration, calibration_error
 from utils.config import load_config
 from utils.errors import UserError
 from utils.plugins import is_import_path
@@ -105,7 +105,7 @@ def fitted_chances(grasps: dict[str, ExecutedGrasps]) -> dict[str, Calibration]:
         judged = is_judged(name)  # the critic sees itself how rough the heights are
         roughness = np.zeros_like(own.roughness) if judged else own.roughness
         # The search's scores may exceed 1; of another's planner, these grasps alone can tell.
-        bounded = judged or (name not in PLANNERS and bool(own.scores.max() <= 1.0))
+        bounded = judged or (name not in PLANNERS and bool(own.scores.max() <= 1.0 + ROUNDING))
         fits[name] = Calibration.fit(own.scores, own.successes, roughness, own.failed, bounded)
     return fits
 

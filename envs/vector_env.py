@@ -233,12 +233,17 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         arguments["render_mode"] = render_mode
     if settings.env_id in OWN_ENVS:
         arguments["config"] = config
+    no_pictures = UserError(f"rl.films: {settings.env_id} draws no pictures; use rl.films=0")
     try:
         env = gymnasium.make(settings.env_id, disable_env_checker=True, **arguments)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         raise UserError(f"rl.env_id {settings.env_id}: {error}") from error
     except TypeError as error:
+        if render_mode is not None and "render_mode" in str(error):
+            raise no_pictures from error
         raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
+    if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
+        raise no_pictures
     seen = settings.policy_observations, settings.privileged_observations
     wanted = [name for names in (*seen, settings.estimated_observations) for name in names or ()]
     return CheckedEnv(with_info(env, wanted), index)

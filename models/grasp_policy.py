@@ -222,12 +222,14 @@ class GraspPolicyNetwork(nn.Module):
         clipped to them."""
         if self.squash:
             half = (self.action_high - self.action_low) / 2
-            return self.action_low + half * (latent.tanh() + 1)
+            latent = self.action_low + half * (latent.tanh() + 1)  # rounding may leave the bounds
         return torch.minimum(torch.maximum(latent, self.action_low), self.action_high)
 
-    def limited_log_std(self) -> torch.Tensor:
-        """(A,) logarithm of the Gaussian's deviation, within the limits of exploration."""
-        return self.log_std.clamp(LOWEST_LOG_STD, HIGHEST_LOG_STD)
+    @torch.no_grad()
+    def limit_exploration(self) -> None:
+        """Bring the Gaussian's deviation back within its limits, after a step of the optimiser; a
+        limit in the forward pass would have no gradient that leads back."""
+        self.log_std.clamp_(LOWEST_LOG_STD, HIGHEST_LOG_STD)
 
     def observe(self, observations: Observations, team: Team) -> None:
         """Add a rollout's observations to the statistics that normalise them."""
@@ -256,7 +258,7 @@ class GraspPolicyNetwork(nn.Module):
 
     def _distribution(self, features: torch.Tensor) -> ActionDistribution:
         mean = self.mean_head(self.actor(features))
-        return ActionDistribution(mean, self.limited_log_std(), self.squash)
+        return ActionDistribution(mean, self.log_std, self.squash)
 
     def _value(self, features: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         if privileged.shape[-1]:
@@ -275,12 +277,20 @@ def relief_of(depth: torch.Tensor) -> torch.Tensor:
 
 
 def encoder(channels: int, conv_channels: Sequence[int], features: int) -> nn.Sequential:
-    """(B, channels, H, W) to (B, features), for images of any size."""
+    """(B, channels, H, W) to (B, features), for images of any size that the convolutions leave
+    something of (`convolved`)."""
     parts: list[nn.Module] = []
     for before, after in zip([channels, *conv_channels], conv_channels):
         parts += [initialised(nn.Conv2d(before, after, 3, stride=2), math.sqrt(2)), nn.ReLU()]
     parts += [nn.AdaptiveAvgPool2d(POOLED), nn.Flatten()]
     return nn.Sequential(*parts, *layers([conv_channels[-1] * POOLED**2, features], nn.ReLU))
+
+
+def convolved(side: int, conv_channels: Sequence[int]) -> int:
+    """What the encoder's convolutions leave of an image's side, in pixels."""
+    for _ in conv_channels:
+        side = (side - 3) // 2 + 1
+    return side
 
 
 def layers(widths: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
@@ -306,22 +316,30 @@ def policy_for(
     """A new network for an environment's observations and actions.
 
     Raises UserError for actions that are not a vector of real numbers, or without bounds where
-    they would have to be squashed.
+    they would have to be squashed, and for images of which the convolutions leave nothing.
     """
-    if not isinstance(action_space, spaces.Box) or not np.issubdtype(
-        action_space.dtype, np.floating
+    if (
+        not isinstance(action_space, spaces.Box)
+        or not np.issubdtype(action_space.dtype, np.floating)
+        or len(action_space.shape) != 1
     ):
         raise UserError(
             f"rl.env_id {settings.env_id}: its actions are {action_space}; this PPO has a Gaussian "
-            "policy, choose an environment whose action space is a Box of floats"
+            "policy, choose an environment whose action space is a Box of floats with one dimension"
         )
-    low, high = (torch.as_tensor(b, dtype=torch.float32).flatten()
-                 for b in (action_space.low, action_space.high))  # fmt: skip
+    for part in layout.images:
+        if min(convolved(side, settings.conv_channels) for side in part.shape[:2]) < 1:
+            raise UserError(
+                f"rl.env_id {settings.env_id}: {len(settings.conv_channels)} convolutions leave "
+                f"nothing of {part.key!r}, {part.shape[1]}x{part.shape[0]} pixels; shorten "
+                "rl.conv_channels or use larger images"
+            )
     if settings.squash and not action_space.is_bounded():
         raise UserError(
             f"rl.squash: the actions of {settings.env_id} have no bounds to be squashed between; "
             "use rl.squash=false"
         )
+    low, high = bounds_within(action_space)
     estimated = layout.privileged[: len(settings.estimated_observations or ())]
     network = GraspPolicyNetwork(
         settings.image_feature_dim,
@@ -344,6 +362,14 @@ def policy_for(
     return network
 
 
+def bounds_within(space: spaces.Box) -> tuple[torch.Tensor, torch.Tensor]:
+    """(A,) each, float32: the bounds of a space, of any precision, rounded into the space."""
+    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    low = np.where(low < space.low, np.nextafter(low, np.float32(np.inf)), low)
+    high = np.where(high > space.high, np.nextafter(high, np.float32(-np.inf)), high)
+    return torch.from_numpy(low), torch.from_numpy(high)
+
+
 def make_ppo(
     observation_space: spaces.Space, action_space: spaces.Space, config: Config, team: Team = ALONE
 ) -> GraspPPO:
@@ -359,7 +385,7 @@ def make_ppo(
     network = policy_for(layout, action_space, settings)
     if settings.initial is not None:
         load_initial(network, layout, settings.initial)
-    return GraspPPO(network, layout, settings, team)
+    return GraspPPO(network, layout, settings, team, config.seed)
 
 
 def load_initial(network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str) -> None:

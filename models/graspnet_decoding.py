@@ -116,7 +116,7 @@ def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     """(N, 2) offsets (u, v) of the maxima of quadratics through the 3x3 pixels around peaks.
 
     Newton's step with central differences (Brown and Lowe 2002) on the logarithm, which is exact
-    where the peak is Gaussian. No step where the surface is not a cap.
+    where the peak is Gaussian. No step where the surface is not a cap, nor across the border.
     """
     rows, columns = score.shape
     log = np.log(np.maximum(score, 1e-6))
@@ -132,7 +132,8 @@ def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     cap = (guu < 0) & (determinant > 1e-9)
     step_uv = np.stack([guv * gv - gvv * gu, guv * gu - guu * gv], axis=-1)
     step_uv /= np.where(cap, determinant, 1.0)[:, None]
-    return np.clip(np.where(cap[:, None], step_uv, 0.0), -1, 1)
+    at_border = np.stack([np.isin(column, [0, columns - 1]), np.isin(row, [0, rows - 1])], axis=-1)
+    return np.clip(np.where(cap[:, None] & ~at_border, step_uv, 0.0), -1, 1)
 
 
 def _angles(probability: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from utils.transforms import angle_difference, known_depth
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-_BEST_PEAK = PeakSettings(threshold=0.0, count=1)  # the highest peak
+_BEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
 DRAWN = PeakSettings(threshold=0.3, count=5)  # the peaks in a picture
 NO_CURVES = ("epoch", "step", "images")  # entries of a history row that are no curves
 # Where each entry of a history row comes from, and its unit; "" has none.

@@ -107,7 +107,7 @@ class RandomPlanner:
         grasps = []
         for quality in np.linspace(1, 0, self.count, endpoint=False):
             x, y, top = candidates[self._random.integers(len(candidates))]
-            height = max(top - 0.02, lowest)  # the fingers reach 2 cm below the surface
+            height = max(top - 0.02, lowest)  # the hand's centre, 2 cm below the surface
             angle = self._random.uniform(0, np.pi)
             grasps.append(Grasp(np.array([x, y, height]), angle, self.gripper.max_opening, quality))
         return grasps

@@ -103,10 +103,10 @@ class GraspPPO:
                 f"{team.ranks} processes have to share both equally; make them multiples"
             )
         self.network, self.layout = network.to(team.device), layout
-        self.settings, self.team, self.seed = settings, team, seed
+        self.settings, self.team = settings, team
         self.rewards = RewardScaler(settings.gamma).to(team.device)
         self.updates = 0
-        self.generator = torch.Generator()
+        self.generator = torch.Generator().manual_seed(seed)
         # Not in a checkpoint: it is cleared at every one, so that a resumed run equals a whole one.
         self.memory = StepMemory(settings.estimate_memory)
         team.share_weights(network)
@@ -158,6 +158,7 @@ class GraspPPO:
             if self._too_far(losses.approx_kl):
                 break
             self.optimizer.step()
+            self.network.limit_exploration()
         estimates = {}
         if self.estimator_weights is not None:
             rate = self.settings.estimate_lr * left

@@ -36,7 +36,7 @@ class Actor:
         self._layers = [_plain(layer) for layer in network.actor[::2]]
         self._activation = type(network.actor[1])
         self._mean = _plain(network.mean_head)
-        self._deviation = network.limited_log_std().exp().detach().numpy()
+        self._deviation = network.log_std.detach().exp().numpy()
         self._low, self._high = network.action_low.numpy(), network.action_high.numpy()
 
     def latent(self, seen: Observations, noise: np.ndarray | None = None) -> np.ndarray:
@@ -53,7 +53,7 @@ class Actor:
     def action(self, latent: np.ndarray) -> np.ndarray:
         """(A,) the action of a latent, as `GraspPolicyNetwork.action` defines it."""
         if self._squash:
-            return self._low + (self._high - self._low) / 2 * (np.tanh(latent) + 1)
+            latent = self._low + (self._high - self._low) / 2 * (np.tanh(latent) + 1)
         return np.minimum(np.maximum(latent, self._low), self._high)
 
 

@@ -57,7 +57,7 @@ def pretrain_estimator(
             seeds = [None] * envs.num_envs
             bar.update(per_chunk)
             bar.set_postfix(loss=f"{loss:.3g}")
-            # Steps below 0, so that a resumed run keeps the curve.
+            # Steps up to 0, so that a resumed run keeps the curve.
             curves.add("pretraining", (chunk + 1 - chunks) * per_chunk, {"estimate_loss": loss})
     ppo.memory.clear()
 

@@ -71,12 +71,12 @@ class Curves:
     """TensorBoard curves over environment steps, written by the main process alone.
 
     Their names are group/value: `training` (episodes with exploration), `evaluation` (deterministic
-    episodes), `update` (losses and what an update did), `pretraining` and `time`. Curves beyond
-    `first_step`, of a run that is resumed before them, are dropped.
+    episodes), `update` (losses and what an update did), `pretraining` and `time`. What lies
+    beyond `first_step`, of a run that is resumed before it, is dropped.
     """
 
     def __init__(self, folder: Path, first_step: int, is_main: bool):
-        self._writer = SummaryWriter(folder, purge_step=first_step) if is_main else None
+        self._writer = SummaryWriter(folder, purge_step=first_step + 1) if is_main else None
 
     def add(self, group: str, step: int, values: dict[str, float]) -> None:
         if self._writer is not None:
@@ -90,6 +90,24 @@ class Curves:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def after_not_finite(run: Path) -> str:
+    """What to do after a number that is not finite."""
+    last = run / "last.pt"
+    if last.is_file():
+        return (
+            f"the weights of {last} are sound: continue from them with rl.initial, perhaps with a "
+            "lower rl.lr"
+        )
+    return "nothing was saved before; look at the environment's rewards and observations"
+
+
+def after_worker_error(run: Path) -> str:
+    """What to do after an environment has failed."""
+    if (run / "last.pt").is_file():
+        return f"go on with --resume {run}"
+    return "start a new run: nothing was saved before"
 
 
 def save_evaluation(

@@ -144,7 +144,6 @@ class _NetworkUnpickler(pickle.Unpickler):
             if is_function or isinstance(found, type):
                 return found
         raise pickle.UnpicklingError(f"it holds {place}, which no policy needs")
-        return found
 
 
 def _same_box(theirs: spaces.Box, ours: spaces.Box) -> bool:

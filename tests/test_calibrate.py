@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.calibrate import grasps_of, main
+from benchmarks.calibrate import ExecutedGrasps, fitted_chances, grasps_of, main
 from models.planners import CALIBRATIONS
 from utils.calibration import Calibration, load_calibrations
 from utils.config import dump_config, load_config
@@ -137,6 +137,19 @@ def test_planners_of_a_user_are_fitted_and_random_and_policies_are_not(tmp_path,
     assert main([str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "my_module:plan" in printed and "random" not in printed and "ppo" not in printed
+
+
+def test_a_score_of_one_that_was_rounded_is_one() -> None:
+    rng = np.random.default_rng(0)
+    scores = np.append(rng.uniform(0.3, 1, 400), 1.0)
+    grasps = ExecutedGrasps(
+        scores, scores, rng.random(401) < scores**3, np.zeros(401), np.zeros(401, bool)
+    )
+    exact, rounded = (
+        fitted_chances({"my_module:plan": own})["my_module:plan"]
+        for own in (grasps, grasps._replace(scores=scores * (1 + 2e-13)))
+    )
+    assert exact(0.99) == pytest.approx(rounded(0.99), abs=1e-6)
 
 
 def test_what_the_critic_judges_has_no_penalty(tmp_path) -> None:

@@ -22,6 +22,7 @@ from models.grasp_policy import (
     relief_of,
     save_policy,
 )
+from models.ppo_actor import Actor
 from models.ppo_observations import (
     ObservationLayout,
 )
@@ -163,6 +164,44 @@ def test_actions_that_cannot_be_learned(name, overrides, message):
     layout = ObservationLayout.of(env.observation_space)
     with pytest.raises(UserError, match=message):
         policy_for(layout, env.action_space, settings_of(*overrides))
+
+
+def test_actions_of_more_dimensions_are_no_vector():
+    layout = ObservationLayout.of(spaces.Box(-1.0, 1.0, (2,), np.float32))
+    with pytest.raises(UserError, match="Box of floats with one dimension"):
+        policy_for(layout, spaces.Box(-1.0, 1.0, (2, 3), np.float32), settings_of())
+
+
+@pytest.mark.parametrize(("side", "fits"), [(14, False), (15, True)])
+def test_images_of_which_the_convolutions_leave_nothing(side, fits):
+    """Three 3x3 convolutions with stride 2 make 15 pixels 7, 3 and 1."""
+    image = spaces.Box(0, 255, (side, 40, 3), np.uint8)
+    layout = ObservationLayout.of(spaces.Dict(rgb=image))
+    actions, settings = spaces.Box(-1.0, 1.0, (2,)), settings_of("rl.conv_channels=[4,4,4]")
+    if fits:
+        network = policy_for(layout, actions, settings)
+        seen = layout.read_one({"rgb": image.sample()})
+        assert network.features(seen.image(), seen.state).shape == (1, 8)
+    else:
+        with pytest.raises(UserError, match=r"leave nothing of 'rgb', 40x14.*rl.conv_channels"):
+            policy_for(layout, actions, settings)
+
+
+@pytest.mark.parametrize("squash", [False, True])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_lie_in_their_space_to_the_last_bit(dtype, squash):
+    """0.1 in single precision is above 0.1, and squashed actions pass the bounds by rounding."""
+    rng = np.random.default_rng(0)
+    low, size = rng.uniform(-1, 1, 200), rng.uniform(0.01, 1, 200)
+    space = spaces.Box(low.astype(dtype), (low + size).astype(dtype), dtype=dtype)
+    layout = ObservationLayout.of(spaces.Box(-1.0, 1.0, (2,), np.float32))
+    network = policy_for(layout, space, settings_of(f"rl.squash={squash}".lower()))
+    for latent in (-20.0, 20.0):
+        wanted = torch.full((1, 200), latent)
+        by_network = network.action(wanted)[0].numpy()
+        by_actor = Actor(network).action(wanted[0].numpy())
+        assert space.contains(by_network) and space.contains(by_actor)
+        np.testing.assert_allclose(by_network, space.low if latent < 0 else space.high, atol=1e-6)
 
 
 def test_relief_is_how_far_pixels_stand_out():

@@ -79,6 +79,12 @@ def test_an_oblique_ridge_is_still_located() -> None:
     assert np.abs(found.pixel[0] - (21.6, 18.3)).max() < 0.05
 
 
+def test_a_peak_at_the_border_stays_there() -> None:
+    quality, angle, width = maps_of([(0, 20, 1.0, 0.05, 0.9)], (40, 30))
+    found = find_peaks(quality, angle, width, PeakSettings(blur=0))
+    np.testing.assert_allclose(found.pixel, [[0, 20]], atol=1e-3)
+
+
 def test_at_the_images_edge_and_on_a_plateau() -> None:
     quality = torch.zeros(1, 1, 30, 40)
     quality[0, 0, 0, 0] = 0.9  # a corner

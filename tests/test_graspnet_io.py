@@ -70,7 +70,7 @@ def test_a_training_checkpoint_loads_too(tmp_path, model):
 @pytest.mark.parametrize("saved_head", [False, True])
 @pytest.mark.parametrize("new_head", [False, True])
 def test_a_network_starts_from_another_with_or_without_a_centre_head(
-    tmp_path, saved_head, new_head
+    tmp_path, capsys, saved_head, new_head
 ):
     torch.manual_seed(0)
     saved = GraspNet(max_width=0.08, backbone="ggcnn", centre_head=saved_head)
@@ -83,6 +83,9 @@ def test_a_network_starts_from_another_with_or_without_a_centre_head(
         expected = saved.state_dict()[name] if shared else before[name]
         torch.testing.assert_close(value, expected, rtol=2**-11 if shared else 0, atol=2**-25)
     assert (new.centre_head is not None) == new_head
+    assert "net.pt: its widths end at 0.08 m, the new network's at 0.2 m; they are 2.5 times" in (
+        capsys.readouterr().out
+    )
     with pytest.raises(UserError, match="net.pt.*another architecture"):
         load_initial(GraspNet(backbone="tutorial"), tmp_path / "net.pt")
 

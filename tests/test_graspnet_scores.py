@@ -91,6 +91,18 @@ def test_scores_are_means_over_images_with_something_to_grasp():
     assert (nothing.images, nothing.label_quality, nothing.precision) == (0, 0.0, 0.0)
 
 
+def test_a_network_that_sees_nothing_is_scored_too():
+    """After an epoch that diverged every quality may be 0 in single precision."""
+
+    class Blind(Always):
+        def forward(self, x: torch.Tensor, centres: bool = False):
+            quality, angle, width = super().forward(x, centres)
+            return 0 * quality, angle, width
+
+    scores = score_labels(Blind(), [labelled((4, 10, 12, 0.9, 0.05))])
+    assert (scores.images, scores.label_quality, scores.precision) == (1, 0.0, 0.0)
+
+
 def test_one_image_with_something_to_grasp_is_enough():
     poor = labelled((4, 10, 12, 0.5, 0.05))
     check_graspable([poor, labelled((4, 10, 12, 0.9, 0.05))])

@@ -229,6 +229,34 @@ def test_updates_learn_what_pays():
     assert errors[0] > 0.3 and np.median(errors[-30:]) < errors[0] / 3
 
 
+@pytest.mark.parametrize(("start", "entropy_coef"), [(2, 0), (-5, 10)])
+def test_exploration_leaves_its_limits_again(start, entropy_coef):
+    """Noise that costs falls from the upper limit; entropy that pays rises from the lower one."""
+    ppo = ppo_of("rl.lr=0.01", f"rl.initial_log_std={start}", f"rl.entropy_coef={entropy_coef}")
+    for number in range(20):
+        rollout = rollout_of(ppo, seed=number)
+        rollout.rewards = -(rollout.latents[..., 0].double().numpy() ** 2)
+        ppo.update(rollout)
+    assert -4.9 < ppo.network.log_std.item() < 1.9
+
+
+@pytest.mark.parametrize(("start", "sign"), [(2, 1), (-5, -1)])
+def test_exploration_stays_within_its_limits(start, sign):
+    ppo = ppo_of("rl.lr=0.01", f"rl.initial_log_std={start}")
+    ppo.gradient = lambda loss: ppo.weights.grad.fill_(-sign).sum().item()  # towards the limit
+    ppo.weights.grad = torch.zeros_like(ppo.weights)
+    ppo.update(rollout_of(ppo))
+    assert ppo.network.log_std.item() == start
+
+
+def test_a_seed_gives_an_order_of_minibatches():
+    parts = ppo_of().network, COUNTED, ppo_of().settings
+    first, again, other = (GraspPPO(*parts, seed=seed) for seed in (3, 3, 4))
+    order = torch.randperm(100, generator=first.generator)
+    assert torch.equal(order, torch.randperm(100, generator=again.generator))
+    assert not torch.equal(order, torch.randperm(100, generator=other.generator))
+
+
 def test_a_resumed_training_is_the_same_bit_for_bit(tmp_path, config):
     straight = ppo_of()
     rows = [straight.update(rollout_of(straight, seed=k), k / 4) for k in range(2)]

@@ -232,6 +232,31 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch
     assert (copy / "last.pt").read_bytes() == (finished / "last.pt").read_bytes()
 
 
+def test_resuming_keeps_the_curves_up_to_its_checkpoint(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    assert train_rl.main([*POINT, "--resume", str(run)]) == 0
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("evaluation/return")] == [0, 64, 128, 192]
+    assert events.Scalars("update/loss")[-1].step == 192
+
+
+def test_an_environment_without_pictures_is_told_of_before_the_training(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="rl.films: .*QuickPoint-v0 draws no pictures"):
+        train_rl.main([*POINT, "rl.films=1"])
+    assert not Path("runs").exists()
+
+
+def test_an_error_before_the_first_checkpoint_names_none(tmp_path, monkeypatch):
+    """Six evaluation episodes: the third of a process has a reward that is no number."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="not finite.*nothing was saved before"):
+        train_rl.main([*POINT, "rl.env_kwargs=trouble=reward", "rl.evaluation_episodes=20"])
+    (run,) = Path("runs/train_rl").iterdir()
+    assert not (run / "last.pt").exists()
+
+
 def test_what_cannot_be_resumed(finished, tmp_path):
     for changes in (["rl.lr=0.1"], ["seed=9"], ["env.max_steps=5"]):
         with pytest.raises(UserError, match="only .*rl.name.* may differ"):

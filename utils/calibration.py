@@ -41,7 +41,7 @@ DOUBT_SPREAD = 2.0  # and of doubts
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 _LONGEST = 700.0  # logarithm of a number that floats hold
 _HALVINGS = 60
-_ROUNDING = 1e-6  # by which a score of 1 may come back from its chance
+ROUNDING = 1e-6  # by which a score of 1 may come back from its chance
 BINS = 10  # of equal width in [0, 1]
 
 
@@ -148,7 +148,7 @@ class _Sample(NamedTuple):
         scores, won = np.asarray(scores, dtype=float), np.asarray(successes, dtype=bool)
         if scores.size == 0 or not np.isfinite(scores).all():
             raise ValueError("a fit needs at least one grasp, and scores that are finite numbers")
-        if bounded and scores.max() > 1.0 + _ROUNDING:
+        if bounded and scores.max() > 1.0 + ROUNDING:
             raise ValueError(f"a score is {scores.max():g}: give bounded=False where some exceed 1")
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
         rough, after_failure = 1000 * np.asarray(roughness, float), np.asarray(failed, float)
