@@ -49,6 +49,7 @@ __all__ = [
 ]
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
+BOUNDS = ("action_low", "action_high")  # of an action space, perhaps infinite
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
@@ -165,8 +166,8 @@ class GraspPolicyNetwork(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), initial_log_std))
         self.critic = layers([seen + privileged_dim, *widths], kind)
         self.value_head = initialised(nn.Linear(hidden_dim, 1), 1.0)
-        self.register_buffer("action_low", torch.full((action_dim,), -1.0))
-        self.register_buffer("action_high", torch.full((action_dim,), 1.0))
+        for name, bound in zip(BOUNDS, (-1.0, 1.0)):
+            self.register_buffer(name, torch.full((action_dim,), bound))
 
     def forward(self, image: torch.Tensor | None, state: torch.Tensor) -> ActionDistribution:
         """The policy. image: (B, C, H, W), colours in 0..1 and depth in metres, or None without
@@ -400,7 +401,7 @@ def load_initial(network: GraspPolicyNetwork, layout: ObservationLayout, path: P
             f"rl.initial {path}: its policy sees {_listed(seen)}, this one {_listed(layout)}; set "
             "rl.policy_observations and its like as in its training, or rl.initial=null"
         )
-    own = {"action_low": network.action_low.clone(), "action_high": network.action_high.clone()}
+    own = {name: getattr(network, name).clone() for name in BOUNDS}
     weights = checkpoint["model"] | own
     if not all(bool(weights[name].isfinite().all()) for name in weights.keys() - own.keys()):
         raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
@@ -434,7 +435,7 @@ class SavedPolicy(NamedTuple):
 def load_policy(path: Path | str) -> SavedPolicy:
     """The policy of a checkpoint that `GraspPPO.save` wrote, on the CPU. Raises UserError."""
     checkpoint = load_checkpoint(path, KIND)
-    network = build_model(GraspPolicyNetwork, checkpoint, path)
+    network = build_model(GraspPolicyNetwork, checkpoint, path, BOUNDS)
     extra = checkpoint["extra"]
     with reading(path):
         layout = ObservationLayout.from_plain(extra["layout"])

@@ -250,6 +250,21 @@ def test_a_policy_in_half_precision_acts_nearly_the_same(tmp_path):
     np.testing.assert_allclose(*np.swapaxes(actions, 0, 1), atol=0.01)
 
 
+@pytest.mark.parametrize("high", [2.0, math.inf, math.nan])
+def test_a_policy_of_actions_without_bounds_is_read_again(tmp_path, high):
+    space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    config = load_config(None, ["rl.hidden_dim=16", "rl.squash=false"])
+    ppo = make_ppo(spaces.Box(-1.0, 1.0, (3,)), space, config)
+    ppo.network.action_high.fill_(high)
+    ppo.save(tmp_path / "policy.pt")
+    if math.isnan(high):
+        with pytest.raises(UserError, match="not finite"):
+            load_policy(tmp_path / "policy.pt")
+    else:
+        action = load_policy(tmp_path / "policy.pt").network.action(torch.full((1, 2), 50.0))
+        assert (action == min(high, 50.0)).all()
+
+
 SEEN = spaces.Dict({name: spaces.Box(-1, 1, (2,)) for name in ("place", "speed")})
 
 

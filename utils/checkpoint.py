@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -121,8 +121,15 @@ def load_checkpoint(
     return content
 
 
-def build_model(make: Callable[..., Model], checkpoint: dict[str, Any], path: Path | str) -> Model:
+def build_model(
+    make: Callable[..., Model],
+    checkpoint: dict[str, Any],
+    path: Path | str,
+    bounds: Collection[str] = (),
+) -> Model:
     """Build the model of a checkpoint's arguments, with its weights, in evaluation mode.
+
+    bounds: names of what may be infinite.
 
     Nothing is allocated before the shapes have been compared: a few numbers in a file may ask for
     any amount of memory. Raises UserError, naming `path`, where they do not fit, and for weights
@@ -141,7 +148,9 @@ def build_model(make: Callable[..., Model], checkpoint: dict[str, Any], path: Pa
     _check_fit(planned, stored, path)
     model = make(**arguments)
     load_weights(model, checkpoint, path)
-    if not all(bool(torch.isfinite(value).all()) for value in model.state_dict().values()):
+    weights = model.state_dict()
+    finite = [torch.isfinite(v) | (torch.isinf(v) & (k in bounds)) for k, v in weights.items()]
+    if not all(bool(each.all()) for each in finite):
         raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
     return model.eval()
 
