@@ -104,6 +104,13 @@ def test_the_largest_number_of_16_bits_is_unknown_in_every_file(tmp_path, name):
     np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("largest", [300, 4095, 10000, 65535])
+def test_depth_in_a_pgm_is_not_stretched_to_its_largest_value(tmp_path, largest):
+    millimetres = np.array([[0, 1, 299], [256, 17, 300]], ">u2")
+    (tmp_path / "depth.pgm").write_bytes(b"P5\n3 2\n%d\n" % largest + millimetres.tobytes())
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.pgm"), millimetres / 1000, rtol=1e-6)
+
+
 def test_a_length_of_65535_is_known_where_numbers_have_more_bits(tmp_path):
     np.save(tmp_path / "depth.npy", np.full((2, 3), 65535, np.int32))
     np.testing.assert_allclose(read_depth(tmp_path / "depth.npy", 1e-5), 0.65535)

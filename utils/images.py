@@ -179,9 +179,13 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
 
 def _depth_values(path: Path) -> np.ndarray:
     image = open_image(path)
-    values = np.asarray(image)
-    # Pillow reads the 16 bits of a PGM as 32.
-    return values.astype(np.uint16) if (image.format, image.mode) == ("PPM", "I") else values
+    if (image.format, image.mode) == ("PPM", "I"):
+        # Pillow stretches the 16 bits of a PGM to its largest value, and reads them as 32.
+        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if values is None:
+            raise UserError(f"{path}: a PGM that OpenCV cannot read; write a PNG")
+        return values
+    return np.asarray(image)
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
