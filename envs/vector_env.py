@@ -243,6 +243,7 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
             raise no_pictures from error
         raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
+        env.close()
         raise no_pictures
     seen = settings.policy_observations, settings.privileged_observations
     wanted = [name for names in (*seen, settings.estimated_observations) for name in names or ()]
