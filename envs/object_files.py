@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -175,7 +176,7 @@ def _resolve_mesh(filename: str, urdf: Path) -> str:
         inside = Path(filename.removeprefix("package://"))
         for base in urdf.resolve().parents:
             for candidate in (base / inside, base / Path(*inside.parts[1:])):
-                if candidate.is_file():
+                if os.path.isfile(candidate):  # which says no where the name is too long
                     return str(candidate)
     return str(urdf.parent / filename.removeprefix("file://"))
 
@@ -207,17 +208,18 @@ def _read_urdf(path: Path) -> ObjectSource:
         if not 0 <= friction < math.inf:
             raise ValueError(f"its lateral_friction is {friction}")
         inertial = _inertial(robot)
+        shown = [(link, item) for link in robot.robot.links for item in link.visuals]
+        color, single = _urdf_color(shown, robot), _single_visual(shown, robot, path)
     except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
         raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
     if len(mesh.faces) == 0:
         raise ObjectError(f"URDF {path} has neither collision nor visual geometry; add some")
-    shown = [(link, item) for link in robot.robot.links for item in link.visuals]
     return ObjectSource(
         mesh=checked_mesh(mesh, str(path)),
         friction=friction,
         inertial=inertial,
-        color=_urdf_color(shown, robot),
-        visual=_single_visual(shown, robot, path),
+        color=color,
+        visual=single,
         visual_mesh=visual if len(visual.faces) else mesh,
     )
 
@@ -255,21 +257,27 @@ def combined(stated: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> Inertial
 
 
 def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:
+    """Raises ValueError for a colour that is not four numbers."""
     named = {material.name: material for material in robot.robot.materials}
     for _, item in shown:
         material = item.material and named.get(item.material.name, item.material)
         color = (item.material and item.material.color) or (material and material.color)
         if color is not None:
+            if len(color.rgba) != 4 or not np.isfinite(color.rgba).all():
+                raise ValueError(f"the colour of a visual is {color.rgba}, expected four numbers")
             return tuple(float(c) for c in color.rgba)
     return None
 
 
 def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
+    """Raises ValueError for a scale that is neither one number nor three."""
     if len(shown) != 1 or shown[0][1].geometry.mesh is None:
         return None
     link, item = shown[0]
     file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
     scale = item.geometry.mesh.scale
+    if np.size(scale) not in (1, 3) or not (scale is None or np.isfinite(scale).all()):
+        raise ValueError(f"the scale of its visual mesh is {scale}, expected one number or three")
     scale = np.broadcast_to(1.0 if scale is None else scale, 3)
     origin = np.eye(4) if item.origin is None else item.origin
     return file, scale, robot.get_transform(link.name) @ origin

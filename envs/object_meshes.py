@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import struct
 import zipfile
 import zlib
@@ -65,7 +66,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     Raises ObjectError for a file that is missing, unreadable, empty, flat or non-finite.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # which says no where the name is too long, too
         raise ObjectError(f"mesh {path} does not exist")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"mesh {path} is none of {', '.join(MESH_SUFFIXES)}; convert it")

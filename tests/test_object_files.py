@@ -8,6 +8,7 @@ from PIL import Image
 from envs.object_bodies import load_object
 from envs.object_files import read_object
 from envs.object_meshes import ObjectError, surface_colour
+from envs.objects import load_object_set
 
 MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
 <mesh filename="mesh/box.obj"/></geometry></collision></link></robot>"""
@@ -27,6 +28,33 @@ def test_a_bad_urdf_is_named(tmp_path, content, message):
     path.write_text(content)
     with pytest.raises(ObjectError, match=message):
         read_object(path)
+
+
+COLOUR = '<material name="m"><color rgba="1 0 0"/></material>'
+
+
+@pytest.mark.parametrize(
+    ("mesh", "material", "message"),
+    [
+        ('filename="box.obj" scale="1 1"', "", r"bad.urdf .* its visual mesh is \[1. 1.\]"),
+        ('filename="box.obj"', COLOUR, r"bad.urdf .* colour of a visual is \[1. 0. 0.\]"),
+        (f'filename="{300 * "b"}.obj"', "", "b.obj does not exist"),
+        (f'filename="package://{300 * "b"}/other.obj"', "", "other.obj does not exist"),
+    ],
+)
+def test_a_bad_visual_is_named_and_can_be_skipped(tmp_path, mesh, material, message):
+    write_textured(tmp_path)  # whose picture spares yourdfpy the colour
+    (tmp_path / "bad.urdf").write_text(
+        '<robot name="r"><link name="l"><collision><geometry><box size="0.04 0.05 0.06"/>'
+        f"</geometry></collision><visual><geometry><mesh {mesh}/></geometry>{material}</visual>"
+        "</link></robot>"
+    )
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
+    with pytest.raises(ObjectError, match=message):
+        read_object(tmp_path / "bad.urdf")
+    objects = load_object_set(str(tmp_path), cache_dir=tmp_path / "cache", skip_broken=True)
+    with pytest.warns(UserWarning, match=message):
+        assert objects[0].name != "bad"
 
 
 def test_a_urdf_with_collision_geometry_alone_is_shown_by_it(tmp_path):
