@@ -42,6 +42,9 @@ _PARKED = (0.0, 0.0, -10.0)  # m in W, where an object is that is not on the tab
 # MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
 # fingers: with nothing on these here, the object's own coefficient counts in both.
 NO_FRICTION = 1e-5
+# Of an object's friction on bin, palm and arm: Bullet's coefficient where none is stated, which is
+# theirs there, and by which Bullet multiplies the object's.
+OF_OTHER_BODIES = 0.5
 ROLLING = 1e-4  # m, MuJoCo's default
 # s, in which a contact gets rid of a penetration. MuJoCo's default, 20 ms, is so soft that objects
 # of 30 g creep and turn in a grip of 10 N (by 1.6 mm in half a second, with this by 0.5 mm).

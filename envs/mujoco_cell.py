@@ -1,14 +1,15 @@
 """The robot cell in MuJoCo: the same scenes, cameras and robot as in PyBullet, other physics.
 
 `scene_spec` writes MuJoCo's model of table, bin, objects and Panda, placed as in PyBullet's cell;
-`MujocoCell` runs it. Sizes, masses, inertias, and friction with table and fingers are PyBullet's;
-contacts are MuJoCo's own (between two objects MuJoCo takes the larger coefficient, PyBullet the
-product).
+`MujocoCell` runs it. Sizes, masses, inertias, and friction of objects with all else are PyBullet's;
+contacts are MuJoCo's own. Between two objects MuJoCo takes the larger coefficient of two, PyBullet
+the product: they agree where both objects have the same.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,7 @@ from envs.floating_hand import park
 from envs.mujoco_bodies import (
     CONTACT_TIME,
     NO_FRICTION,
+    OF_OTHER_BODIES,
     ROLLING,
     SUBSTEPS,
     add_board,
@@ -54,6 +56,8 @@ from utils.transforms import pose_matrix, position_quaternion
 if TYPE_CHECKING:
     import mujoco
 
+_OBJECT = re.compile(r"object\d+")  # names of the objects' bodies
+
 
 def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujoco.MjSpec:
     """A model of Panda, table, bin and the scene's objects at their resting poses, with a camera.
@@ -81,29 +85,36 @@ def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujo
 
 
 def _add_pairs(spec: mujoco.MjSpec, count: int) -> None:
-    """Give the contacts of the objects with table and fingers parameters of their own.
+    """Give the contacts of the objects with table, bin and robot parameters of their own.
 
-    Sliding and rolling friction are those that MuJoCo would take from the two shapes. Torsional
-    friction, a fourth dimension of a contact, is the fingertips' alone, as in PyBullet.
+    Sliding friction is the object's on table and fingertips, and `OF_OTHER_BODIES` times that on
+    bin, palm and arm, as in PyBullet. What is left to the shape is contact with other objects: it
+    gets the square of the object's coefficient. Rolling friction is what MuJoCo would take from the two
+    shapes. Torsional friction, a fourth dimension of a contact, is the fingertips' alone.
     `envs.mujoco_randomization` changes all of them.
     """
+    own = ("table", *FINGERS)
     touched = [
-        (geom, FINGER_SURFACE.spinning if name in FINGERS else 0.0)
-        for name in ("table", *FINGERS)
-        for geom in spec.body(name).geoms
+        (geom, 1.0 if body.name in own else OF_OTHER_BODIES,
+         FINGER_SURFACE.spinning if body.name in FINGERS else 0.0)
+        for body in spec.bodies
+        if not _OBJECT.fullmatch(body.name)
+        for geom in body.geoms
         if geom.contype
-    ]
-    for number, (geom, _) in enumerate(touched):
+    ]  # fmt: skip
+    for number, (geom, _, _) in enumerate(touched):
         geom.name = geom.name or f"touched{number}"
     for i in range(count):
         for number, shape in enumerate(spec.body(f"object{i}").geoms):
             shape.name = f"object{i}_{number}"
-            for other, patch in touched:
-                sliding, _, rolling = np.maximum(shape.friction, other.friction)
+            for other, share, patch in touched:
+                sliding = share * shape.friction[0]
+                rolling = max(shape.friction[2], other.friction[2])
                 pair = spec.add_pair(geomname1=shape.name, geomname2=other.name)
                 pair.friction = [sliding, sliding, patch * sliding, rolling, rolling]
                 pair.condim = max(shape.condim, 4 if patch else 3)
                 pair.solref, pair.solimp = shape.solref, shape.solimp
+            shape.friction[0] **= 2
 
 
 class MujocoCell(Cell):

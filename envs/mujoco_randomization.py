@@ -6,7 +6,7 @@ parameter changes, beside PyBullet's cell (`envs.pybullet_randomization`):
 | parameter | in MuJoCo's model |
 |---|---|
 | object_mass | mass and inertia of the object, and the constants that follow from them |
-| object_friction | sliding friction of the object in every contact |
+| object_friction | sliding friction of the object in every contact, squared between objects |
 | rolling_friction | rolling friction, m, of the object in every contact; none if it is 0 |
 | spinning_friction | torque over friction force, m, in contacts of objects with the fingertips |
 | table_friction, finger_friction | 1 nominally; multiplies the object's sliding friction there |
@@ -20,8 +20,9 @@ parameter changes, beside PyBullet's cell (`envs.pybullet_randomization`):
 | latency | s, in whole physics steps, until a motor command arrives |
 
 MuJoCo would take the larger friction of two shapes that touch. `envs.mujoco_cell` therefore gives
-each contact of an object with the table or a finger parameters of its own (a contact pair), in
-which this module multiplies as Bullet does. Contacts between two objects keep MuJoCo's rule.
+each contact of an object with table, bin and robot parameters of its own (a contact pair), in which
+this module multiplies as Bullet does. Contacts between two objects keep MuJoCo's rule, for squares
+of the coefficients: for equal ones that is Bullet's product.
 
 Bullet's contact stiffness is in N/m. MuJoCo's is per effective mass of the contact, so that a
 factor means the same in both simulators, and a value that is added or set does not. A contact here
@@ -37,7 +38,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import brentq
 
-from envs.mujoco_bodies import wake
+from envs.mujoco_bodies import OF_OTHER_BODIES, wake
 from envs.mujoco_panda import ARM_JOINTS, FINGERS, MujocoPanda, load_mujoco
 from envs.panda_model import FINGER_SURFACE
 from utils.config_types import Change, changed_in
@@ -83,6 +84,9 @@ class MujocoRandomizable:
         ends = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
         self._with_table = (ends == table).any(axis=1)
         self._with_fingers = np.isin(ends, fingers).any(axis=1)
+        # Of the object's friction that a pair has, see `envs.mujoco_cell`.
+        own = self._with_table | self._with_fingers
+        self._shares = np.where(own, 1.0, OF_OTHER_BODIES)
         self._pair_dim = np.where(self._with_fingers, _TURNS, _SLIDES)  # without rolling friction
         self._pairs_of = [(ends == body).any(axis=1) for body in self._bodies]
         self._shapes_of = [model.geom_bodyid == body for body in self._bodies]
@@ -141,13 +145,16 @@ class MujocoRandomizable:
     def _change_friction(self, changes: Mapping[str, Change]) -> None:
         model = self._model
         for i, (shapes, pairs) in enumerate(zip(self._shapes_of, self._pairs_of)):
-            for friction, dimensions, plain, rows, sliding, rolling in (
-                (model.geom_friction, model.geom_condim, _SLIDES, shapes, slice(0, 1), slice(2, 3)),
-                (model.pair_friction, model.pair_dim, self._pair_dim[pairs], pairs, _SLIDING,
-                 _ROLLING),
-            ):  # fmt: skip
-                nominal = friction[rows, sliding]
-                friction[rows, sliding] = changed_in(changes, "object_friction", nominal, i)
+            sliding = np.sqrt(model.geom_friction[shapes, 0])  # against another object: squared
+            model.geom_friction[shapes, 0] = changed_in(changes, "object_friction", sliding, i) ** 2
+            share = self._shares[pairs, None]
+            sliding = model.pair_friction[pairs, _SLIDING] / share
+            sliding = changed_in(changes, "object_friction", sliding, i)
+            model.pair_friction[pairs, _SLIDING] = share * sliding
+            for friction, dimensions, plain, rows, rolling in (
+                (model.geom_friction, model.geom_condim, _SLIDES, shapes, slice(2, 3)),
+                (model.pair_friction, model.pair_dim, self._pair_dim[pairs], pairs, _ROLLING),
+            ):
                 first = np.flatnonzero(rows)[0]  # all of an object's have the same
                 rolls = dimensions[first] == _ROLLS
                 length = float(friction[first, rolling.start]) if rolls else 0.0

@@ -13,11 +13,15 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from envs.cell import Cell, not_randomizable, require_arm
 from envs.cell_layout import Box, LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError, unknown_choice
+
+_STREAM = 13  # keeps the seed of a scene's randomisation apart from what else its seed draws
 
 
 @dataclass(frozen=True)
@@ -82,9 +86,15 @@ def make_cell(config: Config, gui: bool = False) -> Cell:
     cell = cell_class(config.simulator)(config, gui=gui)
     if config.evaluate.randomise:
         randomizer = DomainRandomizer(cell, config.randomization)
-        cell.on_build = lambda cell: randomizer.randomize(cell.scene.seed)
+        cell.on_build = lambda cell: randomizer.randomize(_seed_of_sample(cell.scene.seed))
         cell.on_action = randomizer.act
     return cell
+
+
+def _seed_of_sample(scene_seed: int) -> int:
+    """A seed apart from the scene's: with that itself, colours would be the numbers that placed an
+    isolated object, and a policy could see from them where it is."""
+    return int(np.random.default_rng([scene_seed, _STREAM]).integers(2**31))
 
 
 def make_layout_table(

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 
 import numpy as np
+import pybullet
 import pytest
 
 from envs.cell import PhysicsError
@@ -26,6 +27,40 @@ def test_settled_objects_stay_where_pybullet_has_them(cells, pile):
     for index in cells[1].remaining:
         off = cells[0].object_position(index) - cells[1].object_position(index)
         assert np.linalg.norm(off) < 0.003
+
+
+def test_frictions_are_pybullets(cells, pile):
+    """Bullet multiplies the coefficients of two bodies, which it tells itself. The pile's objects
+    have the same one, so that MuJoCo's larger of two squares is their product."""
+    bullet, mujoco = cells
+    for cell in cells:
+        cell.load(pile)
+
+    def coefficient(body: int, link: int = -1) -> float:
+        return pybullet.getDynamicsInfo(body, link, physicsClientId=bullet.client)[1]
+
+    robot = bullet.robot.body
+    links = pybullet.getNumJoints(robot, physicsClientId=bullet.client)
+    theirs = {"panda_link0": coefficient(robot), "table": coefficient(bullet.table)}
+    theirs |= {f"bin{i}": coefficient(wall) for i, wall in enumerate(bullet.bin)}
+    for link in range(links):
+        name = pybullet.getJointInfo(robot, link, physicsClientId=bullet.client)[12].decode()
+        theirs[name] = coefficient(robot, link)
+    theirs["panda_hand"] = theirs["panda_link7"]  # one body in Bullet
+
+    model = mujoco.robot.model
+    found = set()
+    for pair, ends in enumerate(zip(model.pair_geom1, model.pair_geom2)):
+        thing, other = sorted(model.geom_bodyid[list(ends)], key=mujoco.bodies.count, reverse=True)
+        expected = theirs[model.body(other).name]
+        expected *= coefficient(bullet.bodies[mujoco.bodies.index(thing)])
+        assert model.pair_friction[pair, :2] == pytest.approx(expected), model.body(other).name
+        found.add(model.body(other).name)
+    assert found == theirs.keys() & {model.body(i).name for i in model.geom_bodyid}
+    own = [coefficient(body) for body in bullet.bodies]
+    assert own == own[:1] * len(own)
+    squares = model.geom_friction[np.isin(model.geom_bodyid, mujoco.bodies), 0]
+    assert squares == pytest.approx(own[0] ** 2)
 
 
 def test_what_leans_on_a_retired_object_wakes_and_falls(config, box_set):

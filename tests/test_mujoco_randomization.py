@@ -169,6 +169,21 @@ def test_rolling_friction_in_every_contact_of_an_object(
     assert {*model.pair_dim, *model.geom_condim[shapes]} == ({6} if own else {3, 4})
 
 
+@pytest.mark.parametrize("change", [("scale", [0.5]), ("set", [0.25]), ("add", [-0.25])])
+def test_friction_of_an_object_changes_in_every_contact(cell, change):
+    """The cube's is 0.5 and becomes 0.25: half of that on bin, palm and arm, its square on another
+    cube."""
+    model = cell.robot.model
+    scene = apply(cell, object_friction=change)
+    whole = {"table", "panda_leftfinger", "panda_rightfinger"}
+    for pair, ends in enumerate(zip(model.pair_geom1, model.pair_geom2)):
+        names = {model.body(model.geom_bodyid[end]).name for end in ends}
+        expected = 0.25 if names & whole else 0.125
+        assert model.pair_friction[pair, :2] == pytest.approx(expected), names
+    assert model.geom_friction[model.geom_bodyid == cell.bodies[0], 0] == pytest.approx(0.0625)
+    scene.apply({})
+
+
 def test_spinning_friction_brakes_what_turns_between_the_fingers(cell):
     """The model's own numbers: torsional friction of pairs with fingers, not with the table."""
     model = cell.robot.model
@@ -281,7 +296,9 @@ def test_contact_stiffness_and_damping_of_the_fingertips(cell):
     model = cell.robot.model
     apply(cell, contact_stiffness=("scale", 0.5), contact_damping=("scale", 1.5))
     changed = model.pair_solref[model.pair_solref[:, 0] < 0]
-    assert len(changed) == len(model.pair_solref) - 1  # all but the cube's with the table
+    ends = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
+    fingers = [model.body(name).id for name in ("panda_leftfinger", "panda_rightfinger")]
+    assert len(changed) == np.isin(ends, fingers).any(axis=1).sum() == 2
     np.testing.assert_allclose(changed, np.tile([-20000.0, -600.0], (len(changed), 1)))
     apply(cell, contact_stiffness=("scale", 1.0), contact_damping=("scale", 1.0))
     assert (model.pair_solref == [0.005, 1.0]).all()

@@ -175,12 +175,13 @@ ACTIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (12, 5))
 
 
 def test_an_evaluated_policy_s_actions_get_the_bias_and_noise_of_the_sample():
-    """Action + bias + noise by hand: NumPy's normal numbers of (the scene's seed, 3, turn)."""
+    """Action + bias + noise by hand: NumPy's normal numbers of (the sample's seed, 3, turn)."""
     with randomised(
         BIAS + "0.1,0.1,uniform,set,episode", NOISE + "0.05,0.05,uniform,set,episode"
     ) as cell:
         sent, q = driven(cell, ACTIONS)
-        noise = [np.random.default_rng([0, 3, turn]).standard_normal(5) for turn in range(12)]
+        seed = cell.sample["seed"]
+        noise = [np.random.default_rng([seed, 3, turn]).standard_normal(5) for turn in range(12)]
         np.testing.assert_allclose(sent, ACTIONS + 0.1 + 0.05 * np.array(noise), atol=1e-12)
         again, q_again = driven(cell, ACTIONS)
         other, _ = driven(cell, ACTIONS, seed=1)
@@ -201,11 +202,11 @@ def test_randomised_actions_are_those_of_the_environment():
     changes = [NOISE + "0.05,0.05,uniform,set,episode", "env.max_steps=12"]
     with randomised(*changes) as cell:
         sent, _ = driven(cell, ACTIONS)
-        config = cell.config
+        config, seed = cell.config, cell.sample["seed"]
     settings = {"config": config, "control": "ee_planar", "observations": ("state",)}
     env = gymnasium.make("RandomizedGrasping-v0", **settings).unwrapped
     _, info = env.reset(options={"scene_seed": 0})
-    env.reset(options={"scene_seed": 0, "randomization": info["randomization"] | {"seed": 0}})
+    env.reset(options={"scene_seed": 0, "randomization": info["randomization"] | {"seed": seed}})
     reached, command = [], env._actions.command
     env._actions.command = lambda action, state: (
         reached.append(action.copy()),
