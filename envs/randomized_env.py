@@ -48,6 +48,8 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         options = dict(options or {})
         self._recorded = options.pop("randomization", None)
+        if self._recorded is not None:
+            self._states_left = 0  # a sample is put into effect as a scene is built
         observation, info = super().reset(seed=seed, options=options)
         return observation, info | {"randomization": self.randomizer.sample}
 

@@ -570,6 +570,15 @@ def test_an_episode_is_replayed_bit_for_bit(env):
     assert seeded == first
 
 
+def test_a_sample_that_is_given_counts_at_every_start(env):
+    """States for pretraining share a scene, and so a sample, unless another one is asked for."""
+    given = [env.reset(seed=seed)[1]["randomization"] for seed in (3, 4)]
+    assert given[0] != given[1]
+    for sample in given:
+        options = {"start": "pretraining", "randomization": sample}
+        assert env.reset(options=options)[1]["randomization"] == sample
+
+
 def test_a_line_on_disk_replays_an_episode_bit_for_bit(env, tmp_path, monkeypatch):
     monkeypatch.setattr(env.unwrapped, "journal", tmp_path / "env0.jsonl")
     first, info, last = episode(env, seed=4)
