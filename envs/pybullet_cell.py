@@ -31,6 +31,7 @@ from envs.pybullet_files import panda_meshes
 from envs.pybullet_panda import PybulletFloatingHand, PybulletHand, PybulletPanda
 from envs.pybullet_randomization import PybulletRandomizable
 from utils.config import Config
+from utils.errors import UserError
 from utils.transforms import position_quaternion
 
 # As SOLVER_RESIDUAL, while the robot touches nothing: a last correction of 1 mrad/s.
@@ -49,10 +50,15 @@ class PybulletCell(Cell):
         super().__init__(config)
         self.fine = fine
         self._gui = gui
-        self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        self.camera = PybulletCamera(self.client, load_renderer(self.client, config.sim.renderer))
         meshes = panda_meshes() if fine else None
         self._urdf = write_panda(config.cache_folder, self.gripper, fine, meshes, self.has_arm)
+        self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+        try:
+            renderer = load_renderer(self.client, config.sim.renderer)
+        except UserError:
+            self.close()  # nobody else can
+            raise
+        self.camera = PybulletCamera(self.client, renderer)
 
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
         # Resetting states alone would leave the solver's memory behind (bullet3 #2442). A build

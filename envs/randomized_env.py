@@ -15,6 +15,7 @@ import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
 from utils.domain_randomization import DomainRandomizer
+from utils.errors import UserError
 
 
 class RandomizedGraspingEnv(RobotGraspingEnv):
@@ -31,7 +32,11 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.randomizer = DomainRandomizer(self.cell, self.config.randomization)
+        try:
+            self.randomizer = DomainRandomizer(self.cell, self.config.randomization)
+        except UserError:
+            self.close()  # nobody else can
+            raise
         self._recorded: Mapping[str, Any] | None = None
         self.journal: Path | None = None
         self.cell.on_build = self._randomize

@@ -85,7 +85,11 @@ def make_cell(config: Config, gui: bool = False) -> Cell:
     check_simulator(config)
     cell = cell_class(config.simulator)(config, gui=gui)
     if config.evaluate.randomise:
-        randomizer = DomainRandomizer(cell, config.randomization)
+        try:
+            randomizer = DomainRandomizer(cell, config.randomization)
+        except UserError:
+            cell.close()  # nobody else can
+            raise
         cell.on_build = lambda cell: randomizer.randomize(_seed_of_sample(cell.scene.seed))
         cell.on_action = randomizer.act
     return cell

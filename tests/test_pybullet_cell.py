@@ -10,9 +10,12 @@ import pybullet
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, PhysicsError
 from envs.pybullet_cell import PybulletCell
 from envs.pybullet_panda import FINGERS
+from envs.randomized_env import RandomizedGraspingEnv
 from envs.robot_kinematics import choose_posture, forward_kinematics, inverse_kinematics
+from envs.simulators import make_cell
 from tests.helpers.cubes import cube_grasp, cube_scene
-from utils.config import with_settings
+from utils.config import load_config, with_settings
+from utils.errors import UserError
 from utils.transforms import top_down_pose
 
 
@@ -129,3 +132,25 @@ def test_lost_objects_are_retired(cell, box_set):
         cell.bodies[0], [0.5, 0.0, -0.5], [0, 0, 0, 1], physicsClientId=cell.client
     )
     assert cell.retire_lost_objects() == [0] and not cell.remaining
+
+
+@pytest.mark.parametrize(
+    ("make", "override"),
+    [
+        (PybulletCell, "sim.renderer=egl"),
+        (make_cell, "randomization.texture_folder=nowhere"),
+        (
+            lambda config: RandomizedGraspingEnv(config=config),
+            "randomization.texture_folder=nowhere",
+        ),
+    ],
+)
+def test_what_is_refused_leaves_no_client_behind(monkeypatch, make, override):
+    monkeypatch.setattr("envs.pybullet_camera._egl_plugin", lambda: None)
+    clients = []
+    connect = pybullet.connect
+    monkeypatch.setattr(pybullet, "connect", lambda *a: clients.append(connect(*a)) or clients[-1])
+    config = load_config(None, ["evaluate.randomise=true", "sim.renderer=tiny", override])
+    with pytest.raises(UserError):
+        make(config)
+    assert clients and not any(map(pybullet.isConnected, clients))
