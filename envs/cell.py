@@ -124,10 +124,10 @@ class Cell(ABC):
     hand. has_arm: whether an arm carries it. robot, camera: see `envs.robot.Robot`, in whose place
     a cell without an arm has an `envs.floating_hand.FloatingHand`, and `envs.cell.Camera`. bodies:
     the simulator's numbers of the objects. remaining: numbers of the objects still in the round.
-    steps, frames: taken since the scene was built. Callbacks, each called with the cell: on_build
-    when a scene has been built and nothing has moved yet, before_step before every physics step (to
-    disturb the objects), on_step after it (to film). view: changes what cameras see; None changes
-    nothing.
+    steps, frames, observations: taken since the scene was built; planners see frames, policies
+    observations. Callbacks, each called with the cell: on_build when a scene has been built and
+    nothing has moved yet, before_step before every physics step (to disturb the objects), on_step
+    after it (to film). view: changes what cameras see; None changes nothing.
     sample: the randomisation drawn for this scene alone (`utils.domain_randomization`), None for a
     nominal cell. on_action: changes each action of a policy that moves the hand step by step; None
     leaves it as it is. taught: (4, 4) T_CE that `envs.scenarios.teach` has measured with this
@@ -159,7 +159,7 @@ class Cell(ABC):
         self.has_arm = config.robot.arm != "none"
         self.scene: Scene | None = None
         self.remaining: set[int] = set()
-        self.steps = self.frames = 0
+        self.steps = self.frames = self.observations = 0
         self.on_build: Callable[[Any], object] | None = None
         self.before_step: Callable[[Any], None] | None = None
         self.on_step: Callable[[Any], None] | None = None
@@ -192,7 +192,7 @@ class Cell(ABC):
         self.scene = scene
         self._build(scene, board, T_WO)
         self.remaining = set(range(len(self.bodies)))
-        self.steps = self.frames = 0
+        self.steps = self.frames = self.observations = 0
         if self.on_build is not None:
             self.on_build(self)
 

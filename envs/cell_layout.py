@@ -39,10 +39,15 @@ BIN_COLOUR = (0.25, 0.35, 0.45, 1.0)
 WALL_COLOUR = (0.8, 0.8, 0.8, 1.0)
 
 REST_SPEED = 0.01  # m/s or (times 10) rad/s under which an object counts as resting
-REST_CHECK_STEPS = 12  # physics steps between two checks of whether objects rest
+_REST_CHECK_SECONDS = 0.05  # between two checks of whether objects rest
 # In a row, after which they certainly do: 0.2 s, in which a body that topples gets ten times as
 # fast, and one that rocks has not only turned round.
 CERTAIN_REST_CHECKS = 5
+
+
+def rest_check_steps(frequency: float) -> int:
+    """Physics steps between two checks of whether objects rest. frequency: of them, Hz."""
+    return max(1, round(_REST_CHECK_SECONDS * frequency))
 
 
 class Box(NamedTuple):

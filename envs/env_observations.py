@@ -85,7 +85,6 @@ class Observer:
         placements = self._cell.scene.placements
         self.outlines = [Outline(placement.model.parts) for placement in placements]
         self.goals = self._find_goals() if self._with_goals else None
-        self._frames = 0
 
     def _find_goals(self) -> GraspGoals:
         return GraspGoals(self._cell.truth(), self._cell.object_pose(0), self._cell.gripper)
@@ -157,15 +156,15 @@ class Observer:
 
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) colours and (H, W, 1) metres. The depth noise is a function of the scene's seed
-        and the number of images since the scene began."""
+        and the number of images since the scene was built."""
         if self._wrist:
             T_WC = self.T_WE @ self._T_EC
         else:
             T_WC = self._cell.camera_pose(camera=self._camera)
         image = self._cell.image(self._intrinsics, T_WC)
         seed, stream = self._cell.scene.seed, NoiseStream.OBSERVATION
-        measure = seeded_noise(self._depth_noise, stream, seed, self._frames)
-        self._frames += 1
+        measure = seeded_noise(self._depth_noise, stream, seed, self._cell.observations)
+        self._cell.observations += 1
         return image.rgb, measure(image.depth, image.rgb)[..., None]
 
     def placeholder(self) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from envs.arm_paths import LIFT_MARGIN
 from envs.cell import Cell
-from envs.cell_layout import GRAVITY, REST_CHECK_STEPS, REST_SPEED, table_box
+from envs.cell_layout import GRAVITY, REST_SPEED, rest_check_steps, table_box
 from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers, holding_force
 from envs.floating_hand import FloatingHand, meets_box, park
 from utils.result_records import loose
@@ -191,7 +191,8 @@ def _remove(cell: Cell, index: int) -> None:
 
 def _let_rest(cell: Cell) -> None:
     """Wait until the objects rest, for at most scene.settle_seconds."""
-    for _ in range(int(cell.config.scene.settle_seconds / (REST_CHECK_STEPS * cell.dt))):
-        cell.step(REST_CHECK_STEPS)
+    steps = rest_check_steps(cell.config.sim.frequency)
+    for _ in range(int(cell.config.scene.settle_seconds / (steps * cell.dt))):
+        cell.step(steps)
         if all(cell.speed(index) < REST_SPEED for index in cell.remaining):
             return

@@ -17,13 +17,13 @@ from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
     CERTAIN_REST_CHECKS,
     GRAVITY,
-    REST_CHECK_STEPS,
     REST_SPEED,
     TABLE_COLOUR,
     WALL_COLOUR,
     Box,
     LayoutTable,
     ObjectModel,
+    rest_check_steps,
     table_box,
 )
 from envs.mujoco_panda import load_mujoco
@@ -90,9 +90,9 @@ def settle(
     steps. Rings and crosses rock for seconds on the edges of their pieces, and a single check would
     find them at rest where they turn round.
     """
-    found = 0
-    for _ in range(int(config.scene.settle_seconds * config.sim.frequency / REST_CHECK_STEPS)):
-        step(REST_CHECK_STEPS)
+    found, steps = 0, rest_check_steps(config.sim.frequency)
+    for _ in range(int(config.scene.settle_seconds * config.sim.frequency / steps)):
+        step(steps)
         found = found + 1 if all(_resting(data.qvel[at : at + 6]) for at in speeds) else 0
         if found == CERTAIN_REST_CHECKS:
             return True

@@ -21,7 +21,6 @@ from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
     BIN_COLOUR,
     GRAVITY,
-    REST_CHECK_STEPS,
     REST_SPEED,
     TABLE_COLOUR,
     WALL_COLOUR,
@@ -29,6 +28,7 @@ from envs.cell_layout import (
     LayoutTable,
     ObjectModel,
     bin_walls,
+    rest_check_steps,
     table_box,
 )
 from envs.object_files import FineVisual
@@ -271,14 +271,14 @@ def add_board(client: int, board: Board, T_WO: np.ndarray) -> int:
 def settle(client: int, bodies: Sequence[int], config: Config, checks: int = 1) -> bool:
     """Step until the bodies rest; False if they still move after scene.settle_seconds.
 
-    checks: how many times in a row, REST_CHECK_STEPS apart, they must be found at rest. A single
+    checks: how many times in a row, `rest_check_steps` apart, they must be found at rest. A single
     check cannot tell a body that rests from one that begins to topple or turns round at the top of
     a bounce.
     """
-    found = 0
+    found, steps = 0, rest_check_steps(config.sim.frequency)
     for step in range(int(config.scene.settle_seconds * config.sim.frequency)):
         pybullet.stepSimulation(physicsClientId=client)
-        if step % REST_CHECK_STEPS == REST_CHECK_STEPS - 1:
+        if step % steps == steps - 1:
             found = found + 1 if all(_resting(client, body) for body in bodies) else 0
             if found == checks:
                 return True

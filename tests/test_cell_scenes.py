@@ -246,6 +246,19 @@ def test_a_cube_on_a_table(box_set, laid_out):
         np.testing.assert_allclose(table.pose(other)[0], [0.5, 0.0, 0.03], atol=1e-3)
 
 
+@pytest.mark.parametrize("frequency", [240, 2000])
+def test_rest_is_looked_for_after_a_time_and_not_a_number_of_steps(box_set, frequency):
+    """Within the 0.05 s up to the first look a cube falls freely, by g t^2 / 2 and at most half a
+    step's way more (Bullet's steps are symplectic Euler's)."""
+    pytest.importorskip("pybullet")
+    config = load_config(None, [f"sim.frequency={frequency}"])
+    with make_layout_table(config, [box_set[0]]) as table:
+        cube = table.put(box_set[0], np.array([0.5, 0.0, 1.0]), np.array([0, 0, 0, 1.0]))
+        assert table.settle([])
+        fallen = 1.0 - table.pose(cube)[0][2]
+    assert fallen == pytest.approx(9.81 * 0.05**2 / 2, abs=1.1e-3)
+
+
 def test_one_layout_table_of_pybullet_at_a_time(config):
     pytest.importorskip("pybullet")
     config = with_settings(config, "scene", {"simulator": "pybullet"})

@@ -25,3 +25,11 @@ def test_a_body_that_turns_round_while_it_rocks_does_not_rest(rates, rested):
 
     assert settle(data, [0, 6], config, step) == rested
     assert not list(left)
+
+
+@pytest.mark.parametrize("frequency", [60, 240, 2000])
+def test_rest_is_counted_in_seconds(frequency):
+    """Five checks in a row, 0.05 s apart, however many steps that are."""
+    config, taken = load_config(None, [f"sim.frequency={frequency}"]), []
+    assert settle(SimpleNamespace(qvel=np.zeros(6)), [0], config, taken.append)
+    assert sum(taken) / frequency == pytest.approx(0.25)

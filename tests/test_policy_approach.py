@@ -44,6 +44,22 @@ def test_a_policy_sees_through_the_camera_that_it_was_trained_with():
         assert np.median(cell.frame().depth) < 0.7
 
 
+def test_noise_goes_on_in_a_second_attempt():
+    """A policy's second attempt in a scene sees other noise than the first, and the same scene
+    loaded again the same."""
+    config = load_config(None, ["sim.renderer=tiny", "env.camera=overhead",
+                                "camera.depth_noise=realsense"])  # fmt: skip
+    objects = load_object_set("box", cache_dir=config.cache_folder)
+    seen = []
+    with make_cell(config) as cell:
+        env = RobotGraspingEnv(config=config, cell=cell, observations=["depth"])
+        for attempts in (2, 1):
+            cell.load(make_scene("isolated", objects, 0, config))
+            seen += [env.take_over()[0]["depth"] for _ in range(attempts)]
+    first, second, again = seen
+    assert (first == again).all() and (first != second).mean() > 0.5
+
+
 @needs_pybullet  # where the policy has learned; on scenes laid out in MuJoCo it is less certain
 def test_the_policy_of_the_box_lifts_it(box):
     """200 of 200 in docs/ppo.md: by far not each in ten would fail by chance."""
