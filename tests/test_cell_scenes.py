@@ -247,11 +247,11 @@ def test_a_cube_on_a_table(box_set, laid_out):
 
 
 @pytest.mark.parametrize("frequency", [240, 2000])
-def test_rest_is_looked_for_after_a_time_and_not_a_number_of_steps(box_set, frequency):
+def test_rest_is_looked_for_after_a_time_and_not_a_number_of_steps(box_set, config, frequency):
     """Within the 0.05 s up to the first look a cube falls freely, by g t^2 / 2 and at most half a
     step's way more (Bullet's steps are symplectic Euler's)."""
     pytest.importorskip("pybullet")
-    config = load_config(None, [f"sim.frequency={frequency}"])
+    config = with_settings(config, "sim", {"frequency": frequency})
     with make_layout_table(config, [box_set[0]]) as table:
         cube = table.put(box_set[0], np.array([0.5, 0.0, 1.0]), np.array([0, 0, 0, 1.0]))
         assert table.settle([])
