@@ -221,6 +221,30 @@ def test_samples_of_another_scene_or_version_are_refused(cell):
         randomizer.replay(sample | {"textures": sample["textures"][:2]})
 
 
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (5, "got 5, expected a dict"),
+        ({"version": 2}, "seed: Field required"),
+        ({"seed": -1}, "seed: Input should be greater"),
+        ({"textures": 5}, "textures: Input should be a valid list"),
+        ({"textures": [{"kind": "grain"}] * 6}, "not those of a draw"),
+        ({"colours": [[0.5, 0.5, 0.5]]}, "recorded with 0 objects, the scene has 5"),
+        ({"colours": [[0.5, 0.5]] * 6}, "colours.0.2: Field required"),
+        ({"physics": {"object_mass": 5}}, "physics.object_mass: Input should be a valid tuple"),
+        ({"physics": {"object_mass": ["scale", [1.0]]}}, "expected a list of 5 numbers"),
+        ({"physics": {"gravity": ["add", [1.0, 2.0]]}}, "expected one number"),
+        ({"vision": {"brightness": ["times", 1.0]}}, "'scale', 'add' or 'set'"),
+        ({"each_step": {}}, "each_step.physics: Field required"),
+    ],
+)
+def test_what_is_no_sample_is_refused(cell, change, words):
+    randomizer = randomizer_of(cell)
+    whole = isinstance(change, int) or "version" in change
+    with pytest.raises(UserError, match=words):
+        randomizer.replay(change if whole else randomizer.randomize(0) | change)
+
+
 def test_the_sample_holds_every_parameter(cell):
     sample = randomizer_of(cell).randomize(3)
     assert set(sample["physics"]) == set(PHYSICS) and set(sample["vision"]) == set(VISION)

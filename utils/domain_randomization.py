@@ -10,12 +10,22 @@ changes what the cameras see.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from utils.config import Config
-from utils.config_types import Change, RandomizationConfig, Range, changed, draw, ranges_of
+from utils.config_types import (
+    Change,
+    Fraction,
+    RandomizationConfig,
+    Range,
+    RangeOf,
+    changed,
+    draw,
+    ranges_of,
+)
 from utils.errors import UserError
 from utils.random_view import RandomView, TextureRandomizer, random_colour
 
@@ -60,6 +70,27 @@ class RandomizableCell(Protocol):
     def randomizable(self) -> Randomizable:
         """The scene as built: the same object until the cell is built again. Raises UserError in a
         simulator that cannot be randomised."""
+
+
+_Parameters = dict[str, tuple[Literal["scale", "add", "set"], float | list[float]]]
+
+
+class _Ranges(BaseModel):
+    physics: dict[str, RangeOf]
+    vision: dict[str, RangeOf]
+
+
+class _Sample(BaseModel):
+    """The types of a sample's entries, of which a given one may have others."""
+
+    seed: Annotated[int, Field(ge=0)]
+    physics: _Parameters
+    vision: _Parameters
+    each_step: _Ranges
+    colours: list[tuple[Fraction, Fraction, Fraction]] | None
+    textures: list[dict[str, Any] | None]
+    shadow: Literal[0, 1]
+    depth_noise: bool
 
 
 class DomainRandomizer:
@@ -118,18 +149,41 @@ class DomainRandomizer:
         return sample
 
     def replay(self, sample: Mapping[str, Any]) -> None:
-        """Apply a recorded sample. Raises UserError for one of another version or scene."""
+        """Apply a recorded sample. Raises UserError for one of another version or scene, and for
+        what is no sample."""
         self._scene = self._cell.randomizable()
+        self._check(sample)
+        self._apply(sample)
+
+    def _check(self, sample: Mapping[str, Any]) -> None:
+        give = "give one as reset returned it in info['randomization']"
+        if not isinstance(sample, Mapping):
+            raise UserError(f"randomisation sample: got {sample!r:.60}, expected a dict; {give}")
         if sample.get("version") != _VERSION:
             raise UserError(
                 f"randomisation sample: version {sample.get('version')!r}, expected {_VERSION}"
             )
-        recorded, count = len(sample["textures"]) - 1, len(self._scene.surfaces) - 1
-        if recorded != count:
-            raise UserError(
-                f"randomisation sample: recorded with {recorded} objects, the scene has {count}"
-            )
-        self._apply(sample)
+        try:
+            _Sample.model_validate(dict(sample))
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise UserError(f"randomisation sample: {place}: {first['msg']}; {give}") from None
+        count = len(self._scene.surfaces) - 1
+        for surfaces in (sample["textures"], sample["colours"] or sample["textures"]):
+            if len(surfaces) - 1 != count:
+                raise UserError(
+                    f"randomisation sample: recorded with {len(surfaces) - 1} objects, the scene "
+                    f"has {count}"
+                )
+        sizes = self._sizes()
+        for name, (_, value) in (*sample["physics"].items(), *sample["vision"].items()):
+            size = sizes.get(name)
+            if np.shape(value) != (() if size is None else (size,)):
+                expected = "one number" if size is None else f"a list of {size} numbers"
+                raise UserError(
+                    f"randomisation sample: {name} has {value!r:.60}, expected {expected}; {give}"
+                )
 
     def restore(self) -> None:
         """Bring the nominal cell back; the objects stay where they are. A scene that was built

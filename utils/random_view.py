@@ -161,22 +161,34 @@ class TextureRandomizer:
 
     @staticmethod
     def make(description: Mapping[str, Any]) -> SolidTexture:
-        """The texture of a draw. Raises UserError for one of an unknown kind, or whose picture
-        cannot be read."""
-        kind = description.get("kind")
-        if kind == "picture":
-            return Picture(
-                _read_picture(description["file"]), np.array(description["axes"]),
-                description["size"], np.array(description["offset"]),
-            )  # fmt: skip
-        strength = np.array(description.get("strength", ()))
-        if kind == "waves":
-            waves, phases = (np.array(description[name]) for name in ("waves", "phases"))
-            return Texture(waves, phases, strength, description["hard"])
-        if kind == "grain":
-            rng = np.random.default_rng(description["seed"])
-            return Grain(rng.uniform(-1, 1, (_LATTICE,) * 3), description["size"], strength)
-        raise UserError(f"texture kind {kind!r} is unknown; known are grain, picture, waves")
+        """The texture of a draw. Raises UserError for one of an unknown kind, whose picture cannot
+        be read, or that is no draw."""
+        try:
+            return _texture(description)
+        except UserError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"texture {description!r:.60}: its entries are not those of a draw ({error!r}); "
+                "give one as it was recorded"
+            ) from error
+
+
+def _texture(description: Mapping[str, Any]) -> SolidTexture:
+    kind = description.get("kind")
+    if kind == "picture":
+        return Picture(
+            _read_picture(description["file"]), np.array(description["axes"]),
+            description["size"], np.array(description["offset"]),
+        )  # fmt: skip
+    strength = np.array(description.get("strength", ()))
+    if kind == "waves":
+        waves, phases = (np.array(description[name]) for name in ("waves", "phases"))
+        return Texture(waves, phases, strength, description["hard"])
+    if kind == "grain":
+        rng = np.random.default_rng(description["seed"])
+        return Grain(rng.uniform(-1, 1, (_LATTICE,) * 3), description["size"], strength)
+    raise UserError(f"texture kind {kind!r} is unknown; known are grain, picture, waves")
 
 
 def random_colour(rng: np.random.Generator) -> np.ndarray:
