@@ -230,8 +230,8 @@ def inverse_kinematics(
 
     Damped least squares within the joint limits (Buss, "Introduction to inverse kinematics",
     2004), started at `seed`; the redundant joint is drawn towards `rest`. The result has been
-    checked by forward kinematics: within `position_tolerance` metres and `rotation_tolerance`
-    radians, otherwise UnreachableError.
+    checked by forward kinematics: along each axis within `position_tolerance` metres, about each
+    within `rotation_tolerance` radians, otherwise UnreachableError.
     """
     q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
     for _ in range(max_iterations):
