@@ -171,7 +171,8 @@ def blended(
     early as the limits allow.
 
     start: (7,) rad, where the first motion starts at rest. The second one starts where the first
-    ends. Where both are under way their changes add up, so that the corner between them is cut, by what the limits leave room for.
+    ends. Where both are under way their changes add up, so that the corner between them is cut, by
+    what the limits leave room for.
     """
     change = second.positions - first.positions[-1]
     waiting = np.broadcast_to(first.positions[-1], change.shape)
