@@ -89,8 +89,8 @@ def _add_pairs(spec: mujoco.MjSpec, count: int) -> None:
 
     Sliding friction is the object's on table and fingertips, and `OF_OTHER_BODIES` times that on
     bin, palm and arm, as in PyBullet. What is left to the shape is contact with other objects: it
-    gets the square of the object's coefficient. Rolling friction is what MuJoCo would take from the two
-    shapes. Torsional friction, a fourth dimension of a contact, is the fingertips' alone.
+    gets the square of the object's coefficient. Rolling friction is what MuJoCo would take from the
+    two shapes. Torsional friction, a fourth dimension of a contact, is the fingertips' alone.
     `envs.mujoco_randomization` changes all of them.
     """
     own = ("table", *FINGERS)
