@@ -63,3 +63,54 @@ def test_wrong_ranges_are_refused(value, words):
 def test_a_negative_latency_is_refused():
     with pytest.raises(ConfigError, match="must not be negative"):
         load_config(None, ["randomization.physics.latency=-1,1,uniform,set,episode"])
+
+
+@pytest.mark.parametrize(
+    "key, value, words",
+    [
+        ("physics.object_mass", "-0.02,0,uniform,add", r"low \(-0.02\) \+ 0.02.* must be positive"),
+        ("physics.object_mass", "0,1,uniform,set", r"low \(0.0\) must be positive"),
+        ("physics.robot_mass", "-1,1,uniform,add", "must be positive"),
+        ("physics.object_friction", "-1,1,uniform,set", "must not be negative"),
+        ("physics.rolling_friction", "-1,1,uniform,add", "must not be negative"),
+        ("physics.spinning_friction", "-1,1,uniform,set", "must not be negative"),
+        ("physics.table_friction", "-1.1,0,uniform,add", r"\+ 1, the nominal value, must not be"),
+        ("physics.finger_friction", "-1,1,uniform,set", "must not be negative"),
+        ("physics.contact_stiffness", "-1,1,uniform,set", "must not be negative"),
+        ("physics.contact_damping", "-1,1,uniform,set", "must not be negative"),
+        ("physics.arm_position_gain", "-1,0,uniform,add", "must be positive"),
+        ("physics.arm_velocity_gain", "-1,1,uniform,set", "must not be negative"),
+        ("physics.gripper_gain", "-1,1,uniform,set", "must not be negative"),
+        ("vision.camera_fov", "-1,0,uniform,add", "must be positive"),
+        (
+            "vision.camera_fov",
+            "1,3,uniform,scale",
+            "field of view of 180 degrees out of camera.wris",
+        ),
+        ("vision.depth_shift", "-0.6,0,uniform,add", "must not be negative"),
+        ("vision.depth_jitter", "-1,0,uniform,set", "must not be negative"),
+        ("vision.depth_step", "-0.125,0,uniform,add", "must be positive"),
+    ],
+)
+def test_impossible_results_are_refused(key, value, words):
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_config(None, [f"randomization.{key}={value},episode"])
+    assert str(caught.value).startswith(f"randomization.{key}: ")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ["randomization.physics.object_mass=-0.01,0.01,normal,add,episode"],
+        ["randomization.physics.robot_mass=0,0.1,uniform,add,episode"],
+        ["randomization.physics.table_friction=-0.2,0.2,normal,add,episode"],
+        ["randomization.vision.depth_shift=-0.5,0.5,uniform,add,step"],
+        [
+            "randomization.vision.camera_fov=1,3,uniform,scale,episode",
+            "randomization.parts=physics",
+        ],
+        ["camera.fov_deg=170", "camera.wrist_fov_deg=170"],
+    ],
+)
+def test_possible_results_are_allowed(changes):
+    load_config(None, changes)

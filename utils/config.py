@@ -464,6 +464,8 @@ def explain(error: ValidationError, layers: Sequence[Layer]) -> str:
         message = unknown_key(key, source)
     elif first["type"] == "missing" and isinstance(first["loc"][-1], str):
         message = f"{key}: not set in {DEFAULTS}; every key needs its default there"
+    elif not location and first["type"] == "value_error":
+        message = str(first["ctx"]["error"])  # a rule between sections
     elif not location:
         message = f"{key or source}: {first['msg']}; keys are text as in {DEFAULTS.name}"
     else:

@@ -35,6 +35,7 @@ from utils.config_types import (
     TrainingSets,
     Vector2,
     Vector3,
+    changed,
     no_repeats,
 )
 from utils.depth import DepthNoise, make_depth_noise
@@ -441,6 +442,19 @@ class Config(Section):
     env: EnvConfig
     rl: RLConfig
     randomization: RandomizationConfig
+
+    @model_validator(mode="after")
+    def _possible_fields_of_view(self) -> Config:
+        widened = self.randomization.vision.camera_fov
+        factor = changed(widened.operation, 1.0, widened.high)
+        for name in ("fov_deg", "wrist_fov_deg"):
+            widest = factor * getattr(self.camera, name)
+            if "vision" in self.randomization.parts and widest >= 180:
+                raise ValueError(
+                    f"randomization.vision.camera_fov: high ({widened.high}) makes a field of view "
+                    f"of {widest:g} degrees out of camera.{name}; expected less than 180"
+                )
+        return self
 
     @property
     def cache_folder(self) -> Path:

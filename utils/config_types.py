@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from utils.depth import KinectNoise
+
 Change = tuple[str, Any]  # operation, and a value or a list of them
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
 
@@ -109,10 +111,24 @@ def _range(values: tuple) -> Range:
     return value
 
 
-def _unsigned(value: Range) -> Range:
-    if value.low < 0:
-        raise ValueError(f"low ({value.low}) must not be negative")
-    return value
+def unsigned(nominal: float = 0.0, zero: bool = True) -> AfterValidator:
+    """A validator of ranges of what cannot be negative.
+
+    nominal: the least value that a cell has there; 0 where that is not known. zero: whether it may
+    be 0.
+    """
+
+    def check(value: Range) -> Range:
+        own = nominal if value.operation == "add" else 0.0
+        least = own + value.low  # a factor is positive
+        unknown = value.operation == "add" and not nominal
+        if least < 0 or (least == 0 and not (zero or unknown)):
+            added = f" + {own:g}, the nominal value," if own else ""
+            rule = "not be negative" if zero else "be positive"
+            raise ValueError(f"low ({value.low}){added} must {rule}")
+        return value
+
+    return AfterValidator(check)
 
 
 RangeOf = Annotated[
@@ -130,24 +146,27 @@ RangeOf = Annotated[
     ),
     AfterValidator(_range),
 ]
-UnsignedRange = Annotated[RangeOf, AfterValidator(_unsigned)]
+UnsignedRange = Annotated[RangeOf, unsigned()]
+PositiveRange = Annotated[RangeOf, unsigned(zero=False)]
+FactorRange = Annotated[RangeOf, unsigned(nominal=1.0)]  # of what is 1 in a nominal cell
+PositiveFactorRange = Annotated[RangeOf, unsigned(nominal=1.0, zero=False)]
 
 
 class PhysicsRangesConfig(Section):
-    object_mass: RangeOf
-    object_friction: RangeOf
-    rolling_friction: RangeOf
-    spinning_friction: RangeOf
-    table_friction: RangeOf
-    finger_friction: RangeOf
+    object_mass: Annotated[RangeOf, unsigned(nominal=0.02, zero=False)]
+    object_friction: UnsignedRange
+    rolling_friction: UnsignedRange
+    spinning_friction: UnsignedRange
+    table_friction: FactorRange
+    finger_friction: FactorRange
     restitution: UnsignedRange
-    contact_stiffness: RangeOf
-    contact_damping: RangeOf
-    robot_mass: RangeOf
+    contact_stiffness: UnsignedRange
+    contact_damping: UnsignedRange
+    robot_mass: PositiveRange
     joint_damping: UnsignedRange
-    arm_position_gain: RangeOf
-    arm_velocity_gain: RangeOf
-    gripper_gain: RangeOf
+    arm_position_gain: PositiveFactorRange
+    arm_velocity_gain: FactorRange
+    gripper_gain: FactorRange
     gravity: RangeOf
     action_noise: UnsignedRange
     action_bias: RangeOf
@@ -163,15 +182,15 @@ class VisionRangesConfig(Section):
     light_specular: UnsignedRange
     camera_shift: RangeOf
     camera_turn: RangeOf
-    camera_fov: RangeOf
+    camera_fov: PositiveFactorRange
     brightness: RangeOf
     contrast: RangeOf
     saturation: RangeOf
     white_balance: RangeOf
     colour_noise: UnsignedRange
-    depth_shift: RangeOf
-    depth_jitter: RangeOf
-    depth_step: RangeOf
+    depth_shift: Annotated[RangeOf, unsigned(nominal=KinectNoise.shift)]
+    depth_jitter: Annotated[RangeOf, unsigned(nominal=KinectNoise.noise)]
+    depth_step: Annotated[RangeOf, unsigned(nominal=KinectNoise.step, zero=False)]
 
 
 class RandomizationConfig(Section):
