@@ -5,6 +5,7 @@ This module knows nothing of scenes and tasks. MuJoCo is optional: pip install "
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +63,14 @@ def load_mujoco():
         raise UserError(
             'MuJoCo is not installed: pip install "mujoco>=3.12,<4" (4.0.0 is another package)'
         ) from error
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_tell)
     return mujoco
+
+
+def _tell(warning: str) -> None:
+    """In place of MuJoCo's own way, which also writes MUJOCO_LOG.TXT into the current folder."""
+    print(f"MuJoCo: {warning}", file=sys.stderr)
 
 
 def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:

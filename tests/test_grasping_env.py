@@ -513,6 +513,21 @@ def test_a_physics_blow_up_ends_the_episode(make_env, blow_up, monkeypatch):
     assert env.step(np.zeros(7))[-1]["reason"] is None
 
 
+def test_what_mujoco_warns_of_ends_the_episode(config, monkeypatch, tmp_path):
+    """A speed beyond MuJoCo's limit, 1e10, while all numbers are finite. It leaves no file."""
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    env = RobotGraspingEnv(
+        config=config.model_copy(update={"simulator": "mujoco"}), observations=["state"]
+    )
+    env.reset(seed=0)
+    move(env.cell, 0, velocity=(0, 0, 1e11))
+    *_, terminated, _, info = env.step(np.zeros(7))
+    env.close()
+    assert terminated and info["reason"] == "physics"
+    assert not list(tmp_path.iterdir())
+
+
 # --- Wrong use --------------------------------------------------------------------------------
 
 
