@@ -335,7 +335,7 @@ class MujocoPanda(MujocoHand, Robot):
         """Put the robot at joint positions q (7,) with the gripper at `opening` metres, at rest."""
         opening = self.max_opening if opening is None else opening
         self.data.qpos[self._places] = [*q, opening / 2, opening / 2]
-        self.data.qvel[:] = 0
+        self.data.qvel[self._speeds] = 0.0
         self._stay_placed(q, opening)
         self.data.ctrl[:7], self.data.ctrl[7] = q, opening
         self._mujoco.mj_forward(self.model, self.data)

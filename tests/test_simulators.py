@@ -205,3 +205,9 @@ def test_a_body_tumbles_alike_however_it_lies_in_its_file(taught_cell, tmp_path)
         ends.append(taught_cell.object_pose(0) @ T)
     apart = Rotation.from_matrix(ends[0][:3, :3].T @ ends[1][:3, :3]).magnitude()
     assert np.degrees(apart) < 2
+
+
+def test_placing_the_arm_leaves_a_moving_object_moving(cell):
+    move(cell, 0, velocity=(0.0, 0.0, 1.0))
+    cell.robot.place(cell.home)
+    assert cell.speed(0) == pytest.approx(1.0)
