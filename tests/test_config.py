@@ -117,6 +117,8 @@ def test_override_values(text, expected):
         ("sim.zzz=5", ["sim.zzz", "frequency, solver_iterations, renderer"]),
         ("seed.x=5", ["seed.x", "unknown"]),
         ("evaluate.rounds=0", ["evaluate.rounds", "got 0", "command line", "whole number >= 1"]),
+        ("compute.timeout=1e10", ["compute.timeout", "a number > 0 and <= 604800"]),
+        ("rl.worker_timeout=604801", ["rl.worker_timeout", "a number > 0 and <= 604800"]),
         ("evaluate.rounds=ten", ["got 'ten'", "whole number"]),
         ("evaluate.rounds=1.5", ["got 1.5", "whole number"]),
         ("evaluate.rounds=true", ["got true", "whole number"]),

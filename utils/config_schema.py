@@ -32,6 +32,7 @@ from utils.config_types import (
     SimulatorName,
     TermScales,
     TestSets,
+    Timeout,
     TrainingSets,
     Vector2,
     Vector3,
@@ -46,7 +47,7 @@ from utils.transforms import look_at
 
 class ComputeConfig(Section):
     scheduler: Name | None
-    timeout: Positive
+    timeout: Timeout
 
 
 class SimConfig(Section):
@@ -352,7 +353,7 @@ class RLConfig(Section):
     estimated_observations: Names | None
     envs: Count
     parallel: bool
-    worker_timeout: Positive
+    worker_timeout: Timeout
     total_steps: Count
     rollout_steps: Count
     epochs: Count

@@ -41,6 +41,7 @@ KeywordArguments = Annotated[dict[str, Any], AfterValidator(Arguments)]
 TermScales = Annotated[dict[str, float], Field(min_length=1), AfterValidator(Arguments)]
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
+Timeout = Annotated[float, Field(gt=0, le=604_800)]  # s, a week: systems have limits
 Share = Annotated[float, Field(gt=0, le=1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Pixels = Annotated[int, Field(ge=16, le=4096)]
