@@ -242,6 +242,13 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         if render_mode is not None and "render_mode" in str(error):
             raise no_pictures from error
         raise UserError(f"rl.env_kwargs {settings.env_kwargs}: {error}") from error
+    except UserError:
+        raise
+    except (ValueError, LookupError, AssertionError) as error:  # Gymnasium's, and environments' own
+        raise UserError(
+            f"rl.env_id {settings.env_id}, rl.env_kwargs {settings.env_kwargs}: "
+            f"{type(error).__name__}: {one_line(error)}"
+        ) from error
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
         env.close()
         raise no_pictures

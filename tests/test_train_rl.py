@@ -290,6 +290,8 @@ def test_a_training_can_start_from_weights(finished, tmp_path, monkeypatch):
         (["rl.env_id=Pendulums-v1"], "rl.env_id Pendulums-v1: .*Pendulum"),
         (["rl.env_id=no_such_module:Pendulum-v1"], "rl.env_id .*no_such_module"),
         (["rl.env_kwargs=gravity=3"], "rl.env_kwargs .*gravity"),
+        (["rl.env_id=:Foo-v0"], "rl.env_id :Foo-v0, .*Empty module name"),
+        (["rl.env_kwargs=max_episode_steps=0"], "rl.env_kwargs .*max_episode_steps=0.* positive"),
         (["rl.env_kwargs=gravity"], "rl.env_kwargs.*NAME=VALUE"),
         (["rl.env_id=tests.helpers.quick_envs:QuickDiscrete-v0"], "Discrete"),
         (["rl.env_id=CartPole-v1"], "Discrete"),
