@@ -237,6 +237,9 @@ class MujocoTable(LayoutTable):
         if body < len(self._models):
             self._place(body, _PARKED, (0.0, 0.0, 0.0, 1.0))
             self._free.append(body)
+        else:  # a wall, which the next compiled model must not bring back
+            for geom in self._spec.body(_name(body)).geoms:
+                geom.contype = geom.conaffinity = 0
 
     def settle(self, bodies: Sequence[int]) -> bool:
         def step(count: int) -> None:

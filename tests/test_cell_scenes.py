@@ -246,6 +246,16 @@ def test_a_cube_on_a_table(box_set, laid_out):
         np.testing.assert_allclose(table.pose(other)[0], [0.5, 0.0, 0.03], atol=1e-3)
 
 
+def test_a_wall_that_was_taken_away_stays_away_when_others_are_built(box_set, laid_out):
+    with make_layout_table(laid_out, [box_set[0]]) as table:
+        for wall in table.put_walls(square_walls((0.5, 0.0), 0.08, 0.1, 0.02)):
+            table.remove(wall)
+        table.put_walls(square_walls((0.5, 0.0), 0.2, 0.1, 0.02))
+        cube = table.put(box_set[0], np.array([0.59, 0.0, 0.05]), np.array([0.0, 0.0, 0.0, 1.0]))
+        assert table.settle([cube])
+        np.testing.assert_allclose(table.pose(cube)[0], [0.59, 0.0, 0.03], atol=1e-3)
+
+
 @pytest.mark.parametrize("frequency", [240, 2000])
 def test_rest_is_looked_for_after_a_time_and_not_a_number_of_steps(box_set, config, frequency):
     """Within the 0.05 s up to the first look a cube falls freely, by g t^2 / 2 and at most half a
