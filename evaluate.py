@@ -182,13 +182,14 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
     for name, version in sample.versions.items():
         if version != ours.get(name):
             print(f"{name} is {ours.get(name)} here, the rounds were played with {version}")
-    different = differing_rounds(sample.rounds, replay(sample, config, work))
+    different = differing_rounds(sample.rounds, replay(sample, config, work, overrides))
     for record in different:
         print(f"different: {record.policy}, {record.scenario}, scene {record.seed}")
     print(f"{len(sample.rounds) - len(different)} of {len(sample.rounds)} rounds are the same")
     if different:
         print(
-            f"code that has changed plays other rounds: `git checkout {sample.commit}` has theirs"
+            "code that has changed, or a KEY=VALUE given here, plays other rounds: `git checkout "
+            f"{sample.commit}` has their code"
         )
     return 1 if different else 0
 

@@ -187,6 +187,25 @@ def test_a_sample_is_played_again():
     assert replay(sample, one_worker(), known_round) == ROUNDS[:3]
 
 
+@pytest.mark.parametrize(
+    "override, round_",
+    [("evaluate.policies=oracle", "heuristic"), ("evaluate.scenarios=packed", "box")],
+)
+def test_what_leaves_a_round_of_a_sample_out_is_named(override, round_):
+    sample = Sample(None, {}, [], ROUNDS[:3])
+    words = f"a round of {round_}.*, which its own config with {override} does not .*; omit"
+    with pytest.raises(UserError, match=words):
+        replay(sample, one_worker(override), known_round, [override])
+
+
+def test_a_torn_journal_is_gone_on_with(tmp_path):
+    append_round(tmp_path / "rounds.jsonl", ROUNDS[0])
+    with (tmp_path / "rounds.jsonl").open("a") as journal:
+        journal.write('{"policy": "heur')
+    assert play(one_worker(), tmp_path, known_round).rounds == ROUNDS
+    assert len(read_rounds(tmp_path / "rounds.jsonl")) == len(ROUNDS)
+
+
 def one_worker(*overrides):
     changes = [*changed_keys(CONFIG), "evaluate.workers=1", *overrides]
     return load_config(None, changes)

@@ -14,6 +14,7 @@ from utils.result_records import (
     AttemptRecord,
     RoundRecord,
     append_round,
+    cut_torn_line,
     differing_rounds,
     read_rounds,
     read_sample,
@@ -96,8 +97,11 @@ def test_a_journal_of_an_older_version_is_read(tmp_path):
 
 def test_a_torn_last_line_of_the_journal_is_taken_off(journal):
     whole = journal.read_text()
-    journal.write_text(whole + whole.splitlines()[0][:40])
+    torn = whole + whole.splitlines()[0][:40]
+    journal.write_text(torn)
     before = read_rounds(journal)
+    assert before == read_rounds(journal) and journal.read_text() == torn, "readers write nothing"
+    cut_torn_line(journal)
     append_round(journal, before[0])
     assert len(read_rounds(journal)) == len(ROUNDS) + 1
 
@@ -154,6 +158,10 @@ def test_a_sample_holds_the_first_rounds_of_each_row_and_their_origin(tmp_path):
         '{"policy": "heuristic"}\n',
         "[1]\n",
         '{"commit": null, "versions": {}, "overrides": ["camera=3"]}',
+        '{"commit": null, "versions": {}, "overrides": {"seed=1": 2}}',
+        '{"commit": null, "versions": ["numpy"], "overrides": []}',
+        '{"commit": null, "versions": {"numpy": 2}, "overrides": []}',
+        '{"commit": 3, "versions": {}, "overrides": []}',
     ],
 )
 def test_a_file_that_is_no_sample_is_refused(tmp_path, text):

@@ -30,6 +30,7 @@ from utils.result_records import (
     RoundRecord,
     Sample,
     append_round,
+    cut_torn_line,
     policy_name,
     read_rounds,
     writing,
@@ -162,7 +163,13 @@ def planned_rounds(config: Config) -> int:
     return plan.rounds * scenes * len(policies) * len(depth_noises_of(config))
 
 
-def check_recorded(rounds: Sequence[RoundRecord], config: Config, source: str) -> None:
+def check_recorded(
+    rounds: Sequence[RoundRecord],
+    config: Config,
+    source: str,
+    whose: str = "its config",
+    advice: str = "it was changed by hand, start a new run",
+) -> None:
     """Raise UserError for a round on a scene, or with a depth noise, that this config does not
     play."""
     plan = config.evaluate
@@ -171,8 +178,8 @@ def check_recorded(rounds: Sequence[RoundRecord], config: Config, source: str) -
         if not all(name in names for name, names in zip(record.kind, known)):
             raise UserError(
                 f"{source}: holds a round of {record.objects} in the scenario {record.scenario} "
-                f"with the depth noise {record.depth_noise}, which its config does not play; it "
-                "was changed by hand, start a new run"
+                f"with the depth noise {record.depth_noise}, which {whose} does not "
+                f"play; {advice}"
             )
 
 
@@ -269,6 +276,7 @@ def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) 
 def _play(
     config: Config, run: Path, journal: Path, work: Callable[[Config, Task], TaskResult]
 ) -> Outcome:
+    cut_torn_line(journal)
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
     check_played_once(outcome.rounds, str(journal))
@@ -307,18 +315,26 @@ def _play(
 
 
 def replay(
-    sample: Sample, config: Config, work: Callable[[Config, Task], TaskResult]
+    sample: Sample,
+    config: Config,
+    work: Callable[[Config, Task], TaskResult],
+    overrides: Sequence[str] = (),
 ) -> list[RoundRecord]:
-    """Play the rounds of a sample again; `config` is made of the sample's overrides.
+    """Play the rounds of a sample again; `config` is made of the sample's overrides and of others
+    over these.
 
     Raises UserError for a round that is not of this config: its policy would be loaded unchecked.
     """
-    check_recorded(sample.rounds, config, "--replay")
+    whose, advice = "its own config", "it was changed by hand, choose another"
+    if overrides:
+        whose = f"its own config with {' '.join(overrides)}"
+        advice = "omit what leaves it out there, or choose another sample"
+    check_recorded(sample.rounds, config, "--replay", whose, advice)
     for record in sample.rounds:
         if (record.planner, record.controller) not in policies_of(config):
             raise UserError(
-                f"--replay: the sample holds a round of {record.policy}, which its own config does "
-                "not score; it was changed by hand, choose another"
+                f"--replay: the sample holds a round of {record.policy}, which {whose} does not "
+                f"score; {advice}"
             )
     todo = [
         Task(

@@ -189,7 +189,7 @@ class RoundRecord:
 def writing(path: Path) -> Iterator[None]:
     """Within this context, no other process enters it for the same journal. Raises UserError where
     one is in it; a file system that knows no locks lets all in."""
-    place = path.with_name(f".{path.name}.lock")  # `read_rounds` may replace the journal itself
+    place = path.with_name(f".{path.name}.lock")  # `cut_torn_line` may replace the journal itself
     try:
         file = place.open("ab")
     except OSError as error:
@@ -239,20 +239,26 @@ def _line(record: RoundRecord) -> str:
     return json.dumps(content, allow_nan=False) + "\n"
 
 
+def cut_torn_line(path: Path) -> None:
+    """Remove a last line that a crash cut short, so that the next round begins a line of its own;
+    within `writing` alone, because a line that another process is adding looks the same."""
+    content = path.read_bytes() if path.exists() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    if whole != content:
+        write_atomic(path, whole)
+
+
 def read_rounds(path: Path, depth_noise: str = CLEAN) -> list[RoundRecord]:
     """The rounds of a journal; an empty list where there is none yet.
 
     depth_noise: of the rounds of older files, which name none: their config's.
-    A last line that a crash cut short is removed from the file; any other line that is no round
-    raises UserError.
+    A last line that a crash cut short does not count; any other line that is no round raises
+    UserError.
     """
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8", errors="replace")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        write_atomic(path, whole)
-    return _parse(path, whole.split("\n")[:-1], depth_noise)
+    return _parse(path, text.split("\n")[:-1], depth_noise)
 
 
 def _parse(
@@ -367,12 +373,19 @@ def write_sample(run: Path, path: Path, count: int = 10) -> None:
     write_atomic(path, json.dumps(origin) + "\n" + "".join(lines))
 
 
+_SAMPLE_TYPES = {"commit": str | None, "versions": dict, "overrides": list}
+
+
 def read_sample(path: Path) -> Sample:
     """Read a file of `write_sample`. Raises UserError for a file that is none."""
     try:
         first, *lines = path.read_text(encoding="utf-8").splitlines()
         origin = Sample(**json.loads(first), rounds=[])
-        if not all(isinstance(one, str) for one in [*origin.overrides, *origin.versions]):
+        for name, kinds in _SAMPLE_TYPES.items():
+            if not isinstance(getattr(origin, name), kinds):
+                raise ValueError(f"{name} is {getattr(origin, name)!r:.40}")
+        versions = [one for one in origin.versions.values() if one is not None]
+        if not all(isinstance(one, str) for one in [*origin.overrides, *versions]):
             raise ValueError("its overrides and versions are no texts")
         noise = values_of(origin.overrides).get("camera", {}).get("depth_noise", CLEAN)
     except OSError as error:
