@@ -25,6 +25,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import platform
 import re
 import shlex
@@ -266,6 +267,8 @@ PARTS = (
 def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     parts = chosen_parts(options.parts)
+    if not 0 < options.scale < math.inf:
+        raise UserError(f"--scale: got {options.scale:g}, expected a positive number such as 0.05")
     folders = {name: getattr(options, name) for name in SOURCES if getattr(options, name)}
     if options.list:
         print_parts(parts, options.scale)

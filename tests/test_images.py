@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -111,6 +112,14 @@ def test_depth_in_a_pgm_is_not_stretched_to_its_largest_value(tmp_path, largest)
     np.testing.assert_allclose(read_depth(tmp_path / "depth.pgm"), millimetres / 1000, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("value", "scale"), [(1000, 1e300), (1e300, None), (1e300, 1e100)])
+def test_depths_too_large_for_any_length_are_refused(tmp_path, value, scale):
+    np.save(tmp_path / "depth.npy", np.full((2, 3), value))
+    with pytest.raises(UserError, match="depth.npy: depths of up to .* are too large .*0.001"):
+        read_depth(tmp_path / "depth.npy", scale)
+
+
 def test_a_length_of_65535_is_known_where_numbers_have_more_bits(tmp_path):
     np.save(tmp_path / "depth.npy", np.full((2, 3), 65535, np.int32))
     np.testing.assert_allclose(read_depth(tmp_path / "depth.npy", 1e-5), 0.65535)
@@ -185,6 +194,19 @@ def test_what_the_box_hides_is_bare_table():
     u, v = np.rint(hidden).astype(int)
     assert view.depth[v, u] == pytest.approx(0.8, abs=1e-3)
     assert tuple(view.rgb[v, u]) == GREY
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_above_the_view_from_above_does_not_appear():
+    _, frame = photographed()
+    higher = frame.T_WC.copy()
+    higher[2, 3] = 0.83
+    frame = replace(frame, T_WC=higher)
+    before = overhead_view(frame, WORKSPACE, 0.0018)
+    near = frame.depth.copy()
+    near[:8, :8] = 0.001  # at the photograph's camera
+    view = overhead_view(replace(frame, depth=near), WORKSPACE, 0.0018)
+    np.testing.assert_array_equal(view.depth, before.depth)
 
 
 # --- Hostile files --------------------------------------------------------------------------------

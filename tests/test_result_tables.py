@@ -268,6 +268,12 @@ def test_commands_are_valid_and_take_fresh_seeds(capsys):
     assert f"seed={sealed.seed} objects.split=sealed" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("scale", ["nan", "inf", "-1", "0"])
+def test_a_scale_that_is_no_share_of_rounds_is_refused(scale):
+    with pytest.raises(UserError, match="--scale: got .*, expected a positive number"):
+        main(["--list", "--scale", scale])
+
+
 def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts, capsys):
     assert main(["--parts", "ycb,cornell"]) == 0
     said = capsys.readouterr().out

@@ -174,7 +174,14 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     known = known_depth(values)
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:  # of either byte order
         known &= values != SATURATED
-    return np.where(known, values * np.float64(scale), 0).astype(np.float32)
+    with np.errstate(over="ignore"):
+        metres = np.where(known, values * np.float64(scale), 0).astype(np.float32)
+    if not np.isfinite(metres).all():
+        raise UserError(
+            f"{path}: depths of up to {values[known].max():g} x {scale:g} m are too large to be "
+            "any; give the metres that 1 in the file stands for, such as --depth-scale 0.001"
+        )
+    return metres
 
 
 def _depth_values(path: Path) -> np.ndarray:
@@ -393,10 +400,11 @@ def overhead_view(
     seen = np.zeros((size, size), bool)
     points, colours = _points(frame)
     pixels, far = project(points, K, T_WC)
-    u, v = np.rint(pixels).astype(int).T
-    inside = np.flatnonzero((u >= 0) & (u < size) & (v >= 0) & (v < size))
+    pixels = np.rint(pixels)
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < size)).all(axis=1))  # NaN is not
     inside = inside[np.argsort(-far[inside], kind="stable")]  # the nearest is written last
-    at = v[inside], u[inside]
+    u, v = pixels[inside].astype(int).T
+    at = v, u
     depth[at], seen[at] = far[inside], True
     rgb[at] = colours[inside]
 
