@@ -80,9 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return report_transfer(config, options)
     check_controllers(config, options.overrides)
     check_everything(config)
-    run = open_run(options.resume, "evaluate", config.evaluate.name, config)
-    announce(config, run)
+    with open_run(options.resume, "evaluate", config.evaluate.name, config) as run:
+        return report_scores(config, options, run)
 
+
+def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int:
+    """Play the rounds that are missing, and write table and report; returns the exit code."""
+    announce(config, run)
     outcome = play(config, run, work)
     if outcome.error is not None and not outcome.rounds:
         raise outcome.error
@@ -206,33 +210,32 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     for evaluation in evaluations:
         check_everything(evaluation.config, "transfer.policies")
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []
-    run = open_run(options.resume, "evaluate", config.evaluate.name, config)
+    with open_run(options.resume, "evaluate", config.evaluate.name, config) as run:
+        scores, error, interrupted = {row: {} for row in rows}, None, False
+        for evaluation in evaluations:
+            folder = run / evaluation.column / evaluation.scenes.folder
+            folder.mkdir(parents=True, exist_ok=True)
+            announce(evaluation.config, folder)
+            outcome = play(evaluation.config, folder, work)
+            write_failures(folder / "failures.png", outcome.gallery)
+            for row in evaluation.rows:
+                scores[row][evaluation.column] = score_of(outcome.rounds, row.planner)
+            error, interrupted = outcome.error, outcome.interrupted
+            if error is not None or interrupted:
+                break
+        for row in rows if samples else []:
+            scores[row] |= score_photographs(row, samples, config, run)
 
-    scores, error, interrupted = {row: {} for row in rows}, None, False
-    for evaluation in evaluations:
-        folder = run / evaluation.column / evaluation.scenes.folder
-        folder.mkdir(parents=True, exist_ok=True)
-        announce(evaluation.config, folder)
-        outcome = play(evaluation.config, folder, work)
-        write_failures(folder / "failures.png", outcome.gallery)
-        for row in evaluation.rows:
-            scores[row][evaluation.column] = score_of(outcome.rounds, row.planner)
-        error, interrupted = outcome.error, outcome.interrupted
-        if error is not None or interrupted:
-            break
-    for row in rows if samples else []:
-        scores[row] |= score_photographs(row, samples, config, run)
-
-    lines, complete = transfer_lines(config, scores), error is None and not interrupted
-    print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
-    device = describe_workers(config)
-    write_transfer(run, lines, columns, config, device, complete, options.results)
-    print(f"picture: {run / 'transfer.png'}")
-    if not complete:
-        print(f"interrupted; go on with --resume {run}")
-    if error is not None:
-        raise error
-    return 130 if interrupted else 0
+        lines, complete = transfer_lines(config, scores), error is None and not interrupted
+        print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
+        device = describe_workers(config)
+        write_transfer(run, lines, columns, config, device, complete, options.results)
+        print(f"picture: {run / 'transfer.png'}")
+        if not complete:
+            print(f"interrupted; go on with --resume {run}")
+        if error is not None:
+            raise error
+        return 130 if interrupted else 0
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ from models.graspnet_scores import (
 from models.graspnet_training import Trainer, make_network, mean_of
 from models.rectangle_examples import Judged
 from models.rectangle_folds import (
+    Fold,
     cross_validation_results,
     describe_fold,
     describe_folds,
@@ -90,15 +91,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if photographs is not None:
             data = with_target(config, data, photographs)
         trainer = make_trainer(config, data, processes)
-        run = run_folder("train_graspnet", config.train.name, config, options.resume, processes)
+        with run_folder(
+            "train_graspnet", config.train.name, config, options.resume, processes
+        ) as run:
+            history, finished = train(config, run, data, trainer)
 
-        history, finished = train(config, run, data, trainer)
-
-        if processes.is_main:
-            # A half-trained network must not replace a finished one: no --weights then.
-            save_best(run, data, history, options.weights if finished else None)
-            if not finished:
-                print(f"stopped after {trainer.step} steps; go on with --resume {run}")
+            if processes.is_main:
+                # A half-trained network must not replace a finished one: no --weights then.
+                save_best(run, data, history, options.weights if finished else None)
+                if not finished:
+                    print(f"stopped after {trainer.step} steps; go on with --resume {run}")
     return 0 if finished else 130
 
 
@@ -205,8 +207,15 @@ def cross_validate(config: Config, options: argparse.Namespace, processes: Team)
     """Train and test a network for every fold of real images; returns the exit code."""
     if options.weights is not None and config.data.fold is None:
         raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
-    folds = real_folds(config)
-    run = run_folder("train_graspnet", config.train.name, config, options.resume, processes)
+    folds, name = real_folds(config), config.train.name
+    with run_folder("train_graspnet", name, config, options.resume, processes) as run:
+        return train_folds(config, folds, run, options, processes)
+
+
+def train_folds(
+    config: Config, folds: Sequence[Fold], run: Path, options: argparse.Namespace, processes: Team
+) -> int:
+    """The trainings of `cross_validate`, in the folder of their run."""
     judged: dict[int, list[Judged]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"

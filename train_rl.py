@@ -95,21 +95,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         training_envs(config, envs_of_each(config, processes)) as envs,
     ):
         ppo = make_ppo(envs.observation_space, envs.action_space, config, processes)
-        run = run_folder("train_rl", config.rl.name, config, options.resume, processes)
-        history = load_progress(ppo, run / "last.pt")
-        announce(config, run, ppo)
+        with run_folder("train_rl", config.rl.name, config, options.resume, processes) as run:
+            history = load_progress(ppo, run / "last.pt")
+            announce(config, run, ppo)
 
-        finished = train(config, run, envs, ppo, history)
+            finished = train(config, run, envs, ppo, history)
 
-        if processes.is_main:
-            # A policy that is half trained must not replace one that is not.
-            best = save_training(run, history, options.weights if finished else None)
-            print(f"best evaluation: {row_in_words(best)}")
-            if not finished:
-                more = "" if options.weights is None else f" --weights {options.weights}"
-                done = history[-1]["step"]
-                print(f"stopped; go on after {done:,} steps with --resume {run}{more}")
-            film(config, run, ppo)
+            if processes.is_main:
+                # A policy that is half trained must not replace one that is not.
+                best = save_training(run, history, options.weights if finished else None)
+                print(f"best evaluation: {row_in_words(best)}")
+                if not finished:
+                    more = "" if options.weights is None else f" --weights {options.weights}"
+                    done = history[-1]["step"]
+                    print(f"stopped; go on after {done:,} steps with --resume {run}{more}")
+                film(config, run, ppo)
     return 0 if finished else 130
 
 

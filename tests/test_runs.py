@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from tests.helpers.records import CONFIG
 from utils.atomic_files import write_atomic, write_json_atomic
 from utils.config import ConfigError, load_config
+from utils.distributed import Team, run_folder
 from utils.errors import UserError
 from utils.runs import (
     REPOSITORY,
@@ -165,11 +167,39 @@ def test_parse_args(tmp_path):
 
 
 def test_what_changes_when_a_run_is_resumed_stays_changed(tmp_path):
-    run = open_run(None, "evaluate", None, load_config(), root=tmp_path)
+    with open_run(None, "evaluate", None, load_config(), root=tmp_path) as run:
+        pass
     config, _ = parse_args(["--resume", str(run), "evaluate.rounds=70"], "a script")
-    assert open_run(run, "evaluate", None, config, root=tmp_path) == run
+    with open_run(run, "evaluate", None, config, root=tmp_path) as resumed:
+        assert resumed == run
     again, _ = parse_args(["--resume", str(run)], "a script")
     assert again.evaluate.rounds == 70 and again == config
+
+
+def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom utils.config import load_config\n"
+        "from utils.runs import open_run\n"
+        "with open_run(None, 'train_rl', None, load_config(), Path(sys.argv[1])) as run:\n"
+        "    print(run, flush=True)\n    input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True, cwd=REPOSITORY,
+    ) as other:  # fmt: skip
+        run = Path(other.stdout.readline().strip())
+        before, config = (run / "config.yaml").read_text(), load_config(None, ["seed=9"])
+        alone = Team(0, 1, torch.device("cpu"))
+        for opened in (
+            open_run(run, "evaluate", None, config),
+            run_folder("train_rl", None, config, run, alone),
+        ):
+            with pytest.raises(UserError, match="another process works in this run"), opened:
+                pass
+        assert (run / "config.yaml").read_text() == before
+        other.kill()
+    with run_folder("train_rl", None, config, run, alone):
+        assert (run / "config.yaml").read_text() != before
 
 
 def test_resume_takes_the_run_s_config(tmp_path):

@@ -1,4 +1,5 @@
-"""Files that are written whole or not at all, whatever ends the program or fills the disk."""
+"""Files that are written whole or not at all, whatever ends the program or fills the disk, and by
+one process at a time."""
 
 from __future__ import annotations
 
@@ -8,11 +9,18 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import IO, TYPE_CHECKING, BinaryIO
 
 from utils.errors import UserError
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,6 +95,33 @@ def cannot_write(path: Path, error: OSError) -> UserError:
         f"{path}: cannot be written ({error.strerror or error}); make room or choose a folder that "
         "can be written, what was there before is unchanged"
     )
+
+
+@contextmanager
+def locked(place: Path, refusal: str) -> Iterator[None]:
+    """Within this context, no other process enters it for the same lock file `place`. Raises
+    UserError with the sentence `refusal` where one is in it; a file system that knows no locks lets
+    all in."""
+    try:
+        file = place.open("ab")
+    except OSError as error:
+        raise cannot_write(place, error) from error
+    with file:
+        try:
+            _lock(file)
+        except (BlockingIOError, PermissionError):
+            raise UserError(refusal) from None
+        except OSError:
+            pass
+        yield
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Take a lock that ends with this process, however that ends."""
+    if sys.platform == "win32":
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def write_json_atomic(path: Path, content: Mapping) -> None:

@@ -13,7 +13,7 @@ import sys
 import time
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
@@ -178,19 +178,23 @@ def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> 
     return device
 
 
+@contextmanager
 def run_folder(
     script: str, name: str | None, config: Config, resume: Path | None, processes: Team
-) -> Path:
-    """The folder of a training's run, in every process of it.
+) -> Iterator[Path]:
+    """The folder of a training's run, in every process of it; no other training works there within
+    this context, see `utils.runs.open_run`.
 
     resume: the folder to go on with; None for a new one, or the one that the processes have made
     before `torchrun` started them again, because one was lost or others joined.
     """
-    folder = resume
-    if processes.is_main:
-        again = run_of_job(script, config) if resume is None else None
-        folder = again or open_run(resume, script, name, config)
-    return Path(processes.broadcast(str(folder)))
+    with ExitStack() as opened:
+        folder = resume
+        if processes.is_main:
+            # torchrun has ended those before; a machine that was lost may hold its lock for long.
+            again = run_of_job(script, config) if resume is None else None
+            folder = again or opened.enter_context(open_run(resume, script, name, config))
+        yield Path(processes.broadcast(str(folder)))
 
 
 @contextmanager

@@ -12,21 +12,16 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from utils.atomic_files import cannot_write, write_atomic
+from utils.atomic_files import cannot_write, locked, write_atomic
 from utils.config import changed_keys, load_config, values_of
 from utils.errors import UserError
 from utils.transforms import ImageGrasp
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
 
 SUCCESS = "success"
 OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way to the grasp
@@ -185,34 +180,15 @@ class RoundRecord:
 # --- The journal: one round a line, so that an interrupted evaluation can be resumed -----------
 
 
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Within this context, no other process enters it for the same journal. Raises UserError where
-    one is in it; a file system that knows no locks lets all in."""
+def writing(path: Path) -> AbstractContextManager[None]:
+    """Within this context, no other process enters it for the same journal; see
+    `utils.atomic_files.locked`."""
     place = path.with_name(f".{path.name}.lock")  # `cut_torn_line` may replace the journal itself
-    try:
-        file = place.open("ab")
-    except OSError as error:
-        raise cannot_write(place, error) from error
-    with file:
-        try:
-            _lock(file)
-        except (BlockingIOError, PermissionError):
-            raise UserError(
-                f"{path}: another process is adding rounds to it; wait until it has ended, or "
-                "start a new run"
-            ) from None
-        except OSError:
-            pass
-        yield
-
-
-def _lock(file: IO[bytes]) -> None:
-    """Take a lock that ends with this process, however that ends."""
-    if sys.platform == "win32":
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return locked(
+        place,
+        f"{path}: another process is adding rounds to it; wait until it has ended, or start a new "
+        "run",
+    )
 
 
 def append_round(path: Path, record: RoundRecord) -> None:

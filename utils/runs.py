@@ -20,15 +20,15 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, NoReturn
 
-from utils.atomic_files import DISK_ERRORS, write_atomic, write_json_atomic
+from utils.atomic_files import DISK_ERRORS, locked, write_atomic, write_json_atomic
 from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError, one_line
 
@@ -185,15 +185,19 @@ def _drop_unread() -> bool:
 # --- Run folders ---------------------------------------------------------------------------
 
 
+@contextmanager
 def open_run(
     resumed: Path | None, script: str, name: str | None, config: Config, root: Path = Path("runs")
-) -> Path:
-    """The folder of a run: a new one, or the one that is `resumed`, whose config.yaml gets the keys
-    that have changed, so that it can be resumed again as it is."""
-    if resumed is None:
-        return new_run_folder(script, name, config, root)
-    write_atomic(resumed / "config.yaml", dump_config(config))
-    return resumed
+) -> Iterator[Path]:
+    """The folder of a run, in which no other process works within this context: a new one, or the
+    one that is `resumed`, whose config.yaml gets the keys that have changed, so that it can be
+    resumed again as it is. Raises UserError where another process works there."""
+    run = new_run_folder(script, name, config, root) if resumed is None else resumed
+    refusal = "another process works in this run; wait until it has ended, or start a new run"
+    with locked(run / ".lock", f"{run}: {refusal}"):
+        if resumed is not None:
+            write_atomic(run / "config.yaml", dump_config(config))
+        yield run
 
 
 def new_run_folder(
