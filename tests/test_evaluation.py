@@ -4,12 +4,14 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import changed_keys, load_config
 from utils.errors import UserError
 from utils.evaluation import (
+    FilmFile,
     TaskResult,
     check_depth_noises,
     check_rounds,
@@ -22,6 +24,7 @@ from utils.evaluation import (
     tasks,
     with_depth_noise,
 )
+from utils.report import GalleryItem
 from utils.result_records import Sample, append_round, read_rounds
 from utils.runs import REPOSITORY, new_run_folder
 
@@ -143,6 +146,24 @@ def test_a_resumed_evaluation_plays_the_rest(tmp_path):
     outcome = play(config, tmp_path, known_round)
     assert outcome.rounds == ROUNDS and outcome.error is None and not outcome.interrupted
     assert len(read_rounds(tmp_path / "rounds.jsonl")) == 4
+
+
+def filmed(config, task):
+    image = np.full((8, 8, 3), task.seed, np.uint8)
+    pictures = [GalleryItem(image, f"scene {task.seed}", False, "heuristic")]
+    film = FilmFile(f"{task.seed}.mp4", b"film", f"film of {task.seed}")
+    return TaskResult(known_round(config, task).rounds, pictures, [film])
+
+
+def test_a_resumed_evaluation_shows_the_pictures_and_films_of_both_parts(tmp_path):
+    play(one_worker("evaluate.rounds=1"), tmp_path, filmed)
+    outcome = play(one_worker(), tmp_path, filmed)
+    assert [item.caption for item in outcome.gallery] == ["scene 0", "scene 1"]
+    assert [item.image.max() for item in outcome.gallery] == [0, 1]
+    films = tmp_path / "films"
+    assert outcome.films == [(films / "0.mp4", "0"), (films / "1.mp4", "film of 1")]
+    again = play(one_worker(), tmp_path, filmed)
+    assert len(again.gallery) == len(again.films) == 2
 
 
 def test_a_round_that_was_played_twice_is_refused(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round, attempt
 from utils.config import with_settings
 from utils.errors import UserError
-from utils.report import GalleryItem, balanced, write_report
+from utils.report import GalleryItem, balanced, read_gallery, write_gallery, write_report
 from utils.result_records import FAILURES
 from utils.results import compare, summarise
 from utils.runs import REPOSITORY
@@ -132,3 +132,19 @@ def test_half_of_the_pictures_are_failures_of_each_policy_in_turn():
     chosen = [item.caption for item in balanced(pictures, 6)]
     assert chosen == ["a 0", "b 0", "a 1", "a 0", "a 1", "a 2"]
     assert len(balanced(pictures[:6], 4)) == 4, "failures fill up where successes lack"
+
+
+def test_the_pictures_that_a_report_may_show_are_kept_for_a_resumed_run(tmp_path):
+    path = tmp_path / "gallery.npz"
+    write_gallery(path, [], 3)
+    assert not path.exists() and read_gallery(path) == []
+    image = np.zeros((4, 6, 3), np.uint8)
+    pictures = [GalleryItem(image, f"{n}", n % 2 == 0, "heuristic") for n in range(60)]
+    write_gallery(path, pictures, 3)
+    kept = read_gallery(path)
+    assert sum(not item.success for item in kept) == 24 and len(kept) == 27
+    names = [item.caption for item in balanced(kept, 3)]
+    assert names == [item.caption for item in balanced(pictures, 3)]
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(UserError, match="gallery.npz: cannot be read as pictures"):
+        read_gallery(path)

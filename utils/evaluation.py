@@ -23,7 +23,7 @@ from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
-from utils.report import GalleryItem
+from utils.report import VIDEO_TYPES, GalleryItem, read_gallery, write_gallery
 from utils.result_records import (
     CLEAN,
     OPEN_LOOP,
@@ -280,6 +280,8 @@ def _play(
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
     check_played_once(outcome.rounds, str(journal))
+    films, gallery = run / "films", run / "gallery.npz"
+    outcome.gallery = read_gallery(gallery)
     todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:
@@ -297,8 +299,8 @@ def _play(
                 outcome.rounds += result.rounds
                 outcome.gallery += result.gallery
                 for film in result.films:
-                    write_atomic(run / "films" / film.name, film.content)
-                    outcome.films.append((run / "films" / film.name, film.caption))
+                    write_atomic(films / film.name, film.content)
+                    outcome.films.append((films / film.name, film.caption))
                 progress.update(len(result.rounds))
             outcome.interrupted = stop.is_set()
     except LostWorkerError as error:
@@ -310,7 +312,13 @@ def _play(
         outcome.error = error
     outcome.rounds = in_order(outcome.rounds, config)
     outcome.gallery.sort(key=lambda item: item.caption)  # not in the order of the workers' speed
-    outcome.films.sort()
+    write_gallery(gallery, outcome.gallery, config.evaluate.gallery)
+    told = dict(outcome.films)  # films of an earlier part have their file's name as caption
+    outcome.films = [
+        (file, told.get(file, file.stem))
+        for file in sorted(films.glob("*"))
+        if file.suffix in VIDEO_TYPES
+    ]
     return outcome
 
 

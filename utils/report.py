@@ -8,6 +8,7 @@ loads nothing from anywhere: pictures of grasps and films are inside it. `pictur
 from __future__ import annotations
 
 import base64
+import io
 import shlex
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import imageio.v3 as iio
 import numpy as np
@@ -277,6 +279,7 @@ def _number(value: float | None, digits: int = 0) -> str:
 # --- Pictures of grasps -------------------------------------------------------------------------
 
 MOST_FAILURES = 24  # on failures.png
+_GALLERY = ("image", "caption", "success", "policy")
 
 
 def picture(frame: RGBDFrame, grasp: Grasp, policy: str, caption: str, reason: str) -> GalleryItem:
@@ -306,6 +309,35 @@ def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
     successes = _in_turns([p for p in pictures if p.success])
     take = min(len(failures), max(count // 2, count - len(successes)))
     return failures[:take] + successes[: count - take]
+
+
+def write_gallery(path: Path, pictures: Sequence[GalleryItem], count: int) -> None:
+    """Keep the pictures, all of one size, that a report with `count` of them and failures.png may
+    show, for a run that is resumed; no file if there are none."""
+    failures = _in_turns([p for p in pictures if not p.success])[: max(count, MOST_FAILURES)]
+    kept = failures + _in_turns([p for p in pictures if p.success])[:count]
+    if kept:
+        file = io.BytesIO()
+        arrays = {name: [getattr(item, name) for item in kept] for name in _GALLERY}
+        np.savez_compressed(file, **arrays)
+        write_atomic(path, file.getvalue())
+
+
+def read_gallery(path: Path) -> list[GalleryItem]:
+    """The pictures that `write_gallery` has kept; none where there is no file. Raises UserError for
+    a file that is damaged."""
+    if not path.exists():
+        return []
+    try:
+        with np.load(path) as file:
+            images, captions, successes, policies = (file[name] for name in _GALLERY)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise UserError(
+            f"{path}: cannot be read as pictures of an evaluation ({error}); delete it, the report "
+            "then shows those of later rounds alone"
+        ) from error
+    rows = zip(images, captions.tolist(), successes.tolist(), policies.tolist())
+    return [GalleryItem(*row) for row in rows]
 
 
 def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
