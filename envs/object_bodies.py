@@ -98,8 +98,10 @@ def native_object(
     friction: float,
     color: tuple[float, float, float, float],
 ) -> ObjectModel:
-    """A shape that simulators collide in closed form, of even density (kg/m3)."""
+    """A shape that simulators collide in closed form, of even density (kg/m3), or of a higher one
+    that makes MIN_MASS."""
     solid = shape.mesh(fine=True)
+    density = max(density, MIN_MASS / float(solid.volume))
     vertices = np.asarray(shape.mesh().vertices)
     return ObjectModel(
         name=name,
@@ -116,16 +118,18 @@ def native_object(
 
 
 def compound_object(shape: Primitive, cache_dir: Path) -> ObjectModel:
-    """A procedural solid of convex parts, of even density."""
+    """A procedural solid of convex parts, of even density, or of a higher one that makes
+    MIN_MASS."""
     hulls = [trimesh.convex.convex_hull(part) for part in shape.parts]
     solid = trimesh.util.concatenate(hulls)  # the parts touch but do not overlap
     centre = np.asarray(solid.center_mass)
     parts = tuple(part - centre for part in shape.parts)
-    moments, principal = principal_moments(shape.density * solid.moment_inertia)
+    density = max(shape.density, MIN_MASS / float(solid.volume))
+    moments, principal = principal_moments(density * solid.moment_inertia)
     return ObjectModel(
         name=shape.name,
         parts=parts,
-        mass=shape.density * float(solid.volume),
+        mass=density * float(solid.volume),
         inertia=moments,
         principal=principal,
         friction=shape.friction,

@@ -54,6 +54,7 @@ PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
 RANDOM_URDFS_SCALE = 0.65  # at 1.0, 92 % of them are too wide for the Panda hand when lying flat
 LARGEST_EXTENT = 0.5  # m, of an object that a hand could take at all
+SCALES = 0.1, 10.0  # of the sets whose sizes are known: things from 3 mm to 3 m
 
 Split = Literal["train", "test", "sealed", "unseen_families"]
 
@@ -150,7 +151,8 @@ def load_object_set(
     split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in each.
         sealed: others, for the published tables alone; of `random_urdfs` the test objects.
         unseen_families: 100 objects of `primitives` of four families that the others do not have.
-    scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`.
+    scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`. 0.1 to 10 for the other
+        named sets.
     fit: in place of `scale`, rescale each object of `random_urdfs` or of a folder so that the
         second longest side of its oriented bounding box has this many metres.
     density: kg/m3 of those objects of a folder whose file states no mass; `box` and `primitives`
@@ -282,7 +284,7 @@ class BoxSet(ObjectSet):
     """The tutorial's red cube: half extent 0.03 m, 0.1 kg."""
 
     def __init__(self, settings: SetSettings) -> None:
-        _refuse_fit("box", settings)
+        _check_size("box", settings)
         super().__init__("box")
         self.scale = settings.scale or 1.0
 
@@ -301,7 +303,7 @@ class PrimitiveSet(ObjectSet):
     the families that no training sees."""
 
     def __init__(self, settings: SetSettings, name: str = "primitives") -> None:
-        _refuse_fit(name, settings)
+        _check_size(name, settings)
         super().__init__(name)
         unseen = settings.split == "unseen_families"
         families, first = SPECIAL.get(name, (FAMILIES, LARGE))
@@ -414,11 +416,18 @@ def _random_urdf_files(split: str) -> list[Path]:
     return [folder / f"{n:03d}" / f"{n:03d}.urdf" for n in numbers if n not in BROKEN_RANDOM_URDFS]
 
 
-def _refuse_fit(name: str, settings: SetSettings) -> None:
+def _check_size(name: str, settings: SetSettings) -> None:
+    """Raise ObjectError where the settings make no size of a set whose sizes are known."""
     if settings.fit is not None:
         raise ObjectError(
             f"objects.fit does not apply to the set {name!r}, whose sizes are known; "
             "leave it out or use objects.scale"
+        )
+    scale, (low, high) = settings.scale or 1.0, SCALES
+    if not low <= scale <= high:
+        raise ObjectError(
+            f"objects.scale is {scale:g}, expected {low:g} to {high:g} for the set {name!r}, whose "
+            "objects are 3 to 30 cm long; leave it out"
         )
 
 

@@ -111,6 +111,18 @@ def test_household_things_weigh_what_such_things_do(tmp_path):
         )
 
 
+@pytest.mark.parametrize("scale", [0.1, 0.5])
+def test_nothing_small_is_too_light_for_physics(tmp_path, scale):
+    for name in ("box", "primitives", "household"):
+        objects = load_object_set(name, scale=scale, cache_dir=tmp_path)
+        light = min(
+            (objects[i] for i in range(min(20, len(objects)))), key=lambda model: model.mass
+        )
+        assert light.mass >= 0.02 - 1e-9
+        sides = light.extents  # no moment is larger than that of all the mass in its corners
+        assert (light.inertia < light.mass * (sides @ sides) / 4).all()
+
+
 def test_primitives_weigh_and_slide_as_promised(tmp_path):
     objects = load_object_set("primitives", cache_dir=tmp_path)
     for model in (objects[index] for index in range(len(FAMILIES))):
@@ -440,6 +452,8 @@ def test_a_plug_in_without_objects_is_named(plug_in, tmp_path, path, message):
         ({"scale": -1.0}, "objects.scale is -1.0"),
         ({"density": float("nan")}, "objects.density is nan"),
         ({"fit": 0.06}, "objects.fit does not apply"),
+        ({"scale": 1e-6}, "objects.scale is 1e-06, expected 0.1 to 10 for the set 'primitives'"),
+        ({"scale": 1e3}, "objects.scale is 1000, expected 0.1 to 10 for the set 'primitives'"),
     ],
 )
 def test_arguments_out_of_range_are_named(tmp_path, arguments, message):
