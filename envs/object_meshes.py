@@ -34,7 +34,7 @@ SMALLEST_SIDE, LARGEST_SIDE = (
 )  # in the file's units: beyond them numbers lose their digits
 # What the preparation of a mesh depends on; another value is another file in the cache.
 _SETTINGS = (
-    2,  # counts the changes of the method
+    3,  # counts the changes of the method
     *sorted(
         (name, value)
         for name, value in vars(object_parts).items()

@@ -87,11 +87,16 @@ class Solid:
         return union(self.pieces)
 
     def mass_properties(self) -> MassProperties:
-        """Overlaps count once."""
-        solid = to_trimesh(self.outer() - union(self.cavities))
+        """Overlaps count once, and what lies within a cavity, such as a ball in a bell, counts."""
+        solid = to_trimesh(self.outer() - union([self._void(cavity) for cavity in self.cavities]))
         return MassProperties(
             float(solid.volume), solid.center_mass.copy(), np.array(solid.moment_inertia)
         )
+
+    def _void(self, cavity: Manifold) -> Manifold:
+        """A cavity without the pieces within it."""
+        within = [piece for piece in self.pieces if _lies_in(piece, cavity)]
+        return cavity - union(within) if within else cavity
 
 
 # --- Solids ---------------------------------------------------------------------------------------
@@ -114,12 +119,16 @@ def solid_of(mesh: trimesh.Trimesh) -> Solid:
     turned = [from_trimesh(to_trimesh(s), turned=True) for s in closed if s.volume() < 0]
     positive, cavities, remark = union(pieces), [], ""
     for shell in turned:
-        if (shell - positive).volume() < 0.01 * shell.volume():
+        if _lies_in(shell, positive):
             cavities.append(shell)
         else:
             pieces.append(shell)
             remark = INSIDE_OUT
     return Solid(pieces, cavities, remark)
+
+
+def _lies_in(shell: Manifold, other: Manifold) -> bool:
+    return (shell - other).volume() < 0.01 * shell.volume()
 
 
 def _is_closed(shell: Manifold) -> bool:

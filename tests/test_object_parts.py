@@ -80,6 +80,19 @@ def test_a_cup_stays_hollow(tmp_path, wall):
         assert not inside(ball, part).any() and not inside(line, part).any()
 
 
+def test_what_lies_in_a_cavity_has_mass(tmp_path):
+    """A hollow cylinder that holds a hollow box with a cube in it, off its axis."""
+    boxes = [trimesh.creation.box((side,) * 3) for side in (0.4, 0.3, 0.1)]
+    boxes[1].invert()
+    for box in boxes:
+        box.apply_translation((0.1, 0, 0))
+    found = decompose(trimesh.util.concatenate([cup(0.05, open_top=False), *boxes]), tmp_path)
+    hollow = prism(0.5, 1.0) - prism(0.45, 0.9)
+    held = 0.4**3 - 0.3**3 + 0.1**3
+    assert found.solid.volume == pytest.approx(hollow + held, rel=1e-6)
+    assert found.solid.centre_of_mass[0] == pytest.approx(0.1 * held / (hollow + held), rel=1e-6)
+
+
 def test_a_hollow_cylinder_has_its_closed_form(tmp_path):
     tube = trimesh.creation.annulus(0.4, 0.5, 1.0, sections=64)
     found = decompose(tube, tmp_path)
