@@ -9,6 +9,7 @@ import pytest
 
 from utils.config import TransferPolicy
 from utils.result_records import AttemptRecord, RoundRecord
+from utils.statistics import clustered_interval, wilson_interval
 from utils.transfer import (
     Column,
     Score,
@@ -41,7 +42,17 @@ def test_a_score_counts_executed_grasps():
         round_of("a", "success", "no_plan"),
         round_of("b", "missed"),
     ]
-    assert score_of(rounds, "a") == Score(3, 4)
+    assert score_of(rounds, "a") == Score(3, 4, ((2, 3), (1, 1)))
+    assert score_of(rounds, "c") == Score(0, 0, ()) and score_of(rounds, "c").ci95 == (0, 1)
+
+
+def test_the_grasps_of_one_scene_are_not_taken_as_independent():
+    """Half of the scenes succeed as a whole, so that 20 grasps tell no more than 4 scenes do."""
+    rounds = [round_of("a", *[reason] * 5) for reason in ("success", "missed") * 2]
+    low, high = score_of(rounds, "a").ci95
+    assert (low, high) == clustered_interval([(5, 5), (0, 5)] * 2)
+    assert high - low > np.subtract(*wilson_interval(10, 20)[::-1]) + 0.2
+    assert Score(10, 20).ci95 == wilson_interval(10, 20), "photographs are independent"
 
 
 @pytest.fixture

@@ -18,7 +18,12 @@ from utils.config import Config, TransferPolicy
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord
 from utils.runs import save_results
-from utils.statistics import mean_maximum_rank_violation, pearson_correlation, wilson_interval
+from utils.statistics import (
+    clustered_interval,
+    mean_maximum_rank_violation,
+    pearson_correlation,
+    wilson_interval,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,10 +47,15 @@ class Column:
 
 @dataclass(frozen=True)
 class Score:
-    """Successes in a number of trials, which are executed grasps or photographs."""
+    """Successes in a number of trials, which are executed grasps or photographs.
+
+    by_scene: successes and trials of each scene, whose trials are not independent; None where each
+        trial is on its own, as photographs are.
+    """
 
     successes: int
     trials: int
+    by_scene: tuple[tuple[int, int], ...] | None = None
 
     @property
     def rate(self) -> float | None:
@@ -53,6 +63,8 @@ class Score:
 
     @property
     def ci95(self) -> tuple[float, float]:
+        if self.by_scene is not None:
+            return clustered_interval(self.by_scene)
         return wilson_interval(self.successes, self.trials)
 
 
@@ -85,7 +97,8 @@ class Agreement:
 def score_of(rounds: Sequence[RoundRecord], planner: str) -> Score:
     """All executed grasps of a planner's rounds together."""
     mine = [record for record in rounds if record.policy == planner]
-    return Score(sum(r.successes for r in mine), sum(r.executed for r in mine))
+    by_scene = tuple((r.successes, r.executed) for r in mine)
+    return Score(sum(r.successes for r in mine), sum(r.executed for r in mine), by_scene)
 
 
 def pairs_of(columns: Mapping[str, Column]) -> list[tuple[str, str]]:
