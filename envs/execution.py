@@ -48,6 +48,9 @@ from utils.transforms import Grasp
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 0.4  # longest wait for the fingers to close, beside the time that their way takes
 _LEAST_FRICTION = 0.4  # that a grip counts on
+# Times robot.grip_force, with which a hand lifts after an attempt that lost what it had gripped:
+# most such things are bowls, of whose friction cone the leaning wall takes the larger part.
+FIRM = 4.0
 _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs beside its middle
 # Times the closing force, along the closing line, that the arm feels when one finger presses alone
 # (it feels 2, and of a grip of both a few tenths); steps in which it feels; m and number of shifts.
@@ -86,12 +89,13 @@ def holding_force(pull: float) -> float:
 
 
 class WeighingGrip:
-    """Presses as hard as the weight needs that the arm feels, and never less than
+    """Presses as hard as the weight needs that the arm feels, and never less than `least`, N, or
     robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one."""
 
-    def __init__(self, robot: Robot):
+    def __init__(self, robot: Robot, least: float = 0.0):
         self._robot, self._force = robot, robot.grip_force
         self._felt: list[float] = []  # N, since the last look
+        self._press_with(least)
 
     def feel(self) -> None:
         """Ask once after every physics step."""
@@ -100,8 +104,10 @@ class WeighingGrip:
     def press(self) -> None:
         """Press as hard as what was felt since the last time needs, or harder."""
         pull, self._felt = float(np.median(self._felt or [0.0])), []
-        force = holding_force(pull)
-        if force > self._force:
+        self._press_with(holding_force(pull))
+
+    def _press_with(self, force: float) -> None:
+        if (force := min(force, FINGER_FORCE)) > self._force:
             self._force = force
             self._robot.command_gripper(0.0, force)
 
@@ -200,7 +206,9 @@ def check_bin(config: Config) -> None:
         )
 
 
-def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> GraspOutcome:
+def execute_grasp(
+    cell: Cell, grasp: Grasp, approach: Approach = open_loop, firmly: bool = False
+) -> GraspOutcome:
     """Approach, close, lift, carry to the bin, release, return home.
 
     Success: both fingers grip one object, which is off the table with its centre of mass above
@@ -210,6 +218,7 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
     every attempt. Raises PhysicsError when the simulation blows up.
 
     approach: moves the open gripper around the object; everything after it is the same for all.
+    firmly: lift with `FIRM` times robot.grip_force, as for what has slipped out of the hand before.
     """
     require_arm(cell.config, "execute_grasp")
     cell.check_physics()
@@ -218,7 +227,8 @@ def execute_grasp(cell: Cell, grasp: Grasp, approach: Approach = open_loop) -> G
         closed = _grip(cell, grasp, approach)
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
-        _carry_to_bin(cell, held, closed, max(grasp.position[2], closed[2, 3]), motion)
+        grip = WeighingGrip(cell.robot, FIRM * cell.robot.grip_force if firmly else 0.0)
+        _carry_to_bin(cell, held, closed, max(grasp.position[2], closed[2, 3]), motion, grip)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -298,7 +308,12 @@ def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
 
 
 def _carry_to_bin(
-    cell: Cell, index: int | None, closed: np.ndarray, height: float, motion: InHandMotion | None
+    cell: Cell,
+    index: int | None,
+    closed: np.ndarray,
+    height: float,
+    motion: InHandMotion | None,
+    grip: WeighingGrip,
 ) -> None:
     """Lift an object, gripped `height` m over the table at T_WE `closed` (4, 4), and carry it over
     the bin. Raises GraspFailure; with execution.strict also where the object has moved in the hand.
@@ -310,7 +325,7 @@ def _carry_to_bin(
     carry = way_to_bin(cell, lift.positions[-1], top)
     corner = higher_than(top - _LIFT_CORNER, lift)
     way = robot.blended_moves(start, lift, carry, corner, **scales(cell))
-    grip, every = WeighingGrip(robot), round(_CHECK_SECONDS / cell.dt)
+    every = round(_CHECK_SECONDS / cell.dt)
     for first in range(0, len(lift), every):
         robot.renew_contacts()
         follow(cell, way[first : min(first + every, len(lift))], grip.feel)

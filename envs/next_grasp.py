@@ -32,14 +32,17 @@ ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 @dataclass
 class Failures:
     """The grasps that failed: in a row, with the places (3,), m in W, of the hand where its palm
-    met something, None elsewhere; and in the round, where nothing was picked since."""
+    met something, None elsewhere; and in the round, where nothing was picked since. slipped:
+    whether the last of them lost what it had gripped, as empty fingers tell."""
 
     in_a_row: list[Grasp] = field(default_factory=list)
     palm_stops: list[np.ndarray | None] = field(default_factory=list)
     in_round: list[Grasp] = field(default_factory=list)
+    slipped: bool = False
 
     def note(self, grasp: Grasp, outcome: GraspOutcome) -> None:
         """Remember what has been executed."""
+        self.slipped = outcome.reason in ("slipped", "dropped")
         if outcome.success:
             self.in_a_row, self.palm_stops = [], []
             # What lay there is gone.

@@ -152,7 +152,7 @@ def run_round(
             aim = nearest_object(cell, grasp) if too_large else None
             with disturbed(cell, conditions.motion(cell, len(attempts))):
                 outcome = (
-                    execute_grasp(cell, grasp, approach)
+                    execute_grasp(cell, grasp, approach, firmly=failures.slipped)
                     if cell.has_arm
                     else execute_floating(cell, grasp)
                 )

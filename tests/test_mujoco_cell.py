@@ -100,10 +100,17 @@ def held_box(config, box_set):
 
 
 @pytest.mark.parametrize(
-    ("gravity", "reasons"), [(70.0, {"success"}), (150.0, {"slipped", "dropped"})]
+    ("gravity", "firmly", "reasons"),
+    [
+        (70.0, False, {"success"}),
+        (150.0, False, {"slipped", "dropped"}),
+        (280.0, True, {"success"}),
+        (600.0, True, {"slipped", "dropped"}),
+    ],
 )
-def test_friction_carries_what_coulomb_says(held_box, gravity, reasons):
-    """Two fingers carry 2 mu F = 10 N; 0.1 kg weighs that at 100 m/s2."""
+def test_friction_carries_what_coulomb_says(held_box, gravity, firmly, reasons):
+    """Two fingers carry 2 mu F = 10 N; 0.1 kg weighs that at 100 m/s2. Firmly, it is four times as
+    much."""
     cell, grasp = held_box
 
     def heavier(cell: MujocoCell) -> None:
@@ -111,7 +118,7 @@ def test_friction_carries_what_coulomb_says(held_box, gravity, reasons):
             cell.robot.model.opt.gravity[2] = -gravity
 
     cell.on_step = heavier
-    assert execute_grasp(cell, grasp).reason in reasons
+    assert execute_grasp(cell, grasp, firmly=firmly).reason in reasons
 
 
 def test_what_is_picked_is_out_of_the_round(held_box):

@@ -149,6 +149,22 @@ def test_a_miss_is_forgotten_where_something_was_picked() -> None:
     assert failures.in_a_row == failures.palm_stops == []
 
 
+def test_what_slipped_is_lifted_firmly(cell, box_set, monkeypatch) -> None:
+    """The attempt after one that lost what it had gripped, until another reason or a success."""
+    firmly, reasons = [], iter(("slipped", "dropped", "missed", "slipped", "success"))
+
+    def execute(cell, grasp, approach, **how):
+        firmly.append(how["firmly"])
+        return GraspOutcome(next(reasons), 3.0)
+
+    monkeypatch.setattr("envs.rounds.execute_grasp", execute)
+    scene = cube_scene(box_set)
+    plan = planner_of([cube_grasp()])
+    with pytest.raises(StopIteration):
+        run_round(cell, scene, plan, policy="x", objects="box", max_failures=9)
+    assert firmly == [False, True, True, False, True, False]
+
+
 def test_what_failed_is_not_tried_again_while_there_is_another() -> None:
     first, again, beside, turned = (
         Grasp(np.array([x, 0.0, 0.05]), angle, 0.08, 1.0)
