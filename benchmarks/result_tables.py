@@ -25,6 +25,7 @@ from benchmarks.table_cells import (
     noise_of,
     noises_of,
     origin,
+    percent,
     planner_cells,
     points,
     policy_file,
@@ -204,10 +205,10 @@ def overview(say: Say, *parts: Figures) -> str:
             if noise_of(row) != CLEAN and row["attempts"]:
                 scene = row["scenario"], row["objects"].rpartition(":")[2], noise_of(row)
                 shares = (
-                    row["successes"] / row["attempts"],
-                    row["objects_cleared"] / row["objects_total"],
+                    (row["successes"], row["attempts"]),
+                    (row["objects_cleared"], row["objects_total"]),
                 )
-                both = ", ".join(f"{100 * share:.0f}" for share in shares)
+                both = ", ".join(percent(*share) for share in shares)
                 cells.setdefault(scene, {})[row["policy"]] = both
         page = OVERVIEW[part["part"]]
         for (scenario, objects, noise), of in cells.items():

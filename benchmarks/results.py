@@ -1,6 +1,6 @@
 """Every table of README and docs/results.md, measured and written there: make results
 
-    make results                                  # all parts, some hours: --list says how long
+    make results                                  # all parts, ten hours: --list says how long
     make results PARTS=scoreboard,servo           # some of them
     make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
     make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
@@ -31,7 +31,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
@@ -361,9 +360,13 @@ def _git(*arguments: str) -> str:
 
 
 def measure(part: Part, commit: str, scale: float, folders: Folders = NOWHERE) -> None:
-    """Run a part's commands that are not finished yet."""
+    """Run a part's commands that are not finished yet. Raises UserError where one was measured, or
+    begun, with another folder of SOURCES."""
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
+        run = latest_run(Path(command.program).stem, file.stem)
+        if run is not None:
+            check_folders(command, run, file, folders)
         if not file.exists():
             write_json_atomic(file, run_command(part, command, scale, commit, folders))
 
@@ -399,7 +402,7 @@ def finished_file(part: Part, command: Command, commit: str, scale: float) -> Pa
 
 def run_name(part: Part, command: Command, rounds: int | None, commit: str) -> str:
     """Other arguments have another name, so that no run is taken for one of theirs. The folders of
-    SOURCES have none: who exchanges one deletes runs/results."""
+    SOURCES are no part of it: `check_folders` refuses a run of another one."""
     digest = hashlib.sha256(command.line(rounds).encode()).hexdigest()[:6]
     return "-".join(["results", part.name, command.name, str(rounds or "all"), commit[:10], digest])
 
@@ -408,7 +411,7 @@ def run_command(
     part: Part, command: Command, scale: float, commit: str, folders: Folders
 ) -> dict[str, Any]:
     """Run a command to its end, going on where an earlier call stopped; its figures."""
-    rounds, start = command.scaled(scale), time.perf_counter()
+    rounds = command.scaled(scale)
     name = run_name(part, command, rounds, commit)
     line = command.line(rounds, folders)
     if not command.program.endswith(".py"):
@@ -432,10 +435,29 @@ def run_command(
         "command": command.line(rounds),
         "rounds": rounds,
         "date": str(date.today()),
-        "minutes": round((time.perf_counter() - start) / 60, 1),
         "device": f"{platform.machine()}, {environment_of['cpu_count']} cores",
         "versions": {"python": environment_of["python"]} | environment_of["packages"],
     } | figures
+
+
+def check_folders(command: Command, run: Path, finished: Path, folders: Folders) -> None:
+    """Raise UserError where a run folder's config names another folder of SOURCES than is given
+    now; finished: the file of its figures."""
+    config = load_config(run / "config.yaml")
+    for word in shlex.split(command.line(None)):
+        key, _, place = word.partition("=")
+        for source, folder in folders.items():
+            if not Path(place).is_relative_to(Path("path/to", source)):
+                continue
+            given = folder / Path(place).relative_to(Path("path/to", source))
+            section, name = key.split(".")
+            before = getattr(getattr(config, section), name)
+            before = Path(before[0] if isinstance(before, tuple) else before)
+            if before.resolve() != given.resolve():
+                raise UserError(
+                    f"results: {run} has {key}={before} and does not go on with {given}; give the "
+                    f"folder of before, or delete {run} and {finished}"
+                )
 
 
 def latest_run(script: str, name: str) -> Path | None:

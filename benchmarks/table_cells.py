@@ -18,12 +18,20 @@ Say = Callable[[str], str]  # a word in the page's language
 # --- Cells ------------------------------------------------------------------------------------
 
 
+def percent(successes: int, trials: int) -> str:
+    """'97'; '99.6' where a share below 1 would be rounded to 100."""
+    share = f"{100 * successes / trials:.0f}"
+    if share == "100" and successes < trials:
+        return f"{1000 * successes // trials / 10:.1f}"
+    return share
+
+
 def rate(successes: int, trials: int, interval: Sequence[float] | None = None) -> str:
     """'97 % [95, 98] (488/502)', with the given 95 % interval, or Wilson's; '-' of nothing."""
     if trials == 0:
         return "-"
     low, high = (100 * bound for bound in interval or wilson_interval(successes, trials))
-    return f"{100 * successes / trials:.0f} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
+    return f"{percent(successes, trials)} % [{low:.0f}, {high:.0f}] ({successes}/{trials})"
 
 
 def success(row: Figures) -> str:

@@ -50,6 +50,12 @@ def test_rate_has_wilsons_interval():
     assert rate(0, 0) == "-"
 
 
+def test_a_share_below_1_is_never_100_percent():
+    assert rate(250, 250).startswith("100 % [")
+    assert rate(249, 250).startswith("99.6 % [") and rate(99_999, 100_000).startswith("99.9 % [")
+    assert rate(248, 250).startswith("99 % [")
+
+
 def test_cells_have_the_intervals_of_their_row():
     """Which know that the attempts of a round hang together."""
     wide = row("graspnet", 50, 100) | {"success_ci95": [0.3, 0.7], "cleared_ci95": [0.02, 0.25]}
@@ -332,6 +338,27 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     assert (content["commit"], content["seed"]) == ("c0ffee", results.SEED)
     assert list(content["commands"]) == ["box", "random_urdfs", "primitives"]
     assert results.is_finished(part, "c0ffee", 0.1) and not results.is_finished(part, "dead", 0.1)
+
+
+def test_a_run_of_another_folder_is_not_gone_on_with(tmp_path, monkeypatch):
+    """Neither where its figures are finished, nor where it was stopped."""
+    monkeypatch.chdir(tmp_path)
+    (part,) = chosen_parts("ycb")
+    (command,) = part.commands
+    name = results.run_name(part, command, command.scaled(0.1), "c0ffee")
+    run = tmp_path / "runs" / "evaluate" / f"20260102-030405-{name}"
+    run.mkdir(parents=True)
+    config = load_config(None, ["evaluate.object_sets=old/ycb"])
+    (run / "config.yaml").write_text(dump_config(config))
+    played = []
+    monkeypatch.setattr(results, "run_command", lambda *job: played.append(job) or {"rows": []})
+    refused = r"results: .*ycb.* has evaluate\.object_sets=old/ycb and does not go on with new/ycb"
+    for _ in range(2):
+        with pytest.raises(UserError, match=refused):
+            results.measure(part, "c0ffee", 0.1, {"ycb": Path("new/ycb")})
+        assert len(played) < 2
+        results.measure(part, "c0ffee", 0.1, {"ycb": tmp_path / "old" / "ycb"})
+    assert len(played) == 1
 
 
 @pytest.fixture
