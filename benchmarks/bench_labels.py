@@ -13,7 +13,7 @@ from time import process_time
 import cv2
 import numpy as np
 
-from benchmarks.metrics import Metric, benchmark_parser, report
+from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from envs.cell import Cell
 from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
@@ -32,7 +32,9 @@ FIRST_SEED = 500_000  # of the training scenes
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=15, help="scenes labelled and executed")
+    parser.add_argument(
+        "--scenes", type=positive_int, default=15, help="scenes labelled and executed"
+    )
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="of the first scene")
     options = parser.parse_args(argv)
     cv2.setNumThreads(1)

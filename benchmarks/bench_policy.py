@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.metrics import Metric, benchmark_parser, report
-from envs.vector_env import full_difficulty, make_env
+from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
+from envs.vector_env import OWN_ENVS, full_difficulty, make_env
 from models.grasp_policy import SavedPolicy, load_policy
 from models.ppo_rollouts import FRESH, derived_seeds
 from utils.config import Config, load_foreign
@@ -27,10 +27,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="e.g. objects.split=test")
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--episodes", type=positive_int, default=200)
     options = parser.parse_args(argv)
-    if options.episodes < 1:
-        raise UserError(f"--episodes: got {options.episodes}, expected at least 1")
     count = min(options.episodes, 5) if options.quick else options.episodes
     config = config_of(options.checkpoint, options.overrides)
     episodes = run_episodes(load_policy(options.checkpoint), config, count)
@@ -57,7 +55,7 @@ def config_of(checkpoint: Path, overrides: Sequence[str] = ()) -> Config:
 
 def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[str, int]]:
     """Why each of so many deterministic episodes at full difficulty ended, and after how many
-    steps."""
+    steps. Raises UserError for an environment whose episodes do not say why they end."""
     env, ends = make_env(config), []
     for seed in derived_seeds(count, config.seed, FRESH):
         observation, _ = env.reset(seed=seed, options=full_difficulty(config.rl.env_id))
@@ -65,6 +63,11 @@ def run_episodes(policy: SavedPolicy, config: Config, count: int) -> list[tuple[
         while not ended:
             observation, _, terminated, truncated, info = env.step(policy(observation))
             ended, length = terminated or truncated, length + 1
+        if "reason" not in info:
+            raise UserError(
+                f"bench_policy: episodes of {config.rl.env_id} do not say why they end "
+                f"(info['reason']); give a policy of {' or '.join(OWN_ENVS)}"
+            )
         ends.append((info["reason"], length))
     env.close()
     return ends

@@ -2,8 +2,10 @@
 
 Same environments and number of them, same network and hyper-parameters, no normalising; every seed
 of both in a process of its own, one after the other and in turn. The final return is the mean over
-deterministic episodes of the last policy, from seeds that both are given. How fast the environments
-take our training's actions again, with nobody learning, bounds what any trainer can reach.
+deterministic episodes of the last policy, from seeds that both are given. Those of the cell are not
+at full difficulty: as in its training, half of them begin with the hand near the object, for both
+alike. How fast the environments take our training's actions again, with nobody learning, bounds
+what any trainer can reach.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import psutil
 from gymnasium.wrappers import FilterObservation, FlattenObservation
 from scipy.stats import t as student
 
-from benchmarks.metrics import Metric, benchmark_parser, report
+from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from utils.config import Config, load_config
 from utils.runs import REPOSITORY, run_script
 
@@ -94,8 +96,10 @@ class Result:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
     parser.add_argument("--env", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--seeds", type=int, default=5, help="trainings of either")
-    parser.add_argument("--steps", type=int, help="env steps of each; default: the task's own")
+    parser.add_argument("--seeds", type=positive_int, default=5, help="trainings of either")
+    parser.add_argument(
+        "--steps", type=positive_int, help="env steps of each; default: the task's own"
+    )
     parser.add_argument("--run", nargs=2, metavar=("WHO", "SEED"), help="one training, as JSON")
     options = parser.parse_args(argv)
     if options.run:

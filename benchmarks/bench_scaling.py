@@ -27,7 +27,7 @@ import numpy as np
 import psutil
 from distributed import Client
 
-from benchmarks.metrics import Metric, benchmark_parser, report
+from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from envs.evaluation_worker import work
 from utils.config import Config, load_config, with_settings
 from utils.evaluation import Task, tasks
@@ -68,9 +68,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "overrides", nargs="*", metavar="KEY=VALUE", help="evaluate.policies=oracle"
     )
-    parser.add_argument("--scenes", type=int, default=16, help="of each set-up")
+    parser.add_argument("--scenes", type=positive_int, default=16, help="of each set-up")
     parser.add_argument(
-        "--kills", type=int, default=20, help="worker processes to kill, each engine"
+        "--kills", type=positive_int, default=20, help="worker processes to kill, each engine"
     )
     options = parser.parse_intermixed_args(argv)
     scenes, kills, calls, repeats = options.scenes, options.kills, 500, 3

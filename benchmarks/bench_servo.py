@@ -14,7 +14,7 @@ from time import process_time
 
 import numpy as np
 
-from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
+from benchmarks.metrics import Metric, benchmark_parser, median_ratio, positive_int, report
 from utils.runs import run_script
 from utils.servo_reference import (
     CAMERA,
@@ -44,7 +44,9 @@ MAX_ITERATIONS = 1500
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
-    parser.add_argument("--starts", type=int, default=200, help="random starts for our laws")
+    parser.add_argument(
+        "--starts", type=positive_int, default=200, help="random starts for our laws"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the starts")
     options = parser.parse_args(argv)
     try:

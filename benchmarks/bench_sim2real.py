@@ -7,6 +7,7 @@ training gains on small digit sets (`benchmarks.digits`) over training on the so
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import permutations
 from time import process_time
 
 import cv2
@@ -14,8 +15,8 @@ import numpy as np
 import torch
 
 from benchmarks.depth_loops import by_loops, steps_and_slopes
-from benchmarks.digits import load_digits_of
-from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
+from benchmarks.digits import DOMAINS, load_digits_of
+from benchmarks.metrics import Metric, benchmark_parser, median_ratio, positive_int, report
 from envs.grasping_env import RobotGraspingEnv
 from envs.randomized_env import RandomizedGraspingEnv
 from utils.adaptation import (
@@ -30,6 +31,7 @@ from utils.config import Config, load_config
 from utils.depth import KinectNoise
 from utils.runs import run_script
 
+PARTS = ("speed", "digits")
 PAIRS = ("mnist:uci", "uci:mnist", "mnist:photo")
 TEST_SHARE = 0.2  # of a domain's images, seen by no training
 RESETS = 10
@@ -37,12 +39,17 @@ RESETS = 10
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3, help="trainings of each pair of digit sets")
     parser.add_argument(
-        "--steps", type=int, default=AdaptationSettings.steps, help="of each training"
+        "--seeds", type=positive_int, default=3, help="trainings of each pair of digit sets"
     )
-    parser.add_argument("--parts", default="speed,digits", help="any of speed,digits")
-    parser.add_argument("--pairs", nargs="+", default=PAIRS, help="SOURCE:TARGET of the digits")
+    parser.add_argument(
+        "--steps", type=positive_int, default=AdaptationSettings.steps, help="of each training"
+    )
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    pairs = [f"{source}:{target}" for source, target in permutations(DOMAINS, 2)]
+    parser.add_argument(
+        "--pairs", nargs="+", choices=pairs, default=PAIRS, help="SOURCE:TARGET of the digits"
+    )
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

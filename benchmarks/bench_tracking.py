@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from benchmarks.metrics import Metric, benchmark_parser, report
+from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
@@ -48,8 +48,10 @@ class Errors:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = benchmark_parser(__doc__.splitlines()[0])
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="seed=3")
-    parser.add_argument("--scenes", type=int, default=30, help="of each object set")
-    parser.add_argument("--views", type=int, default=4, help="of each scene from each height")
+    parser.add_argument("--scenes", type=positive_int, default=30, help="of each object set")
+    parser.add_argument(
+        "--views", type=positive_int, default=4, help="of each scene from each height"
+    )
     options = parser.parse_intermixed_args(argv)
     cv2.setNumThreads(1)
     scenes, views = (2, 1) if options.quick else (options.scenes, options.views)

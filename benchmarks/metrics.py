@@ -5,7 +5,7 @@ This module knows nothing of what is measured.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +73,17 @@ def report(metrics: Sequence[Metric], path: Path | None) -> None:
             for m in metrics
         }
         write_json_atomic(path, content)
+
+
+def positive_int(text: str) -> int:
+    """The type of an argument that counts something."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise ArgumentTypeError(f"got {text}, expected a whole number of at least 1")
+    return value
 
 
 def benchmark_parser(description: str) -> ArgumentParser:

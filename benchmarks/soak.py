@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -75,6 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in names:
         if name not in PARTS:
             raise UserError(f"--parts: {name!r} is no part; choose among {', '.join(PARTS)}")
+    if not 0 < options.scale < math.inf:
+        raise UserError(f"--scale: got {options.scale:g}, expected a positive number such as 0.01")
     if options.list:
         for name in names:
             minutes = max(1, round(PARTS[name].minutes * options.scale))

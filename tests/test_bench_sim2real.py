@@ -44,3 +44,17 @@ def test_digit_sets(domain, count):
 def test_unknown_digits():
     with pytest.raises(ValueError, match="svhn"):
         load_digits_of("svhn")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--parts", "sped"], "argument --parts: invalid choice: 'sped'"),
+        (["--parts", "digits", "--pairs", "mnist"], "argument --pairs: invalid choice: 'mnist'"),
+        (["--seeds", "0"], "argument --seeds: got 0, expected a whole number of at least 1"),
+    ],
+)
+def test_bad_input_is_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        bench_sim2real.main(arguments)
+    assert message in capsys.readouterr().err

@@ -21,6 +21,7 @@ from envs.vector_env import make_env
 from models.grasp_policy import load_policy
 from tests.helpers.simulators import move, needs_pybullet
 from utils.config import load_config
+from utils.errors import UserError
 
 CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
 ANYWHERE = ["sim.renderer=tiny", "simulator=auto", "scene.simulator=auto"]  # not as it was trained
@@ -58,6 +59,12 @@ def test_noise_goes_on_in_a_second_attempt():
             seen += [env.take_over()[0]["depth"] for _ in range(attempts)]
     first, second, again = seen
     assert (first == again).all() and (first != second).mean() > 0.5
+
+
+def test_a_policy_of_an_environment_that_tells_no_reason_is_refused():
+    config = load_config(None, ["rl.env_id=Pendulum-v1"])
+    with pytest.raises(UserError, match="Pendulum-v1 do not say why they end .*RobotGrasping-v0"):
+        run_episodes(lambda observation: np.zeros(1, np.float32), config, 1)
 
 
 @needs_pybullet  # where the policy has learned; on scenes laid out in MuJoCo it is less certain

@@ -48,6 +48,12 @@ def test_a_file_that_holds_something_else_is_refused_before_anything_is_tried(pa
         assert (tmp_path / "notes.txt").read_text() == content
 
 
+@pytest.mark.parametrize("scale", ["nan", "inf", "-1", "0"])
+def test_a_scale_that_is_no_share_of_tries_is_refused(parts, scale):
+    with pytest.raises(UserError, match="--scale: got .*, expected a positive number"):
+        main(["--parts", "one", "--scale", scale])
+
+
 def test_parts_are_listed_and_unknown_ones_refused(parts, capsys):
     assert main(["--list", "--scale", "0.5"]) == 0
     assert capsys.readouterr().out.splitlines()[0] == "one: the first; about 5 minutes"
