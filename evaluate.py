@@ -33,7 +33,7 @@ from envs.objects import OBJECT_SETS
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
-from utils.atomic_files import check_writable
+from utils.atomic_files import check_copies
 from utils.config import Config, load_foreign, values_of
 from utils.errors import UserError
 from utils.evaluation import (
@@ -67,8 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_options(options)
     check_names(config)
-    for option in ("results", "csv", "latex"):
-        check_writable(f"--{option}", getattr(options, option))
+    check_copies({f"--{name}": getattr(options, name) for name in ("results", "csv", "latex")})
     if options.compare is not None:
         return report_comparison(options)
     if options.replay is not None:
@@ -134,16 +133,21 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 # would have no effect with it.
 IGNORED = {
     "compare": ("replay", "config", "resume", "overrides"),
-    "replay": ("config", "resume", "results", "csv", "latex"),
-}
+    "replay": (
+        "config", "resume", "results", "csv", "latex",
+        *(f"evaluate.{key}" for key in ("rounds", "name", "videos", "gallery", "film_format")),
+    ),
+}  # fmt: skip
 
 
 def check_options(options: argparse.Namespace) -> None:
     """Raise UserError for an argument that another one leaves without effect."""
+    keys = [change.partition("=")[0].strip() for change in options.overrides]
     for mode, others in IGNORED.items():
-        ignored = [name for name in others if getattr(options, name)]
+        ignored = [name for name in others if getattr(options, name, None) or name in keys]
         if getattr(options, mode) is not None and ignored:
-            words = ["KEY=VALUE" if name == "overrides" else f"--{name}" for name in ignored]
+            told = {"overrides": "KEY=VALUE", **{key: key for key in keys}}
+            words = [told.get(name, f"--{name}") for name in ignored]
             raise UserError(f"--{mode}: {', '.join(words)} would have no effect with it; omit them")
 
 
@@ -223,10 +227,11 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
             error, interrupted = outcome.error, outcome.interrupted
             if error is not None or interrupted:
                 break
-        for row in rows if samples else []:
+        complete = error is None and not interrupted
+        for row in rows if samples and complete else []:
             scores[row] |= score_photographs(row, samples, config, run)
 
-        lines, complete = transfer_lines(config, scores), error is None and not interrupted
+        lines = transfer_lines(config, scores)
         print(format_transfer(lines, columns), *transfer_notes(lines, columns), sep="\n")
         device = describe_workers(config)
         write_transfer(run, lines, columns, config, device, complete, options.results)

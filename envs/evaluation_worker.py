@@ -7,7 +7,6 @@ every round.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -43,6 +42,7 @@ from utils.geometry import Workspace
 from utils.report import picture
 from utils.result_formats import depth_in_words
 from utils.result_records import CLEAN, OPEN_LOOP, policy_name
+from utils.runs import portable_name
 from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
@@ -165,8 +165,7 @@ def work(config: Config, task: Task) -> TaskResult:
 
 
 def film_name(task: Task, policy: str, noise: str, suffix: str) -> str:
-    """A file's name on every system: policies, noises and object sets may be paths or
-    MODULE:NAME."""
+    """A film's name; policies, noises and object sets may be paths or MODULE:NAME."""
     kind = [task.scenario, task.objects, *([] if noise == CLEAN else [noise])]
     stem = "-".join([*kind, policy, str(task.seed)])
-    return re.sub(r"[^\w.+-]", "_", stem) + f".{suffix}"
+    return f"{portable_name(stem)}.{suffix}"

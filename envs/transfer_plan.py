@@ -8,7 +8,6 @@ here; `utils.transfer` writes and draws the table.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from utils.errors import UserError, unknown_choice
 from utils.evaluation import depth_noises_of, policies_of
 from utils.rectangles import RealSample
 from utils.result_records import OPEN_LOOP
+from utils.runs import portable_name
 from utils.transfer import Column, Score, TransferLine
 
 # --- The columns ----------------------------------------------------------------------------------
@@ -42,7 +42,9 @@ class PhotographColumn(Column):
     an entry for each sample, or None for a planner that photographs do not suffice for."""
 
     judge: Callable[[str, Sequence[RealSample], int], list[Judged | None] | None]
-    if_empty: str | None = "no photographs were scored: add transfer.cornell=path/to/cornell"
+    if_empty: str | None = (
+        "no photographs were scored: these need transfer.cornell=path/to/cornell, and all rounds"
+    )
 
 
 COLUMNS: dict[str, SimulatedColumn | PhotographColumn] = {
@@ -78,8 +80,8 @@ class Scenes(NamedTuple):
 
     @property
     def folder(self) -> str:
-        """A name for a folder; it holds the whole path of a folder of objects."""
-        return str(self).replace(", ", "-").replace(" ", "_").replace(os.sep, "_")
+        """A name for a folder; it holds the whole path of a folder of objects, or MODULE:NAME."""
+        return portable_name(str(self).replace(", ", "-"))
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,8 @@ def score_photographs(
         shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
         scores[name] = Score(sum(one.correct for _, one in shown), len(samples))
         if shown:
-            draw_rectangles(pictures / f"{Path(row.planner).stem}-{name}.png", *zip(*shown))
+            picture = pictures / f"{portable_name(row.planner)}-{name}.png"
+            draw_rectangles(picture, *zip(*shown))
     return scores
 
 

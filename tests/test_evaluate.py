@@ -338,6 +338,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
             ["--replay", "a", "--results", "b", "--csv", "c", "--latex", "d"],
             "--replay: --results, --csv, --latex would have no effect with it; omit them",
         ),
+        (
+            ["--replay", "a", "evaluate.rounds=2", "evaluate.film_format=gif", "seed=2"],
+            "--replay: evaluate.rounds, evaluate.film_format would have no effect with it; omit",
+        ),
+        (["--csv", "a", "--latex", "./a"], "--csv, --latex: both name a; give each its own file"),
         (["--replay", "a", "--config", str(DEFAULTS)], "--replay: --config would have no effect"),
         (
             [

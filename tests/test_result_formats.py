@@ -66,7 +66,8 @@ def test_csv(tmp_path):
     assert first["policy"] == "heuristic" and float(first["success_ci95_low"]) < 0.19
     assert first["failures_missed"] == "1" and second["picks_per_hour"] == ""
     write_csv(tmp_path / "none.csv", [])
-    assert (tmp_path / "none.csv").read_text() == ""
+    header = (tmp_path / "rows.csv").read_text().splitlines()[0]
+    assert (tmp_path / "none.csv").read_text() == f"{header}\n"
 
 
 def test_table():
@@ -148,8 +149,15 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     write_comparisons_csv(tmp_path / "pairs.csv", pairs)
     with (tmp_path / "pairs.csv").open(encoding="utf-8", newline="") as file:
         (row,) = csv.DictReader(file)
-    assert row["first"] == "random" and float(row["cleared_low"]) == pytest.approx(-0.4)
+    assert row["first"] == "random" and row["cleared_low"] == row["cleared_high"] == ""
     assert (row["success_value"], row["success_rounds"]) == ("-0.5", "2")
+    write_comparisons_csv(tmp_path / "many.csv", many)
+    with (tmp_path / "many.csv").open(encoding="utf-8", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["cleared_low"]) == pytest.approx(-0.4) and row["success_low"] == ""
+    header = (tmp_path / "pairs.csv").read_text().splitlines()[0]
+    write_comparisons_csv(tmp_path / "one_policy.csv", [])
+    assert (tmp_path / "one_policy.csv").read_text() == f"{header}\n"
     undefined = compare([ROUNDS[1], ROUNDS[2]], seed=0)  # no scene in common
     write_comparisons_csv(tmp_path / "none.csv", undefined)
     assert (tmp_path / "none.csv").read_text().splitlines()[

@@ -4,22 +4,27 @@ import json
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import evaluate
+from envs import transfer_plan
 from envs.registries import check_names
 from envs.simulators import SIMULATORS
 from envs.transfer_plan import (
     COLUMNS,
+    PhotographColumn,
     Scenes,
     SimulatedColumn,
     columns_of,
     evaluations_of,
     score_photographs,
 )
+from models.rectangle_examples import Judged
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
-from utils.evaluation import depth_noises_of
+from utils.evaluation import Outcome, depth_noises_of
+from utils.rectangles import GraspRectangle
 from utils.transfer import pairs_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -147,6 +152,41 @@ def test_rows_that_cannot_see_photographs_have_no_score_there(tmp_path):
                             ("heuristic", ("pile", "box"))):  # fmt: skip
         row = TransferPolicy("a", "-", planner, scenes, None)
         assert score_photographs(row, [], config, tmp_path) == {}
+
+
+def test_pictures_and_folders_have_names_of_their_own_on_every_system(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(transfer_plan, "draw_rectangles", lambda path, *_: drawn.append(path.name))
+    judged = Judged("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, True, 1.0, 0.0)
+    column = PhotographColumn("A", judge=lambda *_: [judged])
+    monkeypatch.setitem(COLUMNS, "a", column)
+    config = load_config(None, ["transfer.columns=a"])
+    for planner in ("my_module:plan", "your_module:plan", "heuristic"):
+        row = TransferPolicy("a", "-", planner, None, None)
+        score_photographs(row, [None], config, tmp_path)
+    assert drawn == ["my_module_plan-a.png", "your_module_plan-a.png", "heuristic-a.png"]
+    scenes = Scenes(("pile", "packed"), ("my_module:objects", "path/to/meshes"))
+    assert scenes.folder == "pile-packed_of_my_module_objects-path_to_meshes"
+
+
+@pytest.mark.parametrize("ended", [{"interrupted": True}, {"error": UserError("no room")}, {}])
+def test_photographs_are_scored_once_all_rounds_are_played(ended, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scored = []
+    monkeypatch.setattr(evaluate, "photographs", lambda folder: ["a photograph"])
+    monkeypatch.setattr(evaluate, "play", lambda *_: Outcome([], **ended))
+    monkeypatch.setattr(evaluate, "check_everything", lambda *_: None)
+    monkeypatch.setattr(evaluate, "score_photographs", lambda row, *_: scored.append(row) or {})
+    arguments = [
+        "transfer.policies=[[a, b, heuristic, null, null]]", "evaluate.depth_noises=null",
+        "transfer.columns=pybullet,cornell", "transfer.cornell=some/cornell",
+    ]  # fmt: skip
+    if "error" in ended:
+        with pytest.raises(UserError, match="no room"):
+            evaluate.main(arguments)
+    else:
+        assert evaluate.main(arguments) == (130 if ended else 0)
+    assert len(scored) == (0 if ended else 1)
 
 
 def test_the_report_has_no_paired_differences(tmp_path):

@@ -89,6 +89,18 @@ def check_writable(option: str, path: Path | None) -> None:
         ) from error
 
 
+def check_copies(files: Mapping[str, Path | None]) -> None:
+    """Raise UserError if one of the files that options name could not be written at the end, or is
+    that of another option, too."""
+    options: dict[str, str] = {}
+    for option, path in files.items():
+        check_writable(option, path)
+        if path is not None:
+            first = options.setdefault(os.path.realpath(path), option)
+            if first != option:
+                raise UserError(f"{first}, {option}: both name {path}; give each its own file")
+
+
 def cannot_write(path: Path, error: OSError) -> UserError:
     """The error for a file that the operating system does not let us write."""
     return UserError(

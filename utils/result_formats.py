@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,15 +42,22 @@ def write_results(
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write a spreadsheet of the rows: intervals as two columns, each failure as one column."""
-    _write_csv(path, [_flat(row) for row in rows])
+    header: list[str] = []
+    for column in fields(Row):
+        if column.name.endswith("_ci95"):
+            header += [f"{column.name}_low", f"{column.name}_high"]
+        elif column.name == "failures":
+            header += [f"failures_{reason}" for reason in FAILURES]
+        else:
+            header.append(column.name)
+    _write_csv(path, header, [_flat(row) for row in rows])
 
 
-def _write_csv(path: Path, flat: Sequence[dict[str, object]]) -> None:
+def _write_csv(path: Path, header: Sequence[str], flat: Sequence[dict[str, object]]) -> None:
     text = io.StringIO(newline="")
-    if flat:
-        writer = csv.DictWriter(text, flat[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(flat)
+    writer = csv.DictWriter(text, header, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
     write_atomic(path, text.getvalue())
 
 
@@ -262,19 +269,24 @@ def write_comparisons(
 
 
 def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None:
-    """Write a spreadsheet of paired differences as shares of 1, with their 95 % intervals."""
+    """Write a spreadsheet of paired differences as shares of 1, with their 95 % intervals; of few
+    rounds without, as in the table."""
+    names = ["first", "second", "scenario", "objects", "depth_noise"]
+    figures = [
+        (measure, name)
+        for measure in ("success", "cleared")
+        for name in ("value", "low", "high", "rounds")
+    ]
     flat = []
     for pair in comparisons:
-        line: dict[str, object] = {
-            name: getattr(pair, name)
-            for name in ("first", "second", "scenario", "objects", "depth_noise")
-        }
-        for measure in ("success", "cleared"):
-            difference = getattr(pair, measure)
-            for name in ("value", "low", "high", "rounds"):
-                line[f"{measure}_{name}"] = getattr(difference, name, None)
+        line: dict[str, object] = {name: getattr(pair, name) for name in names}
+        for measure, name in figures:
+            difference: Difference | None = getattr(pair, measure)
+            few = difference is not None and difference.rounds < FEW_ROUNDS
+            hidden = difference is None or (few and name in ("low", "high"))
+            line[f"{measure}_{name}"] = None if hidden else getattr(difference, name)
         flat.append(line)
-    _write_csv(path, flat)
+    _write_csv(path, [*names, *("_".join(figure) for figure in figures)], flat)
 
 
 def write_comparisons_latex(path: Path, comparisons: Sequence[Comparison]) -> None:

@@ -52,6 +52,11 @@ class GitState(NamedTuple):
     dirty: bool | None
 
 
+def portable_name(text: str) -> str:
+    """A name of a file or folder on every system, of text that may hold paths or MODULE:NAME."""
+    return re.sub(r"[^\w.+-]", "_", text)
+
+
 # --- Command line and exit status -------------------------------------------------------------
 
 
