@@ -39,13 +39,15 @@ cluster: $(VENV)/.installed-cluster
 	$(BIN)/dask worker tcp://127.0.0.1:8786 --nworkers $(WORKERS) --nthreads 1
 
 # The chances of success of all planners, fitted again to executed grasps: half an hour or more on two cores.
+# The runs' names are their time and just this: a run called my-calibration is none of them.
+STAMP := [0-9]*-[0-9][0-9][0-9][0-9][0-9][0-9]
 calibration: $(INSTALLED)
 	$(BIN)/python evaluate.py --config configs/calibration.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_household.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_flat.yaml
-	$(BIN)/python -m benchmarks.calibrate $$(ls -d runs/evaluate/*-calibration | tail -1) \
-		$$(ls -d runs/evaluate/*-calibration-household | tail -1) \
-		$$(ls -d runs/evaluate/*-calibration-flat | tail -1) --output checkpoints/calibration.json
+	$(BIN)/python -m benchmarks.calibrate $$(ls -d runs/evaluate/$(STAMP)-calibration | tail -1) \
+		$$(ls -d runs/evaluate/$(STAMP)-calibration-household | tail -1) \
+		$$(ls -d runs/evaluate/$(STAMP)-calibration-flat | tail -1) --output checkpoints/calibration.json
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q $(PARALLEL) --durations=10 $(ARGS)

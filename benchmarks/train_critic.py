@@ -249,7 +249,7 @@ def judged(critic: GraspCritic, examples: Examples) -> dict[str, float]:
         ):
             first = first_of_plans(examples.where(own), score[own])
             scores[f"{name} by {kind}"] = float(first.mean())
-            scores[f"{name} by {kind} +-"] = 1.96 * float(first.std() / np.sqrt(len(first)))
+            scores[f"{name} by {kind} +-"] = half_width(first, scene_of_plans(examples.where(own)))
     scores["calibration error"] = calibration_error(chance, examples.success)
     scores["log loss"] = log_loss(chance, examples.success)
     return scores
@@ -286,7 +286,7 @@ def compared(
         change = 100 * (new - old)
         lines.append([
             name, str(len(old)), f"{100 * old.mean():.1f} %", f"{100 * new.mean():.1f} %",
-            f"{change.mean():+.1f} +- {1.96 * change.std() / np.sqrt(len(change)):.1f}",
+            f"{change.mean():+.1f} +- {half_width(change, scene_of_plans(own)):.1f}",
             *(f"{log_loss(chance[group], own.success):.3f}" for chance in (before, after)),
         ])  # fmt: skip
     header = ["plans of", "plans", "before", "after", "difference", "log loss", "after"]
@@ -303,6 +303,20 @@ def first_of_plans(examples: Examples, score: np.ndarray) -> np.ndarray:
     order = np.lexsort((-score, examples.plan))
     _, first = np.unique(examples.plan[order], return_index=True)
     return examples.success[order][first]
+
+
+def scene_of_plans(examples: Examples) -> np.ndarray:
+    """For each plan, in the order of `first_of_plans`, the number of its scene."""
+    _, first = np.unique(examples.plan, return_index=True)
+    return examples.scene[first]
+
+
+def half_width(values: np.ndarray, scene: np.ndarray) -> float:
+    """Of the 95 % interval of the mean of values (N,), of which those of one scene (N,) are not
+    independent: as of the sums of whole scenes."""
+    _, number = np.unique(scene, return_inverse=True)
+    off = np.bincount(number, weights=values - values.mean())
+    return float(1.96 * np.sqrt(off @ off) / len(values))
 
 
 if __name__ == "__main__":

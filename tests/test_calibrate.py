@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -196,3 +197,13 @@ def test_one_command_plays_every_config_and_fits_to_all_their_runs() -> None:
     fitted = done.stdout.split("benchmarks.calibrate")[1]
     assert set(re.findall(r"runs/evaluate/\*-(\S+)", fitted)) == {*CONFIGS}
     assert f"--output {CALIBRATIONS.relative_to(ROOT)}" in fitted
+
+
+def test_make_calibration_takes_its_own_runs_alone():
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (stamp,) = re.findall(r"^STAMP := (.*)$", text, re.MULTILINE)
+    assert text.count("runs/evaluate/$(STAMP)-calibration") == 3
+    own = "20261127-171555-calibration"
+    assert fnmatch(own, f"{stamp}-calibration")
+    for other in ("20261127-171555-my-calibration", f"{own}-household", f"{own}-flat"):
+        assert not fnmatch(other, f"{stamp}-calibration")

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.train_critic import collect, compared, first_of_plans, fit, judged
+from benchmarks.train_critic import (
+    collect,
+    compared,
+    first_of_plans,
+    fit,
+    half_width,
+    judged,
+    scene_of_plans,
+)
 from benchmarks.train_critic import main as train
 from envs.critic_examples import PLANNERS, Examples
 from models.grasp_critic import INPUTS, GraspCritic
@@ -35,6 +43,17 @@ def test_the_first_of_each_plan_is_the_one_of_highest_score() -> None:
     examples = made_up(2, 0)._replace(plan=np.repeat([4, 9], 12))
     score = np.arange(24.0) % 12
     np.testing.assert_array_equal(first_of_plans(examples, score), examples.success[[11, 23]])
+
+
+def test_plans_of_one_scene_are_not_independent() -> None:
+    """Of ten scenes whose four plans end alike, the mean is as certain as of ten plans."""
+    ends, scene = np.array([1.0, 0, 0, 1, 1, 0, 1, 1, 1, 0]), np.arange(10)
+    alone = half_width(ends, scene)
+    assert alone == pytest.approx(1.96 * ends.std() / np.sqrt(10))
+    assert half_width(np.repeat(ends, 4), np.repeat(scene, 4)) == pytest.approx(alone)
+    examples = made_up(3, 0)
+    plans = len({*examples.plan}) // 3
+    assert [*scene_of_plans(examples)] == [*np.repeat([0, 1, 2], plans)]
 
 
 def test_the_same_examples_give_the_same_critic() -> None:
