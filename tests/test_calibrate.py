@@ -195,7 +195,7 @@ def test_one_command_plays_every_config_and_fits_to_all_their_runs() -> None:
     played = re.findall(r"evaluate.py --config (\S+)", done.stdout)
     assert {load_config(ROOT / file).evaluate.name for file in played} == {*CONFIGS}
     fitted = done.stdout.split("benchmarks.calibrate")[1]
-    assert set(re.findall(r"runs/evaluate/\*-(\S+)", fitted)) == {*CONFIGS}
+    assert set(re.findall(r"runs/evaluate/\S+\]-([\w-]+)", fitted)) == {*CONFIGS}
     assert f"--output {CALIBRATIONS.relative_to(ROOT)}" in fitted
 
 
