@@ -1,12 +1,11 @@
 """The plan of an evaluation, and playing it."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import changed_keys, load_config
 from utils.errors import UserError
@@ -26,7 +25,7 @@ from utils.evaluation import (
 )
 from utils.report import GalleryItem
 from utils.result_records import Sample, append_round, read_rounds
-from utils.runs import REPOSITORY, new_run_folder
+from utils.runs import new_run_folder
 
 
 def test_tasks_cover_the_plan_once(config):
@@ -175,19 +174,12 @@ def test_a_round_that_was_played_twice_is_refused(tmp_path):
 
 def test_two_processes_do_not_play_the_same_run(tmp_path):
     journal = tmp_path / "rounds.jsonl"
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom utils.result_records import writing\n"
-        "with writing(Path(sys.argv[1])):\n    print('at it', flush=True)\n    input()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(journal)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, cwd=REPOSITORY,
-    ) as other:  # fmt: skip
-        assert other.stdout.readline() == "at it\n"
+    with another_process_within(
+        "from utils.result_records import writing", "writing(argument)", journal
+    ):
         with pytest.raises(UserError, match="rounds.jsonl: another process is adding rounds"):
             play(one_worker(), tmp_path, known_round)
         assert not journal.exists()
-        other.kill()
     assert play(one_worker(), tmp_path, known_round).rounds == ROUNDS
 
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 
+from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG
 from utils.atomic_files import write_atomic, write_json_atomic
 from utils.config import ConfigError, load_config
@@ -177,17 +178,12 @@ def test_what_changes_when_a_run_is_resumed_stays_changed(tmp_path):
 
 
 def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom utils.config import load_config\n"
-        "from utils.runs import open_run\n"
-        "with open_run(None, 'train_rl', None, load_config(), Path(sys.argv[1])) as run:\n"
-        "    print(run, flush=True)\n    input()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, cwd=REPOSITORY,
-    ) as other:  # fmt: skip
-        run = Path(other.stdout.readline().strip())
+    with another_process_within(
+        "from utils.config import load_config\nfrom utils.runs import open_run",
+        "open_run(None, 'train_rl', None, load_config(), argument)",
+        tmp_path,
+    ) as folder:
+        run = Path(folder)
         before, config = (run / "config.yaml").read_text(), load_config(None, ["seed=9"])
         alone = Team(0, 1, torch.device("cpu"))
         for opened in (
@@ -197,7 +193,6 @@ def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
             with pytest.raises(UserError, match="another process works in this run"), opened:
                 pass
         assert (run / "config.yaml").read_text() == before
-        other.kill()
     with run_folder("train_rl", None, config, run, alone):
         assert (run / "config.yaml").read_text() != before
 
