@@ -408,11 +408,12 @@ def cornell(say: Say, part: Figures) -> str:
             continue
         cells = [columns.get(name) for name in ("cornell", "cornell_as_taken")]
         lines.append([row["policy"], row["training"], *(
-            "-" if one is None else rate(one["successes"], one["trials"]) for one in cells
+            "-" if one is None else rate(one["successes"], one["trials"], one["success_ci95"])
+            for one in cells
         )])  # fmt: skip
     folds = part["commands"]["folds"]
     lines.append(["GraspNet, five folds by object", "taught by the other folds' labels", "-",
-                  rate(folds["correct"], folds["images"])])  # fmt: skip
+                  rate(folds["correct"], folds["images"], folds["accuracy_ci95"])])  # fmt: skip
     header = ["policy", "training", "seen from above", "as taken"]
     return "\n\n".join([table(header, lines), origin(say, part)])
 

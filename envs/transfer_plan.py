@@ -22,6 +22,7 @@ from utils.evaluation import depth_noises_of, policies_of
 from utils.rectangles import RealSample
 from utils.result_records import OPEN_LOOP
 from utils.runs import portable_name
+from utils.statistics import counts_by_group
 from utils.transfer import Column, Score, TransferLine
 
 # --- The columns ----------------------------------------------------------------------------------
@@ -176,7 +177,9 @@ def score_photographs(
         if judged is None:
             continue
         shown = [(sample, one) for sample, one in zip(samples, judged) if one is not None]
-        scores[name] = Score(sum(one.correct for _, one in shown), len(samples))
+        right = [one is not None and one.correct for one in judged]
+        by_object = counts_by_group([sample.object_id for sample in samples], right)
+        scores[name] = Score(sum(right), len(samples), tuple(by_object))
         if shown:
             picture = pictures / f"{portable_name(row.planner)}-{name}.png"
             draw_rectangles(picture, *zip(*shown))

@@ -31,7 +31,7 @@ from utils.config import Config
 from utils.errors import UserError
 from utils.real_data import FORMATS, open_real_data
 from utils.rectangles import RealSample, View
-from utils.statistics import wilson_interval
+from utils.statistics import clustered_interval, counts_by_group
 
 MAX_WIDTH = 0.25  # m: the widest label of Cornell's folder 01 opens 0.22 m; no Panda hand does
 IN_MEMORY = 1000  # data sets of up to so many images are decoded once: all of Cornell, 2 GB
@@ -233,15 +233,18 @@ def describe_folds(config: Config, judged: Mapping[int, Sequence[Judged]]) -> st
     which = f"{len(judged)} of {config.data.folds} folds by {config.data.split}"
     return (
         f"{config.data.kind}, {which}: {right} of {count} correct, {100 * right / count:.1f} % "
-        f"[{100 * low:.1f}, {100 * high:.1f}] (95 % Wilson; {METRIC}; fixed schedule, last weights)"
+        f"[{100 * low:.1f}, {100 * high:.1f}] (95 %, by object; {METRIC}; "
+        "fixed schedule, last weights)"
     )
 
 
 def pooled(judged: Mapping[int, Sequence[Judged]]) -> tuple[int, int, tuple[float, float]]:
-    """Return the number of correct images, of all, and the Wilson interval, over all folds."""
+    """Return the number of correct images, of all, and the 95 % interval, over all folds. Images of
+    one object are not independent."""
     every = [one for fold in judged.values() for one in fold]
-    right = sum(one.correct for one in every)
-    return right, len(every), wilson_interval(right, len(every))
+    right = [one.correct for one in every]
+    by_object = counts_by_group([one.object_id for one in every], right)
+    return sum(right), len(every), clustered_interval(by_object)
 
 
 def cross_validation_results(

@@ -6,6 +6,7 @@ from scipy.stats import binomtest
 
 from utils.statistics import (
     clustered_interval,
+    counts_by_group,
     mean_maximum_rank_violation,
     paired_difference_interval,
     pearson_correlation,
@@ -63,6 +64,13 @@ def test_clustered_interval_is_wilsons_where_rounds_do_not_matter():
     assert clustered_interval([(0, 0)]) == (0.0, 1.0)
     with pytest.raises(ValueError, match="more successes"):
         clustered_interval([(2, 1)])
+
+
+def test_trials_are_counted_by_group():
+    groups, right = ["cup", "pan", "cup", "pan", "pot"], [True, False, False, True, True]
+    assert counts_by_group(groups, right) == [(1, 2), (1, 2), (1, 1)]
+    with pytest.raises(ValueError, match="shorter"):
+        counts_by_group(groups, right[:4])
 
 
 def test_clustered_interval_holds_the_truth_where_rounds_end_early():

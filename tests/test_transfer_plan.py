@@ -3,6 +3,7 @@
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,8 @@ from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
 from utils.evaluation import Outcome, depth_noises_of
 from utils.rectangles import GraspRectangle
-from utils.transfer import pairs_of
+from utils.statistics import clustered_interval
+from utils.transfer import Score, pairs_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 REPORT = REPOSITORY / "configs" / "sim_to_real.yaml"
@@ -157,16 +159,32 @@ def test_rows_that_cannot_see_photographs_have_no_score_there(tmp_path):
 def test_pictures_and_folders_have_names_of_their_own_on_every_system(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(transfer_plan, "draw_rectangles", lambda path, *_: drawn.append(path.name))
-    judged = Judged("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, True, 1.0, 0.0)
-    column = PhotographColumn("A", judge=lambda *_: [judged])
+    column = PhotographColumn("A", judge=lambda *_: [judgement(True)])
     monkeypatch.setitem(COLUMNS, "a", column)
     config = load_config(None, ["transfer.columns=a"])
     for planner in ("my_module:plan", "your_module:plan", "heuristic"):
         row = TransferPolicy("a", "-", planner, None, None)
-        score_photographs(row, [None], config, tmp_path)
+        score_photographs(row, [SimpleNamespace(object_id="cup")], config, tmp_path)
     assert drawn == ["my_module_plan-a.png", "your_module_plan-a.png", "heuristic-a.png"]
     scenes = Scenes(("pile", "packed"), ("my_module:objects", "path/to/meshes"))
     assert scenes.folder == "pile-packed_of_my_module_objects-path_to_meshes"
+
+
+def test_photographs_of_one_object_are_not_taken_as_independent(tmp_path, monkeypatch):
+    """The cup is right in all four photographs, the pan in none, of which one shows no grasp."""
+    monkeypatch.setattr(transfer_plan, "draw_rectangles", lambda *_: None)
+    judged = [judgement(right) for right in (True, False) * 3] + [judgement(True), None]
+    monkeypatch.setitem(COLUMNS, "a", PhotographColumn("A", judge=lambda *_: judged))
+    samples = [SimpleNamespace(object_id=name) for name in ("cup", "pan") * 4]
+    row = TransferPolicy("a", "-", "heuristic", None, None)
+    score = score_photographs(row, samples, load_config(None, ["transfer.columns=a"]), tmp_path)
+    assert score == {"a": Score(4, 8, ((4, 4), (0, 4)))}
+    # Two objects that are right or wrong as a whole tell no more than two photographs would.
+    assert score["a"].ci95 == clustered_interval([1, 0])
+
+
+def judgement(right):
+    return Judged("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, right, 1.0, 0.0)
 
 
 @pytest.mark.parametrize("ended", [{"interrupted": True}, {"error": UserError("no room")}, {}])

@@ -5,6 +5,7 @@ This module knows numbers only, nothing of grasps or simulators.
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,7 @@ def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[f
     """Interval of the rate sum(successes) / sum(trials) of rounds, (low, high) in [0, 1].
 
     outcomes: (R, 2) successes and trials of each round, or (R,) 0/1 as in
-        `paired_difference_interval`.
+        `paired_difference_interval`. Photographs of one object count as a round.
 
     Trials of one round share a scene, and a round may end early, so that they are not independent:
     rounds are. Wilson's interval is taken of as many independent trials as tell as much, n divided
@@ -51,6 +52,16 @@ def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[f
         off = counts[:, 0] - rate * counts[:, 1]
         effect = max(rounds / (rounds - 1) * (off @ off) / (n * rate * (1 - rate)), 1.0)
     return _score_interval(rate, n / effect, confidence)
+
+
+def counts_by_group(groups: Iterable[Hashable], right: Iterable[bool]) -> list[tuple[int, int]]:
+    """Successes and trials of each group, for `clustered_interval`: trials that share an object or
+    a scene are one group. groups, right: of each trial. Raises ValueError for unequal lengths."""
+    counts: dict[Hashable, tuple[int, int]] = {}
+    for group, success in zip(groups, right, strict=True):
+        successes, trials = counts.get(group, (0, 0))
+        counts[group] = (successes + bool(success), trials + 1)
+    return list(counts.values())
 
 
 def _score_interval(rate: float, n: float, confidence: float) -> tuple[float, float]:

@@ -49,13 +49,13 @@ class Column:
 class Score:
     """Successes in a number of trials, which are executed grasps or photographs.
 
-    by_scene: successes and trials of each scene, whose trials are not independent; None where each
-        trial is on its own, as photographs are.
+    by_group: successes and trials of each scene, or of each object that was photographed, since
+        trials of one group are not independent; None where each trial is on its own.
     """
 
     successes: int
     trials: int
-    by_scene: tuple[tuple[int, int], ...] | None = None
+    by_group: tuple[tuple[int, int], ...] | None = None
 
     @property
     def rate(self) -> float | None:
@@ -63,8 +63,8 @@ class Score:
 
     @property
     def ci95(self) -> tuple[float, float]:
-        if self.by_scene is not None:
-            return clustered_interval(self.by_scene)
+        if self.by_group is not None:
+            return clustered_interval(self.by_group)
         return wilson_interval(self.successes, self.trials)
 
 
