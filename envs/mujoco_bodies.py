@@ -8,7 +8,7 @@ compiled. This module knows no cell, robot or camera.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from typing_extensions import Self
@@ -40,7 +40,7 @@ _PARKED = (0.0, 0.0, -10.0)  # m in W, where an object is that is not on the tab
 # --- Physics and shapes -----------------------------------------------------------------------
 
 # MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
-# fingers: with nothing on these here, the object's own coefficient counts in both.
+# fingers: these have none here, and `add_pairs` states what counts.
 NO_FRICTION = 1e-5
 # Of an object's friction on bin, palm and arm: Bullet's coefficient where none is stated, which is
 # theirs there, and by which Bullet multiplies the object's.
@@ -138,6 +138,37 @@ def add_object(
     return body
 
 
+class Touched(NamedTuple):
+    """A shape that objects touch. share: of an object's sliding friction, on it. patch: m, torque
+    about the normal over the friction force, where it holds one."""
+
+    geom: mujoco.MjsGeom
+    share: float = 1.0
+    patch: float = 0.0
+
+
+def add_pairs(spec: mujoco.MjSpec, objects: Sequence[str], touched: Sequence[Touched]) -> None:
+    """Give the contacts of objects, which are bodies' names, parameters of their own.
+
+    Sliding friction is the object's times what each shape of `touched` has of it. What is left to
+    the object's shapes is contact with other objects: they get the square of its coefficient.
+    Rolling friction is what MuJoCo would take from the two shapes.
+    """
+    for number, other in enumerate(touched):
+        other.geom.name = other.geom.name or f"touched{number}"
+    for name in objects:
+        for number, shape in enumerate(spec.body(name).geoms):
+            shape.name = f"{name}_{number}"
+            for geom, share, patch in touched:
+                sliding = share * shape.friction[0]
+                rolling = max(shape.friction[2], geom.friction[2])
+                pair = spec.add_pair(geomname1=shape.name, geomname2=geom.name)
+                pair.friction = [sliding, sliding, patch * sliding, rolling, rolling]
+                pair.condim = max(shape.condim, 4 if patch else 3)
+                pair.solref, pair.solimp = shape.solref, shape.solimp
+            shape.friction[0] **= 2
+
+
 def _add_shapes(spec: mujoco.MjSpec, body, name: str, model: ObjectModel) -> list:
     """Give a body its object's shape: a native one, or a mesh for each convex part."""
     mujoco = load_mujoco()
@@ -203,6 +234,9 @@ class MujocoTable(LayoutTable):
         for number, model in enumerate(self._models):
             body = add_object(self._spec, _name(number), model, _PARKED, (0.0, 0.0, 0.0, 1.0))
             body.gravcomp = 1.0  # else the compiled model would never compensate gravity
+        # Walls that come and go are left out: half of the usual coefficient of 0.5 is its square.
+        table = [Touched(geom) for geom in self._spec.body("table").geoms]
+        add_pairs(self._spec, [_name(number) for number in range(len(self._models))], table)
         self._model = self._spec.compile()
         self._data = self._mujoco.MjData(self._model)
         self._walls = 0

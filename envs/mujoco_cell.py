@@ -30,9 +30,11 @@ from envs.mujoco_bodies import (
     OF_OTHER_BODIES,
     ROLLING,
     SUBSTEPS,
+    Touched,
     add_board,
     add_boxes,
     add_object,
+    add_pairs,
     set_up_physics,
     settle,
     wake,
@@ -79,42 +81,19 @@ def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujo
         exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
     for geom in spec.geoms:
         geom.solref[0] = CONTACT_TIME
-    _add_pairs(spec, len(scene.placements))
+    bodies = [body for body in spec.bodies if not _OBJECT.fullmatch(body.name)]
+    objects = [f"object{i}" for i in range(len(scene.placements))]
+    add_pairs(spec, objects, [shape for body in bodies for shape in _touched(body)])
     add_view(spec)
     return spec
 
 
-def _add_pairs(spec: mujoco.MjSpec, count: int) -> None:
-    """Give the contacts of the objects with table, bin and robot parameters of their own.
-
-    Sliding friction is the object's on table and fingertips, and `OF_OTHER_BODIES` times that on
-    bin, palm and arm, as in PyBullet. What is left to the shape is contact with other objects: it
-    gets the square of the object's coefficient. Rolling friction is what MuJoCo would take from the
-    two shapes. Torsional friction, a fourth dimension of a contact, is the fingertips' alone.
-    `envs.mujoco_randomization` changes all of them.
-    """
-    own = ("table", *FINGERS)
-    touched = [
-        (geom, 1.0 if body.name in own else OF_OTHER_BODIES,
-         FINGER_SURFACE.spinning if body.name in FINGERS else 0.0)
-        for body in spec.bodies
-        if not _OBJECT.fullmatch(body.name)
-        for geom in body.geoms
-        if geom.contype
-    ]  # fmt: skip
-    for number, (geom, _, _) in enumerate(touched):
-        geom.name = geom.name or f"touched{number}"
-    for i in range(count):
-        for number, shape in enumerate(spec.body(f"object{i}").geoms):
-            shape.name = f"object{i}_{number}"
-            for other, share, patch in touched:
-                sliding = share * shape.friction[0]
-                rolling = max(shape.friction[2], other.friction[2])
-                pair = spec.add_pair(geomname1=shape.name, geomname2=other.name)
-                pair.friction = [sliding, sliding, patch * sliding, rolling, rolling]
-                pair.condim = max(shape.condim, 4 if patch else 3)
-                pair.solref, pair.solimp = shape.solref, shape.solimp
-            shape.friction[0] **= 2
+def _touched(body: mujoco.MjsBody) -> list[Touched]:
+    """The shapes of a body that is no object, with the shares of friction that PyBullet's have;
+    fingertips alone hold a torque. `envs.mujoco_randomization` changes all of them."""
+    share = 1.0 if body.name in ("table", *FINGERS) else OF_OTHER_BODIES
+    patch = FINGER_SURFACE.spinning if body.name in FINGERS else 0.0
+    return [Touched(geom, share, patch) for geom in body.geoms if geom.contype]
 
 
 class MujocoCell(Cell):
