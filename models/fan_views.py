@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -25,9 +25,10 @@ from utils.seen_heights import (
     GRAZING_JUMP,
     GRAZING_SHARES,
     HOLE_RISE,
+    MOST_SHARES,
     STEEPEST,
-    SUBPIXELS,
     WALL,
+    subpixels,
 )
 from utils.transforms import RGBDFrame, known_depth
 
@@ -193,6 +194,7 @@ class _Drawing:
         cell: float,
     ):
         self._shape, self._device = shape, frames.device
+        self._split = subpixels(frame, cell)
         # From a pixel times its depth to columns, rows and metres of each view.
         to_view = torch.linalg.inv(frames) @ frames.new_tensor(np.asarray(frame.T_WC, float))
         steps = torch.tensor([1 / cell, 1 / cell, 1.0], dtype=torch.float64, device=self._device)
@@ -207,7 +209,7 @@ class _Drawing:
         depth = self._tensor(depth)
         row, column = torch.nonzero(_known(depth), as_tuple=True)
         depth = depth[row, column]
-        sub = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+        sub = (np.arange(self._split) + 0.5) / self._split - 0.5
         return self._highest(
             self._points(torch.stack([column + du, row + dv]), depth)
             for dv, du in itertools.product(sub.tolist(), sub.tolist())
@@ -216,8 +218,9 @@ class _Drawing:
     def grazing(self, depth: np.ndarray) -> torch.Tensor:
         """(B, R, C) the same of points on the rays between neighbouring pixels that lie beside a
         step of the depth."""
-        depth = self._tensor(depth)
-        parts = []
+        return self._highest(self._grazing_points(self._tensor(depth)))
+
+    def _grazing_points(self, depth: torch.Tensor) -> Iterator[torch.Tensor]:
         for down, right in ((0, 1), (1, 0)):
             here = depth[: len(depth) - down, : depth.shape[1] - right]
             there = depth[down:, right:]
@@ -227,12 +230,30 @@ class _Drawing:
                 continue
             near = self._points(torch.stack([column, row]), here[row, column])
             far = self._points(torch.stack([column + right, row + down]), there[row, column])
-            longest = (far - near)[:, :2].norm(dim=1).amax(dim=1)
-            count = (2 * longest).clamp(2, GRAZING_SHARES).long()[:, None, None, None]
-            share = torch.arange(GRAZING_SHARES, device=self._device)[:, None] / (count - 1)
-            points = near[:, :, None] + share.clamp(max=1.0) * (far - near)[:, :, None]
-            parts.append(points.flatten(2))
-        return self._highest(parts)
+            cells = 2 * (far - near)[:, :2].norm(dim=1)  # (B, N) halves
+            longest = cells.amax(dim=1)
+            yield from self._between(near, far, longest.clamp(2, GRAZING_SHARES).long())
+            far_reaching = cells > GRAZING_SHARES
+            some = far_reaching.any(dim=0)
+            if some.any():
+                near, far, longer = near[..., some], far[..., some], far_reaching[:, None, some]
+                for points in self._between(near, far, longest.clamp(2, MOST_SHARES).long()):
+                    column, row, z = points.split(1, dim=1)
+                    z = torch.where(
+                        longer.repeat(1, 1, z.shape[2] // longer.shape[2]), z, -torch.inf
+                    )
+                    yield torch.cat([column, row, z], dim=1)
+
+    def _between(
+        self, near: torch.Tensor, far: torch.Tensor, count: torch.Tensor
+    ) -> Iterator[torch.Tensor]:
+        """(B, 3, M x N) points on the lines between `near` and `far` (B, 3, N), in a view as many
+        on each as `count` (B,) says; not all at once, because a thousand fill a memory."""
+        count = count[:, None, None, None]
+        shares = torch.arange(int(count.max()), device=self._device)[:, None]
+        for some in shares.split(GRAZING_SHARES):
+            share = (some / (count - 1)).clamp(max=1.0)
+            yield (near[:, :, None] + share * (far - near)[:, :, None]).flatten(2)
 
     def _points(self, pixels: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         """(B, 3, N) float32 columns, rows and metres of pixels (2, N) at depths (N,)."""
@@ -308,7 +329,7 @@ def _table_slopes(
     steep_x, steep_y, up, middle = frames[:, 2].T[..., None, None]
     level = (table - middle) - steep_x * (origin[0] + cell * columns)
     level = level - steep_y * (origin[1] + cell * rows)[:, None]
-    return (level / up.clamp(min=STEEPEST)).clamp(-FARTHEST, FARTHEST).float()
+    return (level / up.clamp(min=STEEPEST)).clamp(table - FARTHEST, table + FARTHEST).float()
 
 
 def _in_world(

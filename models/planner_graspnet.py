@@ -354,7 +354,7 @@ class NetworkView:
         table = workspace.table_height
         self._first = _Prediction(network, frame, table, crop)
         self._second = None
-        if frame.second is not None:
+        if frame.second is not None and known_depth(frame.second.depth).any():
             self._second = _Prediction(network, frame.second, table)
         self.frame = self._first.frame
         towards = frame.T_WC[:3, 3] - [*workspace.centre, table]

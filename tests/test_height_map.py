@@ -172,6 +172,29 @@ def test_what_lies_beyond_the_workspace_without_surrounding_it_is_an_object() ->
     assert set(np.unique(heights.label)) == {-1, 0, 1}
 
 
+def test_objects_on_all_sides_are_no_walls() -> None:
+    """Five boxes with their middles outside the workspace, 38 cm together, 16 on one side."""
+    edge = 0.165
+    places = [(edge, -0.1), (edge, 0.1), (-edge, 0.0), (-0.05, edge), (0.0, -edge)]
+    boxes = [((0.04, 0.08, 0.05), 0.0, (0.5 + x, y)) for x, y in places]
+    heights = height_map_from_frame(boxes_frame(boxes), Workspace())
+    assert heights.label.max() >= 4 and WALL_LABEL not in heights.label
+
+
+def test_a_stick_far_from_an_object_is_no_part_of_it() -> None:
+    """It stands 4 x 4 mm wide, 11 cm from a token; 1 cm from it, it may be what was seen of its
+    rim."""
+    token = ((0.03, 0.04, 0.012), 0.0, (0.42, 0.0))
+    alone = height_map_from_frame(boxes_frame([token]), Workspace())
+    for place, count in ((0.53, 0), (0.445, 1)):
+        both = boxes_frame([token, ((0.004, 0.004, 0.10), 0.0, (place, 0.0))])
+        heights = height_map_from_frame(both, Workspace())
+        stick = heights.height > 0.05
+        assert stick.sum() >= 4 and set(np.unique(heights.label[stick])) == {count - 1}
+        if not count:
+            np.testing.assert_allclose(heights.centres, alone.centres, atol=1e-3)
+
+
 def test_only_the_hidden_strip_behind_a_box_may_hold_more_than_is_seen() -> None:
     # Outer face at x = 0.62, 0.05 high: the camera, 0.75 over its edge, hides
     # 0.12 * 0.05 / 0.75 = 8 mm of the table behind it.

@@ -80,3 +80,12 @@ def test_the_dome_looks_at_the_workspace_from_everywhere() -> None:
         assert (pixels >= 0).all() and (pixels < 224).all() and (depth > 0).all()
     azimuths = np.sort([azimuth_of(T_WC) for T_WC in poses])
     assert np.diff(azimuths).max() <= 30 + 1e-6
+
+
+@pytest.mark.parametrize("zoom", [1, 3, 6])
+def test_the_view_that_hid_something_does_not_show_it(zoom: int) -> None:
+    """Matter is as opaque to a camera of many pixels as to one of few."""
+    space = open_space(0)
+    K_zoomed = K * [[zoom, zoom, zoom], [zoom, zoom, zoom], [1, 1, 1]]
+    shown = space.shown(K_zoomed, (224 * zoom, 224 * zoom), from_side(0))
+    assert shown < 0.03 * space.volume

@@ -24,7 +24,7 @@ from utils.target import (
     target_at,
     target_in_box,
 )
-from utils.transforms import RGBDFrame, project
+from utils.transforms import RGBDFrame, look_at, project
 
 SEARCHING = [name for name in PLANNERS if name != "random"]
 LEFT, RIGHT = (0.46, -0.07), (0.54, 0.07)  # x, y of two boxes with room for fingers around each
@@ -207,6 +207,18 @@ def test_a_point_takes_the_object_it_lies_on(frame, labels) -> None:
         assert (np.abs(seen[:, :2] - place) < np.array(BOX[:2]) / 2 + 0.004).all()
         # Of the top, 0.75 m below the camera, a pixel shows 0.75^2 / 390.6^2 m2.
         assert target.sum() * 0.75**2 / 390.6**2 == pytest.approx(0.04 * 0.09, rel=0.15)
+
+
+def test_the_board_over_an_object_is_no_part_of_it() -> None:
+    """Seen from higher than the shelf's board, on whose top many of its pixels lie over the box."""
+    shelf = [((0.40, 0.26, 0.02), 0.0, (0.5, -0.06, 0.30)), ((0.40, 0.02, 0.30), 0.0, (0.5, -0.18))]
+    view = look_at((0.5, 0.45, 0.75), (0.5, 0.0, 0.15), (0, 0, 1))
+    frame = boxes_frame([((0.05, 0.05, 0.12), 0.3, (0.5, 0.03)), *shelf], walls=2, T_WC=view)
+    frame = replace(frame, fixtures=frame.truth.walls)
+    planner = make_planner("heuristic6d", GripperGeometry(), Workspace(), 0)
+    labels, height = planner.segments(frame), frame.points()[..., 2]
+    assert (labels[height > 0.29] == -1).all() and (height > 0.29).sum() > 1000
+    assert (labels[(height > 0.02) & (height < 0.13)] == 0).sum() > 100
 
 
 def test_a_point_in_a_hole_of_the_depth_takes_the_object_around(frame, labels) -> None:

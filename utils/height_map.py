@@ -36,7 +36,8 @@ OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
 LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
-_HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
+HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
+SLIVER = 0.02  # m from an object, within which what is too small for one is part of it
 _LEAST_RISE = 0.001  # m of a labelled surface over what it rests on
 RIM = 3  # cells from a label, in which a tilted view takes it for unlabelled matter
 PIVOT_HEIGHT = 0.05  # m over the table, of the point about which a view is tilted
@@ -214,7 +215,7 @@ def _hung(points: np.ndarray, hanging: Sequence[ConvexSolid]) -> np.ndarray:
     lies on them. NaN belongs to none."""
     found = np.zeros(points.shape[:-1], bool)
     for solid in hanging:
-        low, high = solid.vertices.min(axis=0) - _HUNG, solid.vertices.max(axis=0) + _HUNG
+        low, high = solid.vertices.min(axis=0) - HUNG, solid.vertices.max(axis=0) + HUNG
         inside = (points[..., :2] > low[:2]) & (points[..., :2] < high[:2])
         found |= inside.all(axis=-1) & (points[..., 2] > low[2])
     return found
@@ -236,7 +237,7 @@ def without_rims(
     over it: depth cameras round edges off. fixed: (R, C) the fixtures' tops, -inf beside them."""
     reach = 2 * int(_RIM_REACH / cell) + 1
     window = np.ones((reach, reach))
-    fixed = np.maximum(fixed, -FARTHEST)  # so that heights can be subtracted
+    fixed = np.maximum(fixed, height.min() - FARTHEST)  # so that heights can be subtracted
     near = cv2.dilate(fixed, window)
     edge = near - cv2.erode(fixed, window) > LABEL_FLOOR
     edge &= height < near + _RIM_RISE
@@ -366,14 +367,15 @@ def label_pieces(
     """(R, C) labels of the pieces higher than `floor` over the table, cut where neighbouring cells
     differ by `step`, all in metres.
 
-    Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece.
+    Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece within SLIVER;
+    others stay without a label.
     """
     above = height > table + floor
     label = np.full(height.shape, -1)
     x, y, columns, rows = cv2.boundingRect(above.astype(np.uint8))
     if rows:
         box = np.s_[y : y + rows, x : x + columns]
-        label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2)
+        label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2, int(SLIVER / cell))
     return label
 
 
@@ -382,8 +384,9 @@ def label_walls(
 ) -> np.ndarray:
     """The labels (R, C) of `label_pieces`, with WALL_LABEL on walls around the workspace.
 
-    Pieces that lie mostly outside the workspace are walls if together they are as long as one of
-    its sides; what has merely been pushed over the edge never is. grid: (R, C, 2) cells in W.
+    Pieces that lie mostly outside the workspace are walls if together, beyond one of its sides,
+    they are as long as this side; what has merely been pushed over the edge is not. grid: (R, C, 2)
+    cells in W.
     """
     rows, cols = (
         np.nonzero(np.abs(line - middle) <= workspace.size / 2)[0]
@@ -398,14 +401,21 @@ def label_walls(
     if not outside.any():
         return label
     wall = np.append(outside, False)[label]
-    if cell * max(wall.any(axis=0).sum(), wall.any(axis=1).sum()) < workspace.size:
+    beyond = (
+        wall[: rows[0]].any(axis=0), wall[rows[-1] + 1 :].any(axis=0),
+        wall[:, : cols[0]].any(axis=1), wall[:, cols[-1] + 1 :].any(axis=1),
+    )  # fmt: skip
+    if cell * max(side.sum() for side in beyond) < workspace.size:
         return label
     number = np.append(np.cumsum(~outside) - 1, -1)  # of the pieces that are left
     return np.where(wall, WALL_LABEL, number[label])
 
 
-def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float) -> np.ndarray:
-    """Labels (R, C) as in `label_pieces`, of pieces of more than `smallest` cells."""
+def _pieces(
+    height: np.ndarray, above: np.ndarray, step: float, smallest: float, reach: int
+) -> np.ndarray:
+    """Labels (R, C) as in `label_pieces`, of pieces of more than `smallest` cells; slivers have one
+    at most `reach` cells from such a piece."""
     rows, columns = height.shape
     # Every second pixel is a cell; the pixel between two cells is set where they are connected.
     linked = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
@@ -419,7 +429,9 @@ def _pieces(height: np.ndarray, above: np.ndarray, step: float, smallest: float)
     if not large.any():
         return np.full(height.shape, -1)
     label = (np.cumsum(kept) - 1)[raw]
-    return np.where(above, nearest_values(label, large), -1)
+    near = cv2.dilate(large.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1))) > 0
+    joined = np.unique(raw[near & above])  # slivers join as a whole
+    return np.where(above & np.isin(raw, joined), nearest_values(label, large), -1)
 
 
 def _column_centroids(

@@ -21,7 +21,7 @@ _TILTS = np.deg2rad([30.0, 45.0, 60.0])  # from the vertical
 _AZIMUTHS = 12  # directions around it
 _DISTANCE = 0.45  # m from the middle of the workspace: at 60 degrees of view, all of it is seen
 _VOXEL = 0.006  # m, side
-_BLOCK = 4  # pixels of the camera, side of one of the depth buffer; wider than a voxel in it
+_BLOCK = 4  # pixels of the camera, least side of one of the depth buffer
 
 
 def dome(workspace: Workspace) -> list[np.ndarray]:
@@ -60,11 +60,13 @@ class OpenSpace:
     def shown(self, K: np.ndarray, shape: tuple[int, int], T_WC: np.ndarray) -> float:
         """m3 of it that a camera at T_WC would see past the known matter. K: (3, 3). shape: height
         and width of its image, pixels. What is open does not hide what is behind it."""
-        rows, columns = (side // _BLOCK + 1 for side in shape)
+        # Wider than a voxel at the dome's distance, so that matter leaves no gaps.
+        block = max(_BLOCK, int(np.ceil(_VOXEL * max(K[0, 0], K[1, 1]) / _DISTANCE)) + 1)
+        rows, columns = (side // block + 1 for side in shape)
         nearest = np.full((rows, columns), np.inf, np.float32)
-        index, depth = _blocks(self.matter, K, T_WC, shape)
+        index, depth = _blocks(self.matter, K, T_WC, shape, block)
         np.minimum.at(nearest.reshape(-1), index, depth)
-        index, depth = _blocks(self.points, K, T_WC, shape)
+        index, depth = _blocks(self.points, K, T_WC, shape, block)
         return self.voxel * int((depth <= nearest.reshape(-1)[index] + _VOXEL).sum())
 
 
@@ -79,13 +81,13 @@ def _columns(place: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
 
 
 def _blocks(
-    points: np.ndarray, K: np.ndarray, T_WC: np.ndarray, shape: tuple[int, int]
+    points: np.ndarray, K: np.ndarray, T_WC: np.ndarray, shape: tuple[int, int], block: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The block (N,) of the depth buffer on which each of the points in the image lies, and its
-    depth (N,), metres."""
+    """The number (N,) in the depth buffer, whose blocks have a side of `block` pixels, on which
+    each of the points in the image lies, and its depth (N,), metres."""
     pixels, depth = project(points, K, T_WC)
     rows, columns = shape
     u, v = pixels.T
     within = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
-    u, v = (along[within].astype(np.intp) // _BLOCK for along in (u, v))
-    return v * (columns // _BLOCK + 1) + u, depth[within]
+    u, v = (along[within].astype(np.intp) // block for along in (u, v))
+    return v * (columns // block + 1) + u, depth[within]

@@ -43,11 +43,13 @@ _SEEN_THROUGH = 0.004  # m
 _HIDDEN_BEHIND = 0.01  # m, by which a point has to lie behind a surface to be hidden for certain
 _CARVED = 2  # cells of height that are carved from a ceiling at once
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
-FARTHEST = 1.0  # m, a table in a tilted view is no farther from the pivot
+FARTHEST = 1.0  # m, a table in a tilted view is no farther from the place about which it is tilted
 BORROWED_WITHIN = 0.02  # m, within which a hidden cell takes the lowest surface
 GRAZING_JUMP = 0.006  # m of depth between neighbouring pixels, at which a ray grazes an edge
-GRAZING_SHARES = 60  # points on such a ray, at most
-SUBPIXELS = 2  # points along each side of the square that a pixel stands for
+# Points on such rays, two for each cell of the longest: as many as 30 cells need at most, and again
+# as many as they need on the longer ones, which a camera at the side sees graze what is high.
+GRAZING_SHARES, MOST_SHARES = 60, 1000
+SUBPIXELS = 2  # points along each side of the square that a pixel stands for, at least
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ def seen_heights(
     unknown = ~known_depth(frame.depth)
     to_table = np.where(unknown, depth_of_plane(frame, table), 0) if unknown.any() else None
     frame = replace(frame, T_WC=inverse_pose(T_WV) @ frame.T_WC)
-    seen = _highest(_surface_points(frame, origin, cell), shape)
+    split = subpixels(frame, cell)
+    seen = _highest(_surface_points(frame, origin, cell, split), shape)
     hidden = ~np.isfinite(seen)
     height = _filled(seen, slope, cell)
     # The rays that graze an edge bound the matter in its shadow.
@@ -104,14 +107,17 @@ def seen_heights(
         ceiling = np.where(hidden, ceiling, height)
     if hiding.any():
         nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
-        risen = _highest(_surface_points(nearer, origin, cell), shape)
+        risen = _highest(_surface_points(nearer, origin, cell, split), shape)
         ceiling = np.maximum(ceiling, risen)
     unknown = np.zeros(shape, bool)
     if to_table is not None:
-        below = _highest(_surface_points(replace(frame, depth=to_table), origin, cell), shape)
+        under = _surface_points(replace(frame, depth=to_table), origin, cell, split)
+        below = _highest(under, shape)
         unknown = hidden & np.isfinite(below)
     first = SeenHeights(height, ceiling, hidden, unknown, slope, origin, cell, T_WV)
-    return first if frame.second is None else with_second(first, frame.second)
+    if frame.second is None or not known_depth(frame.second.depth).any():
+        return first
+    return with_second(first, frame.second)
 
 
 def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
@@ -125,7 +131,8 @@ def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
     """
     shape, cell = first.height.shape, first.cell
     second = replace(second, T_WC=inverse_pose(first.T_WV) @ second.T_WC)
-    also = _highest(_surface_points(second, first.origin, cell), shape)
+    split = subpixels(second, cell)
+    also = _highest(_surface_points(second, first.origin, cell, split), shape)
     seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
     height, hidden = _filled(seen, first.slope, cell), ~np.isfinite(seen)
     ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
@@ -214,7 +221,7 @@ def table_slope(
     # Where the hand comes along the table, the table is a wall on one side.
     level = (table - T_WV[2, 3]) - steep_x * (origin[0] + cell * columns)
     slope = (level - steep_y * (origin[1] + cell * rows)[:, None]) / max(up, STEEPEST)
-    return np.clip(slope, -FARTHEST, FARTHEST).astype(np.float32)
+    return np.clip(slope, table - FARTHEST, table + FARTHEST).astype(np.float32)
 
 
 def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np.ndarray]:
@@ -318,11 +325,10 @@ def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
 
 
 def _surface_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int = SUBPIXELS
+    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Columns, rows and z (H, W) of points, split x split times: each pixel stands for that many
-    points of its square, because it covers about 2 mm of the table and single points would leave
-    gaps in a 2 mm grid. Without a depth, z is -inf.
+    points of its square (`subpixels`). Without a depth, z is -inf.
     """
     depth = frame.depth.astype(float)
     unknown = ~known_depth(depth)
@@ -344,6 +350,17 @@ def _surface_points(
         yield tuple(points)
 
 
+def subpixels(frame: RGBDFrame, cell: float) -> int:
+    """Points along each side of the square that a pixel stands for, so that on a surface at the
+    middle depth, which faces the camera, the next one is no farther than a cell: none stays empty.
+    """
+    known = frame.depth[known_depth(frame.depth)]
+    if len(known) == 0:
+        return SUBPIXELS
+    pixel = float(np.median(known)) / min(frame.K[0, 0], frame.K[1, 1])  # m
+    return max(SUBPIXELS, int(np.ceil(pixel / cell)))
+
+
 def _grazing_points(
     frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = GRAZING_JUMP
 ) -> Iterator[np.ndarray]:
@@ -363,6 +380,10 @@ def _grazing_points(
         )
         for end in (near, far):
             end[:2] = (end[:2] - origin[:, None]) / cell
-        cells = np.linalg.norm((far - near)[:2], axis=0).max()
-        share = np.linspace(0, 1, int(np.clip(2 * cells, 2, GRAZING_SHARES)))[:, None]
+        cells = np.linalg.norm((far - near)[:2], axis=0)
+        share = np.linspace(0, 1, int(np.clip(2 * cells.max(), 2, GRAZING_SHARES)))[:, None]
         yield near[:, None] + share * (far - near)[:, None]
+        if (2 * cells > GRAZING_SHARES).any():
+            near, far = (end[:, 2 * cells > GRAZING_SHARES] for end in (near, far))
+            share = np.linspace(0, 1, int(min(2 * cells.max(), MOST_SHARES)))[:, None]
+            yield near[:, None] + share * (far - near)[:, None]

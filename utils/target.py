@@ -17,7 +17,7 @@ import numpy as np
 from utils.depth import nearest_values
 from utils.errors import UserError
 from utils.geometry import Workspace
-from utils.height_map import OTHER_LABEL, HeightMap
+from utils.height_map import HUNG, OTHER_LABEL, HeightMap
 from utils.transforms import RGBDFrame, known_depth, project, transform_points
 
 # Depth cameras and hand-drawn masks are off by some pixels at an edge: nearer to a mask's outline
@@ -129,14 +129,16 @@ def _centroid(heights: HeightMap, cells: np.ndarray) -> np.ndarray:
 
 def pixel_labels(heights: HeightMap, frame: RGBDFrame) -> np.ndarray:
     """(H, W) int32 labels of a map from above at the pixels of its frame: the object over the
-    pixel's place on the table; -1 for the table, beside the map, and where depth is unknown."""
+    pixel's place on the table; -1 for the table, beside the map, where depth is unknown, and for
+    what hangs over the map's surface, such as a board that the map leaves out."""
     points = frame.points()
     known = np.isfinite(points[..., 2])
     place = (np.nan_to_num(points[..., :2]) - heights.origin) / heights.cell
     rows, columns = heights.label.shape
     on_map = known & ((place > -0.5) & (place < (columns - 0.5, rows - 0.5))).all(axis=-1)
-    label = heights.label[heights.index(np.nan_to_num(points[..., :2]))]
-    return np.where(on_map, np.maximum(label, -1), -1).astype(np.int32)
+    cell = heights.index(np.nan_to_num(points[..., :2]))
+    on_map &= ~(points[..., 2] > heights.height[cell] + HUNG)
+    return np.where(on_map, np.maximum(heights.label[cell], -1), -1).astype(np.int32)
 
 
 def target_at(labels: np.ndarray, frame: RGBDFrame, point: Sequence[float]) -> np.ndarray:
