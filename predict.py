@@ -67,7 +67,7 @@ from utils.runs import run_script, timed_folder
 from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
-from utils.user_view import check_mask, check_view, corrected_view, given_workspace, workspace_of
+from utils.user_view import check_found, check_mask, check_view, chosen_workspace, corrected_view
 
 NETWORK_PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
@@ -88,7 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
-    workspace, cut = locate_workspace(frame, table, options)
+    marked = marked_pixels(frame.depth.shape, options.point, options.box, options.mask)
+    workspace, cut = chosen_workspace(frame, table.height, options.workspace, marked)
     remarks = [*scaled, *cut, *check_view(frame, workspace)]
     planner = new_planner(options, saved, workspace)
     frame = replace(frame, target=find_target(planner, frame, options))
@@ -97,6 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if frame.target is not None:
         clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
         remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
+    else:
+        remarks += check_found(len(grasps), frame, workspace)
     if planner.calibration is not None:
         remarks += unlikely_ones([one.quality for one in (*grasps, *(clearing or []))])
     posed, network = options.camera_pose is not None, options.planner in NETWORK_PLANNERS
@@ -202,16 +205,6 @@ def locate_table(image: RGBDFrame, options: argparse.Namespace) -> Table:
     if options.table_height is None:
         return find_table(image.points(), T_WC)
     return table_at_height(options.table_height, image.points(), T_WC)
-
-
-def locate_workspace(
-    frame: RGBDFrame, table: Table, options: argparse.Namespace
-) -> tuple[Workspace, list[str]]:
-    """The square that the planner works on, and remarks."""
-    if options.workspace is None:
-        marked = marked_pixels(frame.depth.shape, options.point, options.box, options.mask)
-        return workspace_of(frame, table.height, marked)
-    return given_workspace(frame, table.height, options.workspace)
 
 
 def new_planner(

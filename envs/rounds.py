@@ -61,6 +61,10 @@ class PlannerError(Exception):
     """A planner raised an exception or returned something else than grasps."""
 
 
+class NoGraspsError(TypeError):
+    """A planner returned what cannot be executed."""
+
+
 def run_round(
     cell: Cell,
     scene: Scene,
@@ -215,18 +219,20 @@ def planner_errors(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        if isinstance(error, NoGraspsError):
+            raise PlannerError(f"{name}: {error}") from error
         last = traceback.extract_tb(error.__traceback__)[-1]
         message, place = one_line(error), f"{last.filename}, line {last.lineno}"
         raise PlannerError(f"{name} raised {type(error).__name__}: {message} ({place})") from error
 
 
 def checked_grasps(grasps: object, planar: bool = False) -> Sequence[Grasp]:
-    """What a planner returned. Raises TypeError for anything but a list or tuple of grasps, and
-    ValueError where they have to be `planar` and one is tilted."""
+    """What a planner returned. Raises NoGraspsError for anything but a list or tuple of grasps, and
+    where they have to be `planar` and one is tilted."""
     if not isinstance(grasps, list | tuple) or not all(isinstance(g, Grasp) for g in grasps):
-        raise TypeError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
+        raise NoGraspsError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
     if planar and any(grasp.tilt > PLANAR for grasp in grasps):
-        raise ValueError(
+        raise NoGraspsError(
             "a closed loop follows grasps from straight above, this planner tilted one; use "
             f"closed_loop.controller={OPEN_LOOP}"
         )

@@ -30,7 +30,8 @@ PHASES = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Play one scripted episode and show it."""
-    config, options = parse_args(argv, "Lift a cube by a script; `seed` chooses it.", _add_options)
+    summary = "Lift a cube by a script; `seed` chooses it."
+    config, options = parse_args(argv, summary, _add_options, resumes=False)
     actions = {"control": "ee_planar", "gripper": "opening", "frame": "world"}
     config = with_settings(config, "env", actions)
     env = RobotGraspingEnv("human" if options.gui else "rgb_array", config)

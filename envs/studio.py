@@ -169,7 +169,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
-    config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options)
+    config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options, resumes=False)
     check_files(chosen.output, chosen.rgbd)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()

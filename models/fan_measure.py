@@ -119,6 +119,9 @@ class _Recording:
         return self._result
 
 
+# Each holds maps of its own, 0.03 to 0.2 GB. A workspace needs up to four: a coarse and a fine map,
+# with the margins and with relaxed ones.
+MOST_RECORDINGS = 8
 _recordings: dict[tuple, _Recording] = {}
 
 
@@ -145,6 +148,8 @@ def _measured_by_recording(
         views.others, device,
     )  # fmt: skip
     if key not in _recordings:
+        while len(_recordings) >= MOST_RECORDINGS:
+            del _recordings[next(iter(_recordings))]  # the oldest
         _recordings[key] = _Recording(padded, maps, gripper, settings)
     return _recordings[key](padded, maps).take(number[:count])
 

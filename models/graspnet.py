@@ -21,7 +21,7 @@ from models.graspnet_decoding import decode_grasps
 from utils.depth import fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry
-from utils.transforms import known_depth
+from utils.transforms import check_images, known_depth
 
 PANDA_HAND = GripperGeometry()
 
@@ -61,17 +61,7 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
     Raises UserError for wrong shapes or types, for an image without known depth, and for a median
     outside `PLAUSIBLE_DEPTH`.
     """
-    if rgb.ndim != 3 or rgb.shape[2] != 3:
-        raise UserError(f"rgb: got an array of shape {rgb.shape}, expected (H, W, 3) channels")
-    if rgb.dtype != np.uint8:
-        raise UserError(f"rgb: got {rgb.dtype}, expected uint8 from 0 to 255")
-    if depth.ndim != 2:
-        raise UserError(f"depth: got an array of shape {depth.shape}, expected one channel, (H, W)")
-    if rgb.shape[:2] != depth.shape:
-        raise UserError(
-            f"rgb and depth differ in size: {rgb.shape[1]}x{rgb.shape[0]} and "
-            f"{depth.shape[1]}x{depth.shape[0]} pixels; register the depth to the colour image"
-        )
+    check_images(rgb, depth)
     known = depth[known_depth(depth)]
     if len(known) == 0:
         raise UserError("depth: no pixel is known; all are zero, negative or NaN")

@@ -139,6 +139,7 @@ def test_override_values(text, expected):
         ("=5", ["KEY=VALUE"]),
         ("camera.position=[0,", ["camera.position", "YAML", "a list of 3 numbers"]),
         ("camera.position=0,]", ["camera.position", "YAML"]),
+        ("env.reward={success:1}", ["env.reward", "lacks a space after a colon"]),
     ],
 )
 def test_bad_override(override, parts):

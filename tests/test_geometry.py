@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 
 from tests.helpers.box_frames import CORNERS, yaw_pose
 from utils.config import load_config
+from utils.errors import UserError
 from utils.geometry import (
     ConvexSolid,
     GripperGeometry,
+    Workspace,
     intersect_lines,
 )
 
@@ -95,3 +97,10 @@ def test_gripper_outline_bounds_pybullets_meshes() -> None:
         assert (
             claimed[hits.hit] - true[hits.hit]
         ).max() < 0.0004  # the claimed outline is nowhere above the mesh
+
+
+@pytest.mark.parametrize("part", [{"size": -1}, {"size": 0.0}, {"centre": (0.5,)},
+                                  {"centre": (np.nan, 0)}, {"size": np.inf}])  # fmt: skip
+def test_a_workspace_that_is_none_is_refused(part: dict) -> None:
+    with pytest.raises(UserError, match="workspace: "):
+        Workspace(**part)

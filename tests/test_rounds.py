@@ -343,7 +343,7 @@ def test_a_planner_that_returns_something_else_is_named(cell, box_set, result):
         max_failures=2,
     )  # fmt: skip
     assert record.ended == "planner_error"
-    assert "mine raised TypeError: a planner returns a list of Grasp" in record.attempts[0].detail
+    assert "mine: a planner returns a list of Grasp" in record.attempts[0].detail
 
 
 def test_a_privileged_planner_sees_the_truth(cell, box_set):

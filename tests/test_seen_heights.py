@@ -231,3 +231,10 @@ def test_only_the_borders_that_cut_something_off_are_widened() -> None:
     np.testing.assert_allclose(points, frame.points(), atol=1e-6)
     rise = wider.points()[..., 2]
     assert rise.min() == pytest.approx(0, abs=1e-5) and rise.max() == pytest.approx(0.05, abs=1e-5)
+
+
+def test_a_workspace_out_of_sight_is_told() -> None:
+    frame, far = boxes_frame([BOX]), Workspace((-2.0, 0.0))
+    plan = make_planner("heuristic", GripperGeometry(), far, 0)
+    with pytest.warns(UserWarning, match=r"no point .* 0.3 m at \(-2, 0\).*workspace_of"):
+        assert plan(frame) == []

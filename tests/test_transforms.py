@@ -218,3 +218,41 @@ def test_velocity_transform_has_the_lever_arm_by_hand():
     np.testing.assert_allclose(
         velocity_transform(T_CE) @ [0, 0, 0, 0, 0, 2], [0, 0.2, 0, 0, 0, 2], atol=1e-15
     )
+
+
+RGB, DEPTH = np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32)
+PINHOLE = np.array([[100.0, 0.0, 2.5], [0.0, 100.0, 1.5], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"rgb": RGB[..., 0]}, "rgb: got an array of shape"),
+        ({"rgb": RGB / 255}, "rgb: got float64, expected uint8"),
+        ({"depth": DEPTH[..., None]}, "depth: got an array of shape"),
+        ({"depth": (1000 * DEPTH).astype(np.uint16)}, "divide millimetres by 1000"),
+        ({"depth": DEPTH[:2]}, "rgb and depth differ in size: 6x4 and 6x2 pixels"),
+        ({"K": np.zeros((3, 3))}, "K: got .* with positive focal lengths"),
+        ({"K": np.diag([-100.0, 100.0, 1.0])}, "K: got"),
+        ({"K": PINHOLE * np.nan}, "K: got"),
+        ({"K": PINHOLE + np.eye(3, k=1)}, "K: got"),  # skewed pixels
+        ({"K": np.eye(4)}, "K: got an array of shape"),
+        ({"T_WC": np.zeros((4, 4))}, "no rotation"),
+        ({"T_WC": np.eye(3)}, "T_WC: got an array of shape"),
+    ],
+)
+def test_a_frame_that_is_none_is_one_sentence(part: dict, message: str) -> None:
+    good = {"rgb": RGB, "depth": DEPTH, "K": PINHOLE, "T_WC": np.eye(4)}
+    with pytest.raises(UserError, match=message):
+        RGBDFrame(**(good | part))
+
+
+def test_a_frame_takes_lists_for_its_matrices() -> None:
+    frame = RGBDFrame(RGB, DEPTH, PINHOLE.tolist(), np.eye(4).tolist())
+    np.testing.assert_array_equal(frame.K, PINHOLE)
+    np.testing.assert_array_equal(frame.part(slice(1, 3), slice(2, 5)).K[:2, 2], (0.5, 0.5))
+
+
+def test_a_width_in_millimetres_is_refused() -> None:
+    with pytest.raises(ValueError, match="Grasp.width is in metres, 0 to 1, got 80"):
+        Grasp(np.zeros(3), 0.0, 80.0, 1.0)

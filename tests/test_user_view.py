@@ -13,6 +13,7 @@ from utils.transforms import RGBDFrame, look_at
 from utils.user_view import (
     LARGEST,
     SMALLEST,
+    check_found,
     check_view,
     corrected_view,
     given_workspace,
@@ -67,7 +68,8 @@ def test_single_pixels_of_noise_do_not_count() -> None:
     depth[801, 41] = depth[800, 41] = depth[801, 40] = UP
     fine = np.diag([2.0, 2.0, 1.0]) @ K
     fine[:2, 2] += 0.5
-    workspace, _ = workspace_of(replace(frame, depth=depth, K=fine), 0.0)
+    rgb = np.repeat(np.repeat(frame.rgb, 2, axis=0), 2, axis=1)
+    workspace, _ = workspace_of(replace(frame, rgb=rgb, depth=depth, K=fine), 0.0)
     np.testing.assert_allclose(workspace.centre, (0.3, -0.2), atol=0.01)
 
 
@@ -148,3 +150,11 @@ def test_missing_depth_is_named_and_too_much_of_it_refused(share, remarks) -> No
             check_view(frame, Workspace((0.0, 0.0)))
     else:
         assert len(check_view(frame, Workspace((0.0, 0.0)))) == remarks
+
+
+def test_an_image_without_a_grasp_says_why() -> None:
+    """A table alone, and a block on it, 8 cm high."""
+    assert check_found(3, scene(), Workspace((0.3, -0.2))) == []
+    (empty,) = check_found(0, scene(), Workspace((0.3, -0.2)))
+    (full,) = check_found(0, scene((0.3, -0.2, 0.06)), Workspace((0.3, -0.2)))
+    assert "nothing there rises 4 mm" in empty and "too wide for the hand" in full

@@ -329,6 +329,9 @@ def _parse_override(text: str) -> dict[str, Any]:
         raise ConfigError(
             f"{key}: cannot read {raw!r} as YAML: {one_line(error)}; expected {allowed(schema)}"
         ) from error
+    named = value.items() if isinstance(value, dict) else ()
+    if any(one is None and ":" in str(name) for name, one in named):
+        raise ConfigError(f"{key}: {raw!r} lacks a space after a colon; expected {allowed(schema)}")
     if "string" in types and not isinstance(value, str | list | dict | None):
         value = raw.strip()  # evaluate.name=007 is text
     nested: Any = value

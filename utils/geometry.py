@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from utils.errors import UserError
 from utils.transforms import transform_points
 
 HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
@@ -132,6 +133,17 @@ class Workspace:
     centre: tuple[float, float] = (0.5, 0.0)
     size: float = 0.30
     table_height: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises UserError where the centre is no pair of numbers or the side not positive."""
+        centre = np.asarray(self.centre, dtype=float)
+        if centre.shape != (2,) or not np.isfinite([*centre, self.size, self.table_height]).all():
+            raise UserError(
+                f"workspace: got the centre {self.centre} and the side {self.size}, expected "
+                "(x, y) and a number, in metres"
+            )
+        if self.size <= 0:
+            raise UserError(f"workspace: the side must be positive, got {self.size:g} m")
 
 
 @dataclass(frozen=True)

@@ -64,11 +64,12 @@ def parse_args(
     argv: Sequence[str] | None,
     description: str,
     extra: Callable[[argparse.ArgumentParser], None] | None = None,
+    resumes: bool = True,
 ) -> tuple[Config, argparse.Namespace]:
     """A script's command line: --config FILE, --resume RUN and dotted overrides.
 
     argv: arguments without the program's name; None takes those of the process.
-    extra: adds the script's own options to the parser.
+    extra: adds the script's own options to the parser. resumes: False for a script without runs.
     With --resume the config of that run is taken (its config.yaml), overrides still apply.
     Returns the config and the parsed options (config, resume: Path or None, and the extra ones).
     Raises ConfigError; an unknown option ends the program with status 2, as argparse does.
@@ -78,13 +79,16 @@ def parse_args(
     )
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--config", type=Path, metavar="FILE", help="YAML laid over the defaults")
-    source.add_argument("--resume", type=Path, metavar="RUN", help="folder of a run to go on with")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="evaluate.rounds=50")
+    if resumes:
+        source.add_argument("--resume", type=Path, metavar="RUN", help="a run's folder, to go on")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="any key of the configuration"
+    )
     if extra is not None:
         extra(parser)
     options = parser.parse_intermixed_args(argv)
     path = options.config
-    if options.resume is not None:
+    if resumes and options.resume is not None:
         path = options.resume / "config.yaml"
         if not path.is_file():
             lack = "no config.yaml in there" if options.resume.is_dir() else "no such folder"

@@ -9,6 +9,7 @@ This module knows neither objects nor networks.
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -151,8 +152,8 @@ def sees_through(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
 
 
 def hides(frame: RGBDFrame, points: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether a frame shows something nearer at the pixel of each point (N, 3) in W, or
-    the point lies outside its image."""
+    """(N,) bool, whether a frame leaves each point (N, 3) in W unseen: it shows something nearer at
+    the point's pixel, measured nothing there, or the point lies outside its image."""
     depth, surface = _on_its_ray(frame, points)
     return ~(surface > depth - _HIDDEN_BEHIND)
 
@@ -294,6 +295,12 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     stands = z > workspace.table_height + _STANDS
     near |= ahead & stands & (apart <= workspace.size / 2 + _HAND_REACH)
     if not near.any():
+        warnings.warn(
+            f"no point of the image lies over the workspace, a square of {workspace.size:g} m at "
+            f"({workspace.centre[0]:g}, {workspace.centre[1]:g}) in the world; "
+            "utils.user_view.workspace_of finds one that the camera sees",
+            stacklevel=2,
+        )
         return slice(0, depth.shape[0]), slice(0, depth.shape[1])
     # Two pixels more: the rays that graze an edge pass between a pixel and the next.
     rows, columns = (

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from utils.errors import UserError
 
+WIDEST = 1.0  # m, no hand opens farther: a larger width is one in other units
 DOWN = (0.0, 0.0, -1.0)  # the approach of a planar grasp
 PLANAR = np.deg2rad(1)  # least tilt of a grasp that is not from straight above
 
@@ -60,8 +61,8 @@ class Grasp:
         numbers = np.concatenate([position, approach, (self.angle, self.width, self.quality)])
         if not np.isfinite(numbers).all():
             raise ValueError(f"Grasp holds a non-finite number: {self!r}")
-        if self.width < 0:
-            raise ValueError(f"Grasp.width must not be negative, got {self.width}")
+        if not 0 <= self.width <= WIDEST:
+            raise ValueError(f"Grasp.width is in metres, 0 to {WIDEST:g}, got {self.width:g}")
         check_approach(approach)
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "approach", approach)
@@ -169,10 +170,18 @@ class RGBDFrame:
     roughness: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises UserError where K or T_WC is no camera matrix or pose."""
-        K, T = np.asarray(self.K), np.asarray(self.T_WC)
+        """Raises UserError where an image, K or T_WC is none, and where the images differ in
+        size."""
+        check_images(self.rgb, self.depth)
+        K, T = np.asarray(self.K, dtype=float), np.asarray(self.T_WC, dtype=float)
         if K.shape != (3, 3):
             raise UserError(f"K: got an array of shape {K.shape}, expected (3, 3) pixels")
+        fx, fy, *others = K[0, 0], K[1, 1], K[0, 1], K[1, 0], *K[2, :2], K[2, 2] - 1
+        if any(others) or not (np.isfinite(K).all() and fx > 0 and fy > 0):
+            raise UserError(
+                f"K: got {K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, "
+                "with positive focal lengths"
+            )
         if T.shape != (4, 4):
             raise UserError(f"T_WC: got an array of shape {T.shape}, expected a pose (4, 4)")
         turn = T[:3, :3]
@@ -180,6 +189,8 @@ class RGBDFrame:
             raise UserError(
                 "T_WC: its upper left (3, 3) is no rotation; give the camera's pose in the world"
             )
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "T_WC", T)
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""
@@ -201,6 +212,25 @@ class RGBDFrame:
         K[:2, 2] -= columns.start, rows.start
         rgb, depth = self.rgb[rows, columns], self.depth[rows, columns]
         return replace(self, rgb=rgb, depth=depth, K=K, segmentation=None, target=None)
+
+
+def check_images(rgb: np.ndarray, depth: np.ndarray) -> None:
+    """Raise UserError for anything but rgb (H, W, 3) uint8 and depth (H, W) of floats."""
+    if rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise UserError(f"rgb: got an array of shape {rgb.shape}, expected (H, W, 3) channels")
+    if rgb.dtype != np.uint8:
+        raise UserError(f"rgb: got {rgb.dtype}, expected uint8 from 0 to 255")
+    if depth.ndim != 2:
+        raise UserError(f"depth: got an array of shape {depth.shape}, expected one channel, (H, W)")
+    if not np.issubdtype(depth.dtype, np.floating):
+        raise UserError(
+            f"depth: got {depth.dtype}, expected metres as floats; divide millimetres by 1000"
+        )
+    if rgb.shape[:2] != depth.shape:
+        raise UserError(
+            f"rgb and depth differ in size: {rgb.shape[1]}x{rgb.shape[0]} and "
+            f"{depth.shape[1]}x{depth.shape[0]} pixels; register the depth to the colour image"
+        )
 
 
 def known_depth(depth: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from utils.depth import depth_of_plane
 from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
+from utils.height_map import LABEL_FLOOR
 from utils.transforms import RGBDFrame, deproject, known_depth, project
 
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
@@ -107,6 +108,19 @@ def given_workspace(
     return workspace, [remark]
 
 
+def chosen_workspace(
+    frame: RGBDFrame,
+    table_height: float,
+    numbers: Sequence[float] | None,
+    marked: np.ndarray | None,
+) -> tuple[Workspace, list[str]]:
+    """The square that is searched, and remarks: `given_workspace` of the numbers; where there are
+    none, `workspace_of` the frame and the marked pixels."""
+    if numbers is None:
+        return workspace_of(frame, table_height, marked)
+    return given_workspace(frame, table_height, numbers)
+
+
 def _outside_share(frame: RGBDFrame, workspace: Workspace) -> float:
     """Share of a square of the table that lies outside the image."""
     across = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
@@ -162,6 +176,22 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
     if unseen > MANY_UNSEEN:
         remarks.append(f"{unseen:.0%} of the place that was searched has no depth")
     return remarks
+
+
+def check_found(found: int, frame: RGBDFrame, workspace: Workspace) -> list[str]:
+    """A remark on a frame in which no grasp was found."""
+    if found:
+        return []
+    points = frame.points()
+    rises = points[..., 2] > workspace.table_height + LABEL_FLOOR
+    over = np.abs(points[..., :2] - workspace.centre).max(axis=-1) <= workspace.size / 2
+    if not (rises & over).any():
+        lowest = 1000 * LABEL_FLOOR
+        return [f"no grasp was found: nothing there rises {lowest:g} mm over the table"]
+    return [
+        "no grasp was found on what stands there: it may be too small, too wide for the hand, or "
+        "too close to other things"
+    ]
 
 
 def unseen_share(frame: RGBDFrame, workspace: Workspace) -> float | None:
