@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 
 from envs.cell import Cell, Intrinsics
@@ -22,9 +21,11 @@ from envs.cell_layout import ObjectModel, Placement, Scene
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from envs.simulators import cell_class
+from utils.image_overlay import write_picture
 from utils.runs import parse_args, run_script
 from utils.transforms import look_at
 
+OUTPUT = Path("runs/show_bar/bar.png")
 FORCE = 10.0  # N a finger
 OFFSETS = (0.03, 0.045, 0.06)  # m from the centre
 SECONDS = 0.6  # after the bar is let go
@@ -73,9 +74,12 @@ def tilt(cell: Cell, axis: int = 0) -> float:
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("bar.png"), help="PNG file")
+        parser.add_argument(
+            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+        )
 
-    config, chosen = parse_args(argv, "Grip a bar off its centre in both simulators.", options)
+    summary = "Grip a bar off its centre in both simulators."
+    config, chosen = parse_args(argv, summary, options, resumes=False)
     model = bar(load_object_set("box", cache_dir=config.cache_folder)[0])
     columns = []
     for name, title in (("pybullet", "PyBullet"), ("mujoco", "MuJoCo")):
@@ -92,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                     cv2.putText(picture, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0))
                 )
         columns.append(np.vstack(column))
-    iio.imwrite(chosen.output, np.hstack(columns))
+    write_picture(chosen.output, np.hstack(columns))
     print(f"wrote {chosen.output}")
 
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 
 from envs.cell_scenes import LAYOUTS, make_scene
@@ -24,11 +23,12 @@ from utils.config import Config
 from utils.depth import DEPTH_NOISES
 from utils.errors import UserError
 from utils.evaluation import with_depth_noise
-from utils.image_overlay import contact_sheet
+from utils.image_overlay import contact_sheet, write_picture
 from utils.result_records import CLEAN
 from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, deproject, known_depth
 
+OUTPUT = Path("runs/show_depth/depth.png")
 _SIDE = 224  # pixels of each picture
 _LOWEST, _HIGHEST = -0.02, 0.08  # m over the table, black and white
 _UNKNOWN = (200, 30, 30)
@@ -38,12 +38,15 @@ _TABLE = 0.015  # m from the median height, within which a pixel shows the table
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("depth.png"), help="PNG file")
+        parser.add_argument(
+            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+        )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
         parser.add_argument("--photograph", default="pcd0100", help="name of the photograph")
 
-    config, chosen = parse_args(argv, "Show a scene under each depth noise.", options)
+    summary = "Show a scene under each depth noise."
+    config, chosen = parse_args(argv, summary, options, resumes=False)
     frames = frames_of(config, chosen.objects, chosen.layout)
     if config.transfer.cornell is not None:
         samples = {sample.name: sample for sample in photographs(config.transfer.cornell)}
@@ -62,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     sheet = contact_sheet(
         wholes + middles, [*frames, *(f"{n}, middle" for n in frames)], len(frames)
     )
-    iio.imwrite(chosen.output, sheet)
+    write_picture(chosen.output, sheet)
     print(f"wrote {chosen.output}")
 
 

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 
 from envs.cell import Cell, Intrinsics
@@ -29,23 +28,27 @@ from models.planner_fan import FanPlanner
 from models.planners import needs_truth
 from utils.errors import UserError
 from utils.height_map import HeightMap, height_map_from_frame, tilted_height_map, tilted_view
-from utils.image_overlay import contact_sheet
+from utils.image_overlay import contact_sheet, write_picture
 from utils.runs import parse_args, run_script
 from utils.seen_heights import without_holes
 from utils.transforms import Grasp, RGBDFrame, look_at
 
+OUTPUT = Path("runs/show_fan/fan.png")
 _VIEW = Intrinsics(360, 300, fov_deg=34.0, near=0.05, far=3.0)
 _SHOWN = 0.12  # m of height between black and white
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("fan.png"), help="PNG file")
+        parser.add_argument(
+            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+        )
         parser.add_argument("--planner", default="graspnet6d", help="one that grasps from any side")
         parser.add_argument("--layout", default="pile", help="of the scenes, a key of scenarios")
         parser.add_argument("--scenes", type=int, default=10, help="how many, from the seed on")
 
-    config, chosen = parse_args(argv, "Draw a fan of views and the grasps chosen from it.", options)
+    summary = "Draw a fan of views and the grasps chosen from it."
+    config, chosen = parse_args(argv, summary, options, resumes=False)
     planner = new_planner(chosen.planner, config)
     if not isinstance(planner, FanPlanner):
         raise UserError(f"--planner: {chosen.planner} grasps from straight above alone")
@@ -59,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             frame = look_again(partial(cell.frame, needs_truth(planner)))
             if not pictures:
                 path = chosen.output.with_stem(f"{chosen.output.stem}_views")
-                iio.imwrite(path, views(planner, frame.without_truth()))
+                write_picture(path, views(planner, frame.without_truth()))
                 print(f"wrote {path}")
             grasps = planner(frame)
             grasp = first_untried(within_reach(cell, grasps), [])
@@ -67,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 continue
             pictures.append(at_grasp(cell, grasp))
             captions.append(f"scene {seed}: {np.degrees(grasp.tilt):.0f} degrees")
-    iio.imwrite(chosen.output, contact_sheet(pictures, captions, columns=5))
+    write_picture(chosen.output, contact_sheet(pictures, captions, columns=5))
     print(f"wrote {chosen.output}")
 
 

@@ -1,8 +1,8 @@
 """A picture of a closed loop at work: python -m benchmarks.show_grasp_loop [FILE] [SCENARIO]
 
-KEY=VALUE overrides may follow, simulator=mujoco too. Above what a bystander sees, below the wrist
-camera's depth image with the points that the law looks at, at four moments of one grasp of the test
-object that `seed` chooses.
+FILE is runs/show_grasp_loop/servo.png where none is named; KEY=VALUE overrides may follow,
+simulator=mujoco too. Above what a bystander sees, below the wrist camera's depth image with the
+points that the law looks at, at four moments of one grasp of the test object that `seed` chooses.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 
 from envs.cell_scenes import make_scene
@@ -29,9 +28,11 @@ from utils.atomic_files import check_writable
 from utils.config import load_config
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, Workspace
+from utils.image_overlay import write_picture
 from utils.runs import run_script
 from utils.transforms import inverse_pose, transform_points
 
+OUTPUT = Path("runs/show_grasp_loop/servo.png")  # where no FILE is named
 MOMENTS = (0.4, 1.4, 2.2, 2.7)  # s after the arm has set out
 _SIZE = (320, 240)
 
@@ -40,10 +41,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = list(sys.argv[1:] if argv is None else argv)
     overrides = [a for a in argv if "=" in a]
     names = [a for a in argv if "=" not in a]
-    file, scenario = [*names, *("servo.png", "turning_5cm")[len(names) :]][:2]
+    file, scenario = [*names, *(str(OUTPUT), "turning_5cm")[len(names) :]][:2]
     if scenario not in SCENARIOS:
         raise unknown_choice("scenario", scenario, SCENARIOS)
-    check_writable("FILE", Path(file))
+    if names:
+        check_writable("FILE", Path(file))
     config = load_config(None, overrides)
     objects = load_object_set(
         "random_urdfs", cache_dir=config.cache_folder, **config.objects.model_dump()
@@ -70,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             loop.camera = see
             with disturbed(cell, conditions.motion(cell, 0)):
                 outcome = execute_grasp(cell, plan(frame)[0], loop)
-    iio.imwrite(Path(file), np.hstack(pictures))
+    write_picture(Path(file), np.hstack(pictures))
     print(f"{outcome.reason} {outcome.detail}; wrote {file}")
 
 

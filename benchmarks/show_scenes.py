@@ -22,6 +22,7 @@ from utils.config import Config
 from utils.errors import UserError
 from utils.runs import parse_args, run_script
 
+OUTPUT = Path("runs/show_scenes/scenes.gif")
 SCENES = (("tall", "tall"), ("wall", "tall"), ("flat", "flat"), ("shelf", "tall"))  # and objects
 PLANNER = "graspnet6d"
 _RATE, _SPEED = 4.0, 2.5  # pictures a second of simulated time, and how much faster they are shown
@@ -31,9 +32,12 @@ _BAR = 24  # pixels of the caption
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("scenes.gif"), help="GIF or MP4")
+        parser.add_argument(
+            "--output", type=Path, default=OUTPUT, help=f"GIF or MP4; default: {OUTPUT}"
+        )
 
-    config, chosen = parse_args(argv, "Film four scenes that ask for grasps from a side.", options)
+    summary = "Film four scenes that ask for grasps from a side."
+    config, chosen = parse_args(argv, summary, options, resumes=False)
     if chosen.output.suffix not in (".gif", ".mp4"):
         raise UserError(f"--output: {chosen.output} is no .gif or .mp4 file; name such a file")
     films = [film(config, layout, objects) for layout, objects in SCENES]

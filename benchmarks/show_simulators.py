@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 
 from envs.cell import Cell, Intrinsics
@@ -20,20 +19,25 @@ from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
 from envs.simulators import cell_class
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
+from utils.image_overlay import write_picture
 from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
+OUTPUT = Path("runs/show_simulators/simulators.png")
 _SIDE = 320  # pixels of each picture of the camera
 _DEEPEST, _HIGHEST = 0.81, 0.70  # m, black and white in the picture of depth
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--output", type=Path, default=Path("simulators.png"), help="PNG file")
+        parser.add_argument(
+            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+        )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)
 
-    config, chosen = parse_args(argv, "Show one scene in both simulators.", options)
+    summary = "Show one scene in both simulators."
+    config, chosen = parse_args(argv, summary, options, resumes=False)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
@@ -52,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             np.linalg.norm(bullet.object_position(i) - mujoco.object_position(i))
             for i in sorted(bullet.remaining)
         ]
-    iio.imwrite(chosen.output, np.vstack([np.hstack(row) for row in rows]))
+    write_picture(chosen.output, np.vstack([np.hstack(row) for row in rows]))
     off = 1000 * np.abs(frames[0].depth - frames[1].depth)
     same = frames[0].segmentation == frames[1].segmentation
     print(

@@ -39,7 +39,7 @@ from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
 from utils.geometry import Workspace
-from utils.report import picture
+from utils.report import objects_in_words, picture
 from utils.result_formats import depth_in_words
 from utils.result_records import CLEAN, OPEN_LOOP, policy_name
 from utils.runs import portable_name
@@ -130,6 +130,8 @@ def work(config: Config, task: Task) -> TaskResult:
     objects.told = True  # by the main process, which prepares the sets
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
+    several = len(config.evaluate.object_sets) > 1
+    named = f", {objects_in_words(task.objects, CLEAN)}" if several else ""
     for name, controller, noise in task.policies:
         noisy = with_depth_noise(config, noise)
         cell = cell_of(noisy)
@@ -138,13 +140,16 @@ def work(config: Config, task: Task) -> TaskResult:
             approach = approach_of(name, noisy)
         else:
             planner = planner_of(name, config)
-        caption = f"{policy}, {task.scenario}{depth_in_words(noise)}"
+        caption = f"{policy}, {task.scenario}{named}{depth_in_words(noise)}"
+        kind = task.scenario, task.objects, noise
 
         def keep(
-            frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome, policy=policy, caption=caption
-        ) -> None:
+            frame: RGBDFrame, grasp: Grasp, outcome: GraspOutcome,
+            policy=policy, caption=caption, kind=kind,
+        ) -> None:  # fmt: skip
             if task.keep_pictures or not outcome.success:
-                result.gallery.append(picture(frame, grasp, policy, caption, outcome.reason))
+                shown = picture(frame, grasp, policy, caption, outcome.reason, kind)
+                result.gallery.append(shown)
 
         film = Film(cell) if noise == task.filmed else None
         result.rounds.append(

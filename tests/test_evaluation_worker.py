@@ -2,7 +2,7 @@
 
 import pytest
 
-from envs.evaluation_worker import check_everything, film_name
+from envs.evaluation_worker import check_everything, film_name, work
 from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.evaluation import Task
@@ -38,3 +38,15 @@ def test_a_set_of_which_no_object_suits_a_layout_is_refused_before_any_round(con
     changes = {"policies": ("random",), "scenarios": ("pile", layout), "object_sets": ("box",)}
     with pytest.raises(UserError, match=f"no object of 'box' is .*{what}.* use the set {layout}"):
         check_everything(with_settings(config, "evaluate", changes))
+
+
+def test_a_picture_knows_its_scene_and_names_the_object_set_where_there_are_several(config):
+    def caption(sets: tuple[str, ...]) -> str:
+        changes = {"policies": ("random",), "object_sets": sets, "max_failures": 1}
+        task = Task("box", "isolated", 3, (("random", "open_loop", "none"),), keep_pictures=True)
+        first, *_ = work(with_settings(config, "evaluate", changes), task).gallery
+        assert first.kind == ("isolated", "box", "none")
+        return first.caption.removesuffix(f": {first.reason}")
+
+    assert caption(("box",)) == "random, isolated"
+    assert caption(("box", "primitives")) == "random, isolated, box"

@@ -1,6 +1,7 @@
 """The page that shows an evaluation."""
 
 import re
+from collections import Counter
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -11,9 +12,11 @@ from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round
 from utils.config import with_settings
 from utils.errors import UserError
 from utils.report import GalleryItem, balanced, read_gallery, write_gallery, write_report
+from utils.result_formats import format_comparisons
 from utils.result_records import FAILURES
 from utils.results import compare, summarise
 from utils.runs import REPOSITORY
+from utils.statistics import FEW_ROUNDS
 from utils.transforms import ImageGrasp
 
 
@@ -41,6 +44,24 @@ def test_report_is_self_contained(tmp_path):
     assert "evaluate.rounds=2" in page and "python evaluate.py" in page
     assert "heuristic: 3 of 6" in page and "1 collision on approach" in page
     assert "few rounds" in page  # two rounds give no verdict
+
+
+def test_few_rounds_have_no_interval_on_the_page_as_in_the_table(tmp_path):
+    (pair,) = compare(ROUNDS, 0)
+    assert pair.cleared.rounds == 2 and "[" not in format_comparisons([pair])
+    pages = []
+    for count in (FEW_ROUNDS - 1, FEW_ROUNDS):
+        cleared = replace(pair.cleared, rounds=count)
+        one = replace(pair, success=None, cleared=cleared)
+        path = tmp_path / f"{count}.html"
+        write_report(path, summarise(ROUNDS, 0), ROUNDS, [one], CONFIG)
+        page = path.read_text(encoding="utf-8")
+        pages.append(page[page.index("Paired comparison") :].partition("<h2>")[0])
+    few, enough = pages
+    assert "−40 to −20" in enough and "whisker" in enough and "few rounds" not in enough
+    assert "−40" not in few and "whisker" not in few
+    assert re.search(r'class="value">−30\s+<span class="tag few rounds">few rounds', few)
+    assert 'aria-label="random minus heuristic: −30, few rounds"' in few
 
 
 def test_each_reason_has_a_colour_in_light_and_dark():
@@ -134,17 +155,47 @@ def test_half_of_the_pictures_are_failures_of_each_policy_in_turn():
     assert len(balanced(pictures[:6], 4)) == 4, "failures fill up where successes lack"
 
 
+def test_scenarios_sets_noises_and_reasons_take_turns_on_the_page():
+    """Of 200 failures, nearly all of them of the first scenario, policy and reason."""
+    image = np.zeros((2, 2, 3), np.uint8)
+    pictures = [
+        GalleryItem(image, f"{n}", False, policy, (scenario, objects, noise), reason)
+        for policy in ("a", "b")
+        for scenario in ("isolated", "pile")
+        for objects in ("box", "primitives")
+        for noise in ("none", "realsense")
+        for reason in ("collision", "missed", "slipped")
+        for n in range(160 if (policy, scenario, reason) == ("a", "isolated", "collision") else 1)
+    ]
+    chosen = balanced(pictures, 12)
+    assert len(chosen) == 12
+    for counts in (
+        Counter(item.policy for item in chosen),
+        *(Counter(item.kind[place] for item in chosen) for place in range(3)),
+    ):
+        assert sorted(counts.values()) == [6, 6], counts
+    assert sorted(Counter(item.reason for item in chosen).values()) == [4, 4, 4]
+
+
 def test_the_pictures_that_a_report_may_show_are_kept_for_a_resumed_run(tmp_path):
     path = tmp_path / "gallery.npz"
     write_gallery(path, [], 3)
     assert not path.exists() and read_gallery(path) == []
     image = np.zeros((4, 6, 3), np.uint8)
-    pictures = [GalleryItem(image, f"{n}", n % 2 == 0, "heuristic") for n in range(60)]
+    kinds = [("pile", "box", "none"), ("isolated", "box", "none")]
+    pictures = [
+        GalleryItem(image, f"{n}", n % 2 == 0, "heuristic", kinds[n % 3 == 0], "missed")
+        for n in range(60)
+    ]
     write_gallery(path, pictures, 3)
     kept = read_gallery(path)
     assert sum(not item.success for item in kept) == 24 and len(kept) == 27
     names = [item.caption for item in balanced(kept, 3)]
     assert names == [item.caption for item in balanced(pictures, 3)]
+    assert {item.kind for item in kept} == set(kinds) and kept[0].reason == "missed"
+    earlier = tmp_path / "earlier.npz"  # whole frames, without kinds and reasons
+    np.savez_compressed(earlier, image=[image], caption=["a"], success=[True], policy=["b"])
+    assert read_gallery(earlier) == []
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(UserError, match="gallery.npz: cannot be read as pictures"):
         read_gallery(path)

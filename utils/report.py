@@ -10,9 +10,9 @@ from __future__ import annotations
 import base64
 import io
 import shlex
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -26,25 +26,31 @@ from utils.atomic_files import figure_bytes, write_atomic
 from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
-from utils.image_overlay import contact_sheet, draw_grasp
-from utils.result_formats import columns_of, depth_in_words, failures_in_words
+from utils.image_overlay import NEAR, close_up, contact_sheet, write_picture
+from utils.result_formats import columns_of, depth_in_words, failures_in_words, has_interval
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stated_chances, stop_reasons
 from utils.runs import git_state
 from utils.statistics import FEW_ROUNDS, Difference
-from utils.transforms import Grasp, RGBDFrame, grasp_to_image, project
+from utils.transforms import Grasp, RGBDFrame
 
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 
 
 @dataclass(frozen=True)
 class GalleryItem:
-    """A frame with its grasp already drawn on it: (H, W, 3) uint8 RGB."""
+    """A picture with its grasp already drawn on it: (H, W, 3) uint8 RGB.
+
+    kind: scenario, object set and depth noise. reason: how the attempt ended, "success" or a key of
+    FAILURES.
+    """
 
     image: np.ndarray
     caption: str
     success: bool
     policy: str = ""
+    kind: tuple[str, ...] = ()
+    reason: str = ""
 
 
 def write_report(
@@ -79,6 +85,8 @@ def write_report(
         policies=_in_order(row.policy for row in rows),
         comparisons=_comparisons(comparisons),
         few_rounds=FEW_ROUNDS,
+        has_interval=has_interval,
+        near=NEAR,
         labels={SUCCESS: "success", **FAILURES},
         failures_in_words=failures_in_words,
         depth_in_words=depth_in_words,
@@ -121,7 +129,7 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
         groups.append(
             {
                 "scenario": scenario,
-                "objects": _objects_in_words(objects, noise),
+                "objects": objects_in_words(objects, noise),
                 "best": (best, _headline(best)),
                 "bounds": [(row, _headline(row)) for row in bounds if row != best],
                 "measures": list(zip(*([(row, m) for m in _measures(row)] for row in cell))),
@@ -131,8 +139,8 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
     return groups
 
 
-def _objects_in_words(objects: str, noise: str) -> str:
-    """A folder by its last part."""
+def objects_in_words(objects: str, noise: str) -> str:
+    """An object set, a folder by its last part, and a depth noise where there is one."""
     return (Path(objects).name or objects) + depth_in_words(noise)
 
 
@@ -210,7 +218,7 @@ def _comparisons(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     return [
         {
             "scenario": scenario,
-            "objects": _objects_in_words(objects, noise),
+            "objects": objects_in_words(objects, noise),
             "measures": [
                 ("success", [(pair, pair.success, _verdict(pair.success)) for pair in pairs]),
                 ("cleared", [(pair, pair.cleared, _verdict(pair.cleared)) for pair in pairs]),
@@ -224,7 +232,7 @@ def _verdict(difference: Difference | None) -> str:
     """A word for a difference: only an interval that leaves out zero decides."""
     if difference is None:
         return "undefined"
-    if difference.rounds < FEW_ROUNDS:
+    if not has_interval(difference):
         return "few rounds"
     if difference.low > 0:
         return "better"
@@ -279,43 +287,40 @@ def _number(value: float | None, digits: int = 0) -> str:
 # --- Pictures of grasps -------------------------------------------------------------------------
 
 MOST_FAILURES = 24  # on failures.png
-_GALLERY = ("image", "caption", "success", "policy")
+_GALLERY = ("image", "caption", "success", "policy", "kind", "reason")
 
 
-def picture(frame: RGBDFrame, grasp: Grasp, policy: str, caption: str, reason: str) -> GalleryItem:
-    """Draw a grasp on its frame; caption: begins the picture's, which ends with the reason,
-    "success" or a key of FAILURES."""
-    on_image, success = grasp_to_image(grasp, frame.K, frame.T_WC), reason == SUCCESS
-    # A closing line that leans appears shorter; of a level one this is the width itself, nearly.
-    half = grasp.closing_direction * grasp.width / 2
-    ends, _ = project([grasp.position - half, grasp.position + half], frame.K, frame.T_WC)
-    seen = float(np.linalg.norm(ends[1] - ends[0])) * on_image.depth / frame.K[0, 0]
-    on_image = replace(on_image, width=seen)
-    image = draw_grasp(frame.rgb, on_image, frame.K, success=success)
-    return GalleryItem(image, f"{caption}: {reason}", success, policy)
+def picture(
+    frame: RGBDFrame, grasp: Grasp, policy: str, caption: str, reason: str, kind: tuple[str, ...]
+) -> GalleryItem:
+    """Draw a grasp on what its frame shows around it; caption: begins the picture's, which ends
+    with the reason. policy, reason, kind: see `GalleryItem`."""
+    success = reason == SUCCESS
+    image = close_up(frame, grasp, success)
+    return GalleryItem(image, f"{caption}: {reason}", success, policy, kind, reason)
 
 
 def write_failures(path: Path, pictures: list[GalleryItem]) -> None:
-    """Write one picture of failed grasps, of each policy in turn; no file if nothing failed."""
-    failures = _in_turns([p for p in pictures if not p.success])[:MOST_FAILURES]
+    """Write one picture of failed grasps, of each kind in turn; no file if nothing failed."""
+    failures = _in_turns([p for p in pictures if not p.success], MOST_FAILURES)
     if failures:
         sheet = contact_sheet([p.image for p in failures], [p.caption for p in failures])
-        write_atomic(path, iio.imwrite("<bytes>", sheet, extension=".png"))
+        write_picture(path, sheet)
 
 
 def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
     """Choose `count` pictures, half of them failures if there are enough of these."""
-    failures = _in_turns([p for p in pictures if not p.success])
-    successes = _in_turns([p for p in pictures if p.success])
+    failures = [p for p in pictures if not p.success]
+    successes = [p for p in pictures if p.success]
     take = min(len(failures), max(count // 2, count - len(successes)))
-    return failures[:take] + successes[: count - take]
+    return _in_turns(failures, take) + _in_turns(successes, count - take)
 
 
 def write_gallery(path: Path, pictures: Sequence[GalleryItem], count: int) -> None:
     """Keep the pictures, all of one size, that a report with `count` of them and failures.png may
     show, for a run that is resumed; no file if there are none."""
-    failures = _in_turns([p for p in pictures if not p.success])[: max(count, MOST_FAILURES)]
-    kept = failures + _in_turns([p for p in pictures if p.success])[:count]
+    kept = _in_turns([p for p in pictures if not p.success], max(count, MOST_FAILURES))
+    kept += _in_turns([p for p in pictures if p.success], count)
     if kept:
         file = io.BytesIO()
         arrays = {name: [getattr(item, name) for item in kept] for name in _GALLERY}
@@ -324,27 +329,47 @@ def write_gallery(path: Path, pictures: Sequence[GalleryItem], count: int) -> No
 
 
 def read_gallery(path: Path) -> list[GalleryItem]:
-    """The pictures that `write_gallery` has kept; none where there is no file. Raises UserError for
-    a file that is damaged."""
+    """The pictures that `write_gallery` has kept; none where there is no file, or one of a version
+    that kept whole frames, beside which later pictures do not fit. Raises UserError for a file that
+    is damaged."""
     if not path.exists():
         return []
     try:
         with np.load(path) as file:
-            images, captions, successes, policies = (file[name] for name in _GALLERY)
+            if "image" in file and "kind" not in file:
+                return []
+            columns = [file[name] for name in _GALLERY]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise UserError(
             f"{path}: cannot be read as pictures of an evaluation ({error}); delete it, the report "
             "then shows those of later rounds alone"
         ) from error
-    rows = zip(images, captions.tolist(), successes.tolist(), policies.tolist())
+    images, captions, successes, policies, kinds, reasons = columns
+    words = captions.tolist(), successes.tolist(), policies.tolist()
+    rows = zip(images, *words, map(tuple, kinds.tolist()), reasons.tolist())
     return [GalleryItem(*row) for row in rows]
 
 
-def _in_turns(pictures: list[GalleryItem]) -> list[GalleryItem]:
-    """One of each policy, then another of each, so that the worst policy does not fill the page."""
-    number_of: Counter[str] = Counter()
-    turns = []
-    for position, item in enumerate(pictures):
-        turns.append((number_of[item.policy], position))
-        number_of[item.policy] += 1
-    return [pictures[position] for _, position in sorted(turns)]
+def _in_turns(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
+    """At most `count` of the pictures: policies, scenarios, object sets, depth noises and reasons
+    take turns, so that neither the worst policy nor the first scenario fills the page.
+
+    Each picture is of those whose properties were shown least so far, then of the combination that
+    was. So the first pictures of a choice are those of a smaller one.
+    """
+    left: dict[tuple[str, ...], deque[GalleryItem]] = {}
+    for item in pictures:
+        left.setdefault((item.policy, item.reason, *item.kind), deque()).append(item)
+    shown: Counter[Any] = Counter()
+
+    def turn(properties: tuple[str, ...]) -> tuple[int, int]:
+        return sum(shown[pair] for pair in enumerate(properties)), shown[properties]
+
+    chosen: list[GalleryItem] = []
+    while left and len(chosen) < count:
+        properties = min(left, key=turn)
+        chosen.append(left[properties].popleft())
+        shown.update([properties, *enumerate(properties)])
+        if not left[properties]:
+            del left[properties]
+    return chosen

@@ -248,12 +248,17 @@ def _difference_cells(
     return [first, "scenario", "objects", *depth, "success", "cleared", "rounds"], lines
 
 
+def has_interval(difference: Difference) -> bool:
+    """Whether a paired difference is of enough rounds for an interval, wherever it is shown."""
+    return difference.rounds >= FEW_ROUNDS
+
+
 def _points(difference: Difference | None) -> str:
     """'+12.5 [+3.1, +21.9]' in percentage points; an interval of few rounds would be too narrow."""
     if difference is None:
         return "-"
     value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
-    if difference.rounds < FEW_ROUNDS:
+    if not has_interval(difference):
         return f"{value:+.1f} (few rounds)"
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
@@ -282,8 +287,9 @@ def write_comparisons_csv(path: Path, comparisons: Sequence[Comparison]) -> None
         line: dict[str, object] = {name: getattr(pair, name) for name in names}
         for measure, name in figures:
             difference: Difference | None = getattr(pair, measure)
-            few = difference is not None and difference.rounds < FEW_ROUNDS
-            hidden = difference is None or (few and name in ("low", "high"))
+            hidden = difference is None or (
+                name in ("low", "high") and not has_interval(difference)
+            )
             line[f"{measure}_{name}"] = None if hidden else getattr(difference, name)
         flat.append(line)
     _write_csv(path, [*names, *("_".join(figure) for figure in figures)], flat)
