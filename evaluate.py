@@ -47,6 +47,7 @@ from utils.evaluation import (
     play,
     policies_of,
     replay,
+    resumption,
 )
 from utils.report import balanced, write_failures, write_report
 from utils.result_formats import (
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_options(options)
     check_names(config)
-    check_copies({f"--{name}": getattr(options, name) for name in ("results", "csv", "latex")})
+    check_copies({f"--{name}": path for name, path in copies(options).items()})
     if options.compare is not None:
         return report_comparison(options)
     if options.replay is not None:
@@ -86,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int:
     """Play the rounds that are missing, and write table and report; returns the exit code."""
     announce(config, run)
-    outcome = play(config, run, work)
+    outcome = play(config, run, work, resumption(run, copies(options)))
     if outcome.error is not None and not outcome.rounds:
         raise outcome.error
 
@@ -106,7 +107,7 @@ def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
     if unfinished is not None:
-        print(f"{unfinished}; go on with --resume {run}")
+        print(f"{unfinished}; go on with {resumption(run, copies(options))}")
     # Last, so that the run's own files are there even where these cannot be written.
     if options.results is not None:
         write_results(options.results, *results)
@@ -124,9 +125,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add("--compare", metavar="RUN", nargs=2, help="paired differences of two runs, nothing else")
     add("--csv", metavar="FILE", help="also write the paired differences here")
     add("--latex", metavar="FILE", help="also write them here as a LaTeX table")
-    add(
-        "--replay", metavar="FILE", help="play the rounds of docs/results/*.jsonl again and compare"
-    )
+    add("--replay", metavar="FILE", help="play rounds of docs/results/*.jsonl again and compare")
+
+
+def copies(options: argparse.Namespace) -> dict[str, Path | None]:
+    """The files that are written besides the run's folder, by option."""
+    return {name: getattr(options, name) for name in ("results", "csv", "latex")}
 
 
 # What plays no rounds of a config, or plays them with a config of its own, and the arguments that
@@ -156,8 +160,7 @@ def announce(config: Config, run: Path) -> None:
     sets = [f"{name} ({split})" if name in OBJECT_SETS else name for name in plan.object_sets]
     print(
         f"{', '.join(policy_name(*pair) for pair in policies_of(config))} on "
-        f"{', '.join(plan.scenarios)} scenes of "
-        f"{', '.join(sets)} with depth noise "
+        f"{', '.join(plan.scenarios)} scenes of {', '.join(sets)} with depth noise "
         f"{', '.join(depth_noises_of(config))}, {plan.rounds} rounds each, seed {config.seed}, in "
         f"{config.simulator}, on {describe_workers(config)}; results in {run}",
         flush=True,
@@ -220,7 +223,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
             folder = run / evaluation.column / evaluation.scenes.folder
             folder.mkdir(parents=True, exist_ok=True)
             announce(evaluation.config, folder)
-            outcome = play(evaluation.config, folder, work)
+            outcome = play(evaluation.config, folder, work, resumption(run, copies(options)))
             write_failures(folder / "failures.png", outcome.gallery)
             for row in evaluation.rows:
                 scores[row][evaluation.column] = score_of(outcome.rounds, row.planner)
@@ -237,7 +240,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
         write_transfer(run, lines, columns, config, device, complete, options.results)
         print(f"picture: {run / 'transfer.png'}")
         if not complete:
-            print(f"interrupted; go on with --resume {run}")
+            print(f"interrupted; go on with {resumption(run, copies(options))}")
         if error is not None:
             raise error
         return 130 if interrupted else 0

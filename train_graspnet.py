@@ -30,6 +30,7 @@ import utils.installation  # noqa: F401 - ends in one sentence where a package i
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import argparse
+import tempfile
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -40,19 +41,20 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.cell import camera_intrinsics
-from envs.data_generation import generate
+from envs.data_generation import data_folder, generate, missing_shards, object_sets
 from envs.registries import check_names
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, epoch_loader, simulated_data, steps_per_epoch
 from models.graspnet_io import load_graspnet, save_graspnet
 from models.graspnet_scores import (
     check_graspable,
-    describe_scores,
+    closing_words,
     draw_curves,
     draw_predictions,
+    row_in_words,
     write_curves,
 )
-from models.graspnet_training import Trainer, make_network, mean_of
+from models.graspnet_training import Trainer, go_on, make_network, mean_of
 from models.rectangle_examples import Judged
 from models.rectangle_folds import (
     Fold,
@@ -62,7 +64,7 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
-from utils.atomic_files import check_writable
+from utils.atomic_files import cannot_write, check_writable
 from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
@@ -80,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_names(config)
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
-    make_network(config, max_width=1.0)  # an impossible network fails here, before data are made
+    check_place(options.resume or Path("runs/train_graspnet"))
+    make_network(config, config.gripper.max_opening)  # an impossible one fails here, before data
     photographs = open_target(config)
     with team(config.train.device, os.environ) as processes:
         if config.data.kind != "simulated":
@@ -98,9 +101,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             if processes.is_main:
                 # A half-trained network must not replace a finished one: no --weights then.
-                save_best(run, data, history, options.weights if finished else None)
+                scores = save_best(run, data, history, options.weights if finished else None)
+                if scores and not trainer.was_finished:
+                    print(closing_words(scores, run / "graspnet.pt"))
                 if not finished:
-                    print(f"stopped after {trainer.step} steps; go on with --resume {run}")
+                    print(f"stopped after {trainer.step} steps; {go_on(run, options.weights)}")
     return 0 if finished else 130
 
 
@@ -108,11 +113,20 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS)
 
 
-def make_data(config: Config, processes: Team) -> TrainingData:
-    """Make the simulated images that are still missing, and open them.
+def check_place(folder: Path) -> None:
+    """Raise UserError if nothing can be written in a folder, or where it would be made."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        os.rmdir(tempfile.mkdtemp(prefix=".", dir=there))
+    except OSError as error:
+        raise cannot_write(folder, error) from error
 
-    Raises UserError if the validation images show nothing graspable.
-    """
+
+def make_data(config: Config, processes: Team) -> TrainingData:
+    """Make the simulated images that are still missing, and open them. Raises UserError if the
+    validation images show nothing graspable."""
+    if missing_shards(config, data_folder(config), processes.rank, processes.ranks):
+        object_sets(config)  # an unusable set is told of here, before there is a folder of its data
     folder = generate(config, processes.rank, processes.ranks)
     processes.wait()
     truth = label_truth(read_trials(folder))
@@ -137,10 +151,8 @@ def train(
     config: Config, run: Path, data: TrainingData, trainer: Trainer
 ) -> tuple[list[dict[str, float]], bool]:
     """Train from the folder's last.pt, if it is there, to the end of the schedule or to Ctrl-C.
-
-    Returns the history, with a row of mean losses and validation scores for every epoch, and
-    whether the end was reached.
-    """
+    Returns the history, with a row of mean losses and scores for every epoch, and whether the end
+    was reached."""
     processes, steps = trainer.team, steps_per_epoch(config, data)
     history, losses = trainer.resume(run / "last.pt")  # losses: of steps after history's last row
     save = partial(
@@ -148,14 +160,10 @@ def train(
     )
     is_main = processes.is_main
     if is_main:
-        adapted = f", adapted to {config.adaptation.target}" if config.adaptation.target else ""
-        print(
-            f"{trainer.describe()}, on {len(data.train)} {config.data.kind} images{adapted}, for "
-            f"{config.train.epochs} epochs, seed {config.seed}; results in {run}",
-            flush=True,
-        )
+        print(trainer.announcement(config, len(data.train), run), flush=True)
     writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step + 1) if is_main else None
-    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=not is_main)
+    quiet = not is_main or trainer.was_finished
+    bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=quiet)
     last_save = time.monotonic()
     with stop_on_interrupt() as interrupted, bar:
         for epoch in range(len(history), config.train.epochs):
@@ -177,7 +185,7 @@ def train(
                 data.keep_best(run, history, save)
                 save(run / "last.pt", losses=[])
                 write_curves(writer, row | {"lr": trainer.scheduler.get_last_lr()[0]})
-                bar.write(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+                bar.write(row_in_words(row))
             losses = []
             processes.wait()
     return history, True
@@ -185,22 +193,19 @@ def train(
 
 def save_best(
     run: Path, data: TrainingData, history: list[dict[str, float]], weights: Path | None
-) -> None:
-    """Save the best network alone, its scores, curves and pictures, and print how good it is."""
+) -> dict[str, float]:
+    """Save the best network alone, its scores, which are returned, curves and pictures."""
     if not history:  # stopped within the first epoch
-        return
+        return {}
     best, network = load_graspnet(run / "best.pt"), run / "graspnet.pt"
     scores = best.extra["history"][-1]
     for path in filter(None, [network, weights]):
         save_graspnet(path, best.model, best.metres_per_pixel, best.config, scores=scores)
     save_results(run / "results.json", {"best": scores, "history": history})
-    draw_curves(run / "curves.png", history)
+    draw_curves(run / "curves.png", history, scores["epoch"])
     for name, images in data.pictured().items():
         draw_predictions(run / f"{name}.png", best.model, images)
-    print(f"best after epoch {scores['epoch']}: {describe_scores(scores)}")
-    print(f"the same on test objects: python -m benchmarks.bench_graspnet --checkpoint {network}")
-    print("with the planner's search, which makes up for much that a weak network misses:")
-    print(f"  python evaluate.py evaluate.policies=heuristic,{network}")
+    return scores
 
 
 def cross_validate(config: Config, options: argparse.Namespace, processes: Team) -> int:
@@ -226,7 +231,7 @@ def train_folds(
         history, finished = train(config, folder, fold.data, trainer)
         if not finished:
             if processes.is_main:
-                print(f"stopped in fold {fold.number}; go on with --resume {run}")
+                print(f"stopped in fold {fold.number}; {go_on(run, options.weights)}")
             return 130
         if processes.is_main:
             judged[fold.number] = fold.judge(trainer.model)

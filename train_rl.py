@@ -36,9 +36,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from envs.policy_approach import KNOWN_TO_A_ROBOT
 from envs.registries import check_names
 from envs.studio import film_episode
-from envs.vector_env import TrainingEnvs, WorkerError, full_difficulty, make_env, training_envs
+from envs.vector_env import (
+    OWN_ENVS,
+    TrainingEnvs,
+    WorkerError,
+    full_difficulty,
+    make_env,
+    training_envs,
+)
 from models.grasp_policy import GraspPPO, make_ppo
 from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
@@ -46,11 +54,17 @@ from models.ppo_progress import (
     ProgressRow,
     after_not_finite,
     after_worker_error,
+    announcement,
+    evaluate,
+    evaluation_due,
     load_progress,
     reached,
     row_in_words,
     save_evaluation,
     save_training,
+    save_unevaluated,
+    scoring_command,
+    stopped_in_words,
     summary,
     time_in_words,
     updates_of,
@@ -63,7 +77,6 @@ from models.ppo_rollouts import (
     NotFinite,
     RolloutCollector,
     derived_seeds,
-    evaluate_policy,
 )
 from utils.atomic_files import check_writable
 from utils.config import Config
@@ -81,6 +94,7 @@ FREE_TO_CHANGE = (
     "rl.target_return",
 )
 WEIGHTS_HELP = "also write the best policy here, once the training has reached its end"
+STOPPING = "interrupted: stopping after the update under way, or within the evaluation"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -97,19 +111,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         ppo = make_ppo(envs.observation_space, envs.action_space, config, processes)
         with run_folder("train_rl", config.rl.name, config, options.resume, processes) as run:
             history = load_progress(ppo, run / "last.pt")
-            announce(config, run, ppo)
+            if processes.is_main:
+                print(announcement(config, run, ppo), flush=True)
 
             finished = train(config, run, envs, ppo, history)
 
-            if processes.is_main:
+            if processes.is_main and history:  # else stopped in the first evaluation
                 # A policy that is half trained must not replace one that is not.
                 best = save_training(run, history, options.weights if finished else None)
-                print(f"best evaluation: {row_in_words(best)}")
-                if not finished:
-                    more = "" if options.weights is None else f" --weights {options.weights}"
-                    done = history[-1]["step"]
-                    print(f"stopped; go on after {done:,} steps with --resume {run}{more}")
+                print(f"best evaluation: {row_in_words(best)}; its policy: {run / 'best.pt'}")
+                print(f"curves: tensorboard --logdir {run / 'tensorboard'}")
+                if config.rl.env_id in OWN_ENVS:
+                    print("its score on other scenes:")
+                    print(f"  {scoring_command(config, run, ppo.layout, KNOWN_TO_A_ROBOT)}")
                 film(config, run, ppo)
+            if processes.is_main and not finished:
+                print(stopped_in_words(run, config, ppo.updates, history, options.weights))
     return 0 if finished else 130
 
 
@@ -127,25 +144,6 @@ def envs_of_each(config: Config, processes: Team) -> int:
     return config.rl.envs // processes.ranks
 
 
-def announce(config: Config, run: Path, ppo: GraspPPO) -> None:
-    processes, settings, layout = ppo.team, config.rl, ppo.layout
-    if not processes.is_main:
-        return
-    seen = ", ".join(part.key for part in (*layout.images, *layout.state))
-    hidden = ", ".join(part.key for part in layout.privileged)
-    estimated = ", ".join(settings.estimated_observations or ())
-    print(
-        f"PPO on {settings.env_id}: {settings.envs} environments, {updates_of(config)} updates of "
-        f"{settings.envs * settings.rollout_steps:,} steps each, "
-        f"{sum(p.numel() for p in ppo.network.parameters()):,} parameters, "
-        f"{processes.ranks} process(es), {processes.device}, seed {config.seed}; "
-        f"the policy sees {seen}"
-        f"{f', only the critic {hidden}' if hidden else ''}"
-        f"{f'; the network estimates {estimated}' if estimated else ''}; results in {run}",
-        flush=True,
-    )
-
-
 def train(
     config: Config, run: Path, envs: TrainingEnvs, ppo: GraspPPO, history: list[ProgressRow]
 ) -> bool:
@@ -157,7 +155,7 @@ def train(
     step = ppo.updates * per_update
     curves = Curves(run / "tensorboard", step, processes.is_main)
     try:
-        if settings.pretraining_images and not history:
+        if settings.pretraining_images and not (run / "last.pt").is_file():
             with envs.pretraining():
                 pretrain_estimator(
                     ppo, envs, settings.pretraining_images, config.seed, watch, curves
@@ -165,17 +163,27 @@ def train(
         bar = tqdm(
             total=total * per_update, initial=step, unit="step", disable=not processes.is_main
         )
-        with stop_on_interrupt() as interrupted, bar:
+        told = STOPPING if processes.is_main else None
+        with stop_on_interrupt(told) as interrupted, bar:
             while True:
-                if ppo.updates % settings.evaluate_every == 0 or ppo.updates == total:
+                due = evaluation_due(config, ppo.updates)
+                if due:
                     envs.record_episodes(None)
                     if not history or history[-1]["update"] < ppo.updates:
-                        history.append(evaluate(config, envs, ppo, watch, step))
+                        with envs.at_full_difficulty():
+                            row = evaluate(config, envs, ppo, watch, bar, interrupted)
+                        if row is None:
+                            save_unevaluated(run, config, ppo, history)
+                            return False
+                        history.append(row)
                         save_evaluation(run, config, ppo, history, curves)
                         if processes.is_main:
-                            bar.write(row_in_words(history[-1]))
+                            bar.write(row_in_words(row))
                     if reached(settings, history[-1]) or ppo.updates == total:
                         break
+                if processes.any(interrupted.is_set()):
+                    return False
+                if due:
                     begin_episodes(config, run, envs, collector, ppo, step)
                 begun = time.perf_counter()
                 seeds = derived_seeds(1, config.seed, LEARNING, processes.rank, ppo.updates)
@@ -191,8 +199,6 @@ def train(
                 curves.add("update", step, losses)
                 rate = per_update / (time.perf_counter() - begun)
                 curves.add("time", step, {"steps_per_second": rate})
-                if processes.any(interrupted.is_set()):
-                    return False
     except NotFinite as error:
         raise UserError(f"{error}; {after_not_finite(run)}") from error
     except WorkerError:
@@ -216,19 +222,6 @@ def begin_episodes(
     collector.restart(seeds)
     ppo.rewards.restart()
     ppo.memory.clear()
-
-
-def evaluate(
-    config: Config, envs: TrainingEnvs, ppo: GraspPPO, watch: Stopwatch, step: int
-) -> ProgressRow:
-    """Deterministic episodes on seeds that stay the same and that no training episode has."""
-    processes = ppo.team
-    seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
-    own, episodes = seeds[processes.rank :: processes.ranks], []
-    if own:
-        with envs.at_full_difficulty():
-            episodes = evaluate_policy(ppo.network, envs, ppo.layout, own, watch)
-    return {"update": ppo.updates, "step": step, **summary(processes.concatenate(episodes))}
 
 
 def film(config: Config, run: Path, ppo: GraspPPO) -> None:

@@ -22,6 +22,8 @@ from utils.grasp_labels import LabelSettings
 from utils.transforms import angle_difference, known_depth
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.transforms import Bbox
     from torch.utils.tensorboard import SummaryWriter
 
 _BEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
@@ -46,6 +48,8 @@ CURVES = {
     "centre_error": (VALIDATION, "px"),
     "information": (VALIDATION, "nats"),
 }
+# Units of CURVES that are printed as others, of which they are so many.
+PRINTED = {"rad": ("degrees", 180 / np.pi), "m": ("mm", 1000.0)}
 
 
 class LabelScores(NamedTuple):
@@ -161,6 +165,28 @@ def describe_scores(scores: Mapping[str, float]) -> str:
     )
 
 
+def row_in_words(row: Mapping[str, float]) -> str:
+    """'epoch 3, step 12, ..., angle error 6.2 degrees': a history row with its units."""
+    words = []
+    for name, value in row.items():
+        if name in NO_CURVES:
+            words.append(f"{name} {value:,.0f}")
+            continue
+        unit, factor = PRINTED.get(CURVES[name][1], (CURVES[name][1], 1.0))
+        words.append(f"{name.replace('_', ' ')} {factor * value:.3g} {unit}".rstrip())
+    return ", ".join(words)
+
+
+def closing_words(scores: Mapping[str, float], network: Path) -> str:
+    """Lines about the best network, whose file is `network`, and what to do with it next."""
+    return (
+        f"best after epoch {scores['epoch']:.0f}: {describe_scores(scores)}\n"
+        f"the same on test objects: python -m benchmarks.bench_graspnet --checkpoint {network}\n"
+        "with the planner's search, which makes up for much that a weak network misses:\n"
+        f"  python evaluate.py evaluate.policies=heuristic,{network}"
+    )
+
+
 def curve_tag(name: str) -> str:
     """Return the TensorBoard tag of an entry of a history row: "validation/width_error_m"."""
     origin, unit = CURVES[name]
@@ -175,9 +201,13 @@ def write_curves(writer: SummaryWriter, row: Mapping[str, float]) -> None:
     writer.flush()
 
 
-def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
-    """Draw one small plot for every loss (training) and score (validation) over the epochs."""
+def draw_curves(
+    path: Path, history: Sequence[dict[str, float]], chosen: float | None = None
+) -> None:
+    """Draw one small plot for every loss (training) and score (validation) over the epochs, with a
+    mark at the `chosen` epoch."""
     import matplotlib.pyplot as plt  # slow to import, and few callers need it
+    from matplotlib.ticker import MaxNLocator
 
     names = [name for name in history[-1] if name not in NO_CURVES]
     columns = 4
@@ -194,6 +224,11 @@ def draw_curves(path: Path, history: Sequence[dict[str, float]]) -> None:
         axis.set_xlabel("epoch", fontsize=8)
         axis.set_ylabel(unit, fontsize=8)
         axis.grid(alpha=0.3)
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        if chosen is not None:
+            axis.axvline(chosen, color="black", linestyle="--", linewidth=1)
+    if chosen is not None:
+        figure.suptitle(f"dashed: epoch {chosen:.0f}, whose weights were chosen", fontsize=10)
     for axis in list(axes.flat)[len(names) :]:
         axis.remove()
     save_figure(path, figure)
@@ -205,27 +240,58 @@ def draw_predictions(path: Path, model: GraspNet, images: LabelledImages, count:
 
     chosen = np.linspace(0, len(images) - 1, min(count, len(images))).astype(int)
     titles = ("grasps", "depth", "labelled quality", "predicted quality")
-    figure, axes = plt.subplots(
-        len(chosen), 4, figsize=(10, 2.5 * len(chosen)), squeeze=False, layout="constrained"
-    )
+    rows, columns = images[0].depth.shape
+    size = 10, 2.5 * rows / columns * len(chosen) + 0.3  # inches; the last ones for the titles
+    figure, axes = plt.subplots(len(chosen), 4, figsize=size, squeeze=False, layout="constrained")
     model.eval()
     for row, index in zip(axes, chosen):
         image = images[int(index)]
         quality, angle, width = predicted_maps(model, image)
         depth = image.depth.numpy()
-        row[0].imshow(image.rgb.permute(1, 2, 0))
+        row[0].imshow(image.rgb.permute(1, 2, 0).numpy())
         known = depth[known_depth(depth)]
         row[1].imshow(depth, cmap="gray", vmin=known.min(), vmax=known.max())
-        row[2].imshow(image.quality.amax(dim=0), vmin=0, vmax=1)
-        row[3].imshow(torch.squeeze(quality).float().cpu(), vmin=0, vmax=1)
-        found = find_peaks(quality, angle, width, DRAWN)
-        for (u, v), direction, value in zip(found.pixel, found.angle, found.quality):
-            du, dv = 12 * np.cos(direction), 12 * np.sin(direction)
-            row[0].plot([u - du, u + du], [v - dv, v + dv], color="white", linewidth=3)
-            row[0].plot([u - du, u + du], [v - dv, v + dv], color="tab:red", linewidth=1.5)
-            row[0].text(u, v, f"{value:.2f}", fontsize=6, color="white")
+        row[2].imshow(image.quality.amax(dim=0).numpy(), vmin=0, vmax=1)
+        row[3].imshow(torch.squeeze(quality).float().cpu().numpy(), vmin=0, vmax=1)
+        draw_peaks(row[0], find_peaks(quality, angle, width, DRAWN))
         for axis in row:
             axis.set_axis_off()
     for axis, title in zip(axes[0], titles):
         axis.set_title(title, fontsize=10)
+    figure.draw_without_rendering()  # numbers have places only once the axes have theirs
+    for axis in axes[:, 0]:
+        keep_legible(axis)
     save_figure(path, figure)
+
+
+def draw_peaks(axis: Axes, found: Peaks) -> None:
+    """Draw grasps and their qualities on an image, whose borders stay those of the axis."""
+    axis.autoscale(False)
+    left, right, bottom, top = *axis.get_xlim(), *axis.get_ylim()
+    for (u, v), direction, value in zip(found.pixel, found.angle, found.quality):
+        du, dv = 12 * np.cos(direction), 12 * np.sin(direction)
+        axis.plot([u - du, u + du], [v - dv, v + dv], color="white", linewidth=3)
+        axis.plot([u - du, u + du], [v - dv, v + dv], color="tab:red", linewidth=1.5)
+        # Towards the middle, so that no number crosses the border.
+        across = "left" if u < (left + right) / 2 else "right"
+        down = v < (bottom + top) / 2
+        number = axis.annotate(
+            f"{value:.2f}", (u, v), (0, -4 if down else 4), textcoords="offset points", fontsize=6,
+            ha=across, va="top" if down else "bottom", color="white",
+            bbox={"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 0.8},
+        )  # fmt: skip
+        number.set_in_layout(False)
+
+
+def keep_legible(axis: Axes) -> None:
+    """Remove the numbers that lie over those of better grasps, which are drawn first, or over the
+    lines of other grasps."""
+    lines = [line.get_window_extent() for line in axis.lines[::2]]  # each has a rim
+    kept: list[Bbox] = []
+    for place, number in enumerate(list(axis.texts)):
+        box = number.get_window_extent()
+        others = lines[:place] + lines[place + 1 :] if place else []  # the best has its number
+        if any(box.overlaps(other) for other in (*kept, *others)):
+            number.remove()
+        else:
+            kept.append(box)

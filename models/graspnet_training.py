@@ -71,6 +71,7 @@ class Trainer:
 
     total_steps: length of the schedule. model: the bare network. trained: the module whose
     parameters the optimiser changes, by default the model, else a module that contains it.
+    epochs_before: how many epochs it had finished when it was resumed.
     Gradients are averaged over the processes of `team`, so that these together take the step of the
     joint batch (with batch-normalisation statistics of each process's part, except on GPUs).
     """
@@ -85,6 +86,7 @@ class Trainer:
                 "share it equally; make it a multiple"
             )
         self.settings, self.team, self.total_steps, self.step = settings, team, total_steps, 0
+        self.epochs_before = 0
         self.precision = choose_precision(settings.precision, team.device)
         model = model.to(team.device, memory_format=torch.channels_last)
         if team.ranks > 1 and team.device.type == "cuda":
@@ -107,6 +109,22 @@ class Trainer:
         )
         self.scaler = torch.amp.GradScaler(
             team.device.type, enabled=self.precision == torch.float16
+        )
+
+    @property
+    def was_finished(self) -> bool:
+        """Whether no epoch was left to train when it was resumed."""
+        return self.epochs_before == self.settings.epochs
+
+    def announcement(self, config: Config, images: int, run: Path) -> str:
+        """What is trained on how many images, or that this was done before, in one line."""
+        if self.was_finished:
+            return f"{run} was finished before, after {self.epochs_before} epochs: nothing to train"
+        target = config.adaptation.target
+        return (
+            f"{self.describe()}, on {images} {config.data.kind} images"
+            f"{'' if target is None else f', adapted to {target}'}, for {self.settings.epochs} "
+            f"epochs, seed {config.seed}; results in {run}"
         )
 
     def describe(self) -> str:
@@ -175,7 +193,9 @@ class Trainer:
     def resume(self, path: Path) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
         """Continue from a checkpoint if it exists; returns its entries `history` and `losses`."""
         saved = self.load(path) if path.is_file() else {}
-        return saved.get("history", []), saved.get("losses", [])
+        history = saved.get("history", [])
+        self.epochs_before = len(history)
+        return history, saved.get("losses", [])
 
     def load(self, path: Path) -> dict[str, Any]:
         """Continue from a checkpoint of `save`; returns its extra entries."""
@@ -205,6 +225,11 @@ class Trainer:
     def take_weights(self, checkpoint: dict[str, Any], path: Path) -> None:
         """Load the weights that `ordinary_model` and `more_state` gave to the checkpoint."""
         load_weights(self.model, checkpoint, path)
+
+
+def go_on(run: Path, weights: Path | None) -> str:
+    """How to go on with a run that was to write the file `weights`, too."""
+    return f"go on with --resume {run}" + ("" if weights is None else f" --weights {weights}")
 
 
 def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -7,15 +7,25 @@ history is the list of all rows. This module makes no environment and no network
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
 from models.grasp_policy import GraspPPO, load_policy, save_policy
-from models.ppo_rollouts import SIMULATION, Episode
+from models.ppo_observations import ObservationLayout
+from models.ppo_rollouts import (
+    EVALUATION,
+    SIMULATION,
+    Envs,
+    Episode,
+    derived_seeds,
+    evaluate_policy,
+)
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
 from utils.runs import Stopwatch, save_results
@@ -34,6 +44,49 @@ UNITS = {
 def updates_of(config: Config) -> int:
     """The number of updates until rl.total_steps are reached."""
     return -(-config.rl.total_steps // (config.rl.envs * config.rl.rollout_steps))
+
+
+def evaluation_due(config: Config, updates: int) -> bool:
+    """Whether the policy is evaluated after so many updates, and a checkpoint written."""
+    return updates % config.rl.evaluate_every == 0 or updates == updates_of(config)
+
+
+def announcement(config: Config, run: Path, ppo: GraspPPO) -> str:
+    """What is trained where, in one line."""
+    processes, settings, layout = ppo.team, config.rl, ppo.layout
+    seen = ", ".join(part.key for part in (*layout.images, *layout.state))
+    hidden = ", ".join(part.key for part in layout.privileged)
+    estimated = ", ".join(settings.estimated_observations or ())
+    return (
+        f"PPO on {settings.env_id}: {settings.envs} environments, {updates_of(config)} updates of "
+        f"{settings.envs * settings.rollout_steps:,} steps each, "
+        f"{sum(p.numel() for p in ppo.network.parameters()):,} parameters, "
+        f"{processes.ranks} process(es), {processes.device}, seed {config.seed}; "
+        f"the policy sees {seen}"
+        f"{f', only the critic {hidden}' if hidden else ''}"
+        f"{f'; the network estimates {estimated}' if estimated else ''}; results in {run}"
+    )
+
+
+def evaluate(
+    config: Config, envs: Envs, ppo: GraspPPO, watch: Stopwatch, bar: tqdm, interrupted: Event
+) -> ProgressRow | None:
+    """Deterministic episodes on seeds that stay the same and that no training episode has; None
+    where Ctrl-C has broken them off in any process. bar: tells how many have been played."""
+    processes, settings = ppo.team, config.rl
+    seeds = derived_seeds(settings.evaluation_episodes, config.seed, EVALUATION)
+    own = seeds[processes.rank :: processes.ranks]
+
+    def goes_on(played: int) -> bool:
+        bar.set_postfix_str(f"evaluating: {played} of {len(own)} episodes")
+        return not interrupted.is_set()
+
+    episodes = evaluate_policy(ppo.network, envs, ppo.layout, own, watch, goes_on)
+    bar.set_postfix_str("")
+    if processes.any(len(episodes) < len(own)):
+        return None
+    step = ppo.updates * settings.envs * settings.rollout_steps
+    return {"update": ppo.updates, "step": step, **summary(processes.concatenate(episodes))}
 
 
 def summary(episodes: Sequence[Episode]) -> dict[str, float]:
@@ -126,6 +179,14 @@ def save_evaluation(
     ppo.team.wait()
 
 
+def save_unevaluated(run: Path, config: Config, ppo: GraspPPO, history: list[ProgressRow]) -> None:
+    """Write last.pt where an evaluation was broken off: a resumed run begins with it, and no update
+    is lost."""
+    if ppo.team.is_main:
+        ppo.save(run / "last.pt", config, history=history)
+    ppo.team.wait()
+
+
 def load_progress(ppo: GraspPPO, last: Path) -> list[ProgressRow]:
     """Continue from a checkpoint, if there is one; returns the history so far."""
     if not last.is_file():
@@ -142,6 +203,36 @@ def save_training(run: Path, history: list[ProgressRow], weights: Path | None) -
     best = best_of(history)
     save_results(run / "results.json", {"best": best, "history": history})
     return best
+
+
+def scoring_command(
+    config: Config, run: Path, layout: ObservationLayout, known: Collection[str]
+) -> str:
+    """The command that scores the best policy of a run in the cell on scenes that it has not met.
+    known: what a robot knows; a policy that sees more is not scored beside planners."""
+    best = run / "best.pt"
+    if any(part.key not in known for part in layout.state):
+        return f"python -m benchmarks.bench_policy {best}"
+    return (
+        f"python evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
+        f"evaluate.object_sets={config.env.objects}"
+    )
+
+
+def stopped_in_words(
+    run: Path, config: Config, updates: int, history: list[ProgressRow], weights: Path | None
+) -> str:
+    """What Ctrl-C has left after so many updates, and how to go on. weights: file of --weights."""
+    command = f"--resume {run}" + ("" if weights is None else f" --weights {weights}")
+    done = updates * config.rl.envs * config.rl.rollout_steps
+    # Where an evaluation is due, it has written a checkpoint, or was broken off with one.
+    saved = done if evaluation_due(config, updates) else history[-1]["step"]
+    if saved == done:
+        return f"stopped after {done:,} steps, at a checkpoint; go on with {command}"
+    return (
+        f"stopped after {done:,} steps, but the last checkpoint is of {saved:,}: {command} goes on "
+        f"from there and repeats the other {done - saved:,}"
+    )
 
 
 def row_in_words(row: ProgressRow) -> str:

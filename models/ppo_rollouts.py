@@ -9,6 +9,7 @@ before a rollout or an evaluation has ended. What it does does not depend on the
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +27,7 @@ from utils.runs import Stopwatch
 SIMULATION, NETWORK = "simulation", "network"  # parts of the time that the stopwatch separates
 # Purposes of seeds (`derived_seeds`), no two of which share a seed: FRESH scores a trained policy.
 TRAINING, EVALUATION, LEARNING, FRESH, PRETRAINING = range(5)
+SLICE_SECONDS = 2.0  # of an evaluation, between two of which it can be broken off
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
 
 Task = Callable[[gymnasium.Env, int], Generator[None, None, Any]]
@@ -190,42 +192,72 @@ def play(
     )  # fmt: skip
 
 
+class Share(NamedTuple):
+    """What one environment has yet to play of an evaluation. seeds: of its episodes. now: that of
+    the first seed, None where it has not begun."""
+
+    seeds: Sequence[int]
+    now: Underway | None = None
+
+
 def evaluate_policy(
-    network, envs: Envs, layout: ObservationLayout, seeds: Sequence[int], watch: Stopwatch
-) -> list[Episode]:
+    network, envs: Envs, layout: ObservationLayout, seeds: Sequence[int], watch: Stopwatch,
+    goes_on: Callable[[int], bool] | None = None,
+) -> list[Episode]:  # fmt: skip
     """Deterministic episodes, one from each seed and in that order, whatever the number of
-    environments. Episodes under way are dropped: restart all environments afterwards."""
+    environments. Episodes under way are dropped: restart all environments afterwards.
+
+    goes_on: is told now and then how many episodes have been played; where it returns False, the
+    evaluation is broken off and its result empty.
+    """
     count = envs.num_envs
-    shares = [seeds[index::count] for index in range(count)]
+    shares = [Share(seeds[index::count]) for index in range(count)]
+    played: list[list[Episode]] = [[] for _ in range(count)]
     with watch(NETWORK):
         actor = Actor(network)
-    task = partial(play_episodes, actor=actor, layout=layout, shares=shares)
-    with watch(SIMULATION), one_thread():
-        played = envs.each(task)
+    while any(len(share.seeds) for share in shares):
+        if goes_on is not None and not goes_on(sum(map(len, played))):
+            return []
+        until = time.monotonic() + SLICE_SECONDS
+        task = partial(play_episodes, actor=actor, layout=layout, shares=shares, until=until)
+        with watch(SIMULATION), one_thread():
+            slices = envs.each(task)
+        shares = [share for _, share in slices]
+        for episodes, (ended, _) in zip(played, slices):
+            episodes += ended
     return [played[number % count][number // count] for number in range(len(seeds))]
 
 
 def play_episodes(
     env: gymnasium.Env, index: int, actor: Actor, layout: ObservationLayout,
-    shares: Sequence[Sequence[int]],
-) -> Generator[None, None, list[Episode]]:  # fmt: skip
-    """A task: play an episode without noise from each seed of this environment's share."""
-    episodes, room = [], layout.empty(1)
-    for seed in shares[index]:
-        observation, info = env.reset(seed=int(seed))
-        total, length, ended = 0.0, 0, False
-        place = f"in an evaluation, of the episode with seed {seed}, is not finite"
-        while not ended:
+    shares: Sequence[Share], until: float,
+) -> Generator[None, None, tuple[list[Episode], Share]]:  # fmt: skip
+    """A task: play episodes without noise, one from each seed of this environment's share, until a
+    time of the monotonic clock, which all processes share, but one step at least. Returns those
+    that have ended, and what is left of the share."""
+    (seeds, now), episodes = shares[index], []
+    while len(seeds):
+        place = f"in an evaluation, of the episode with seed {seeds[0]}, is not finite"
+        if now is None:
+            observation, _ = env.reset(seed=int(seeds[0]))
             yield
-            _read(observation, layout, room, place)
-            action = actor.action(actor.latent(room))
-            observation, reward, terminated, truncated, info = env.step(action)
-            if not math.isfinite(reward):
-                raise NotFinite(f"the reward {place}")
-            total, length, ended = total + float(reward), length + 1, terminated or truncated
+            now = Underway(layout.empty(1))
+            _read(observation, layout, now.seen, place)
+        action = actor.action(actor.latent(now.seen))
+        observation, reward, terminated, truncated, info = env.step(action)
         yield
-        episodes.append(Episode(total, length, _success(info)))
-    return episodes
+        if not math.isfinite(reward):
+            raise NotFinite(f"the reward {place}")
+        total, length = now.total + float(reward), now.length + 1
+        if terminated or truncated:
+            episodes.append(Episode(total, length, _success(info)))
+            seeds, now = seeds[1:], None
+        else:
+            _read(observation, layout, now.seen, place)
+            now = Underway(now.seen, total, length)
+        if time.monotonic() >= until:
+            break
+    return episodes, Share(seeds, now)
 
 
 def _read(observation: Any, layout: ObservationLayout, room: Observations, place: str) -> None:

@@ -398,7 +398,7 @@ def test_a_copy_that_cannot_be_written_takes_nothing_from_the_run(
     """Its folder is gone when the rounds have been played."""
     (tmp_path / "away").mkdir()
 
-    def played(config, run, work):
+    def played(*_):
         (tmp_path / "away").rmdir()
         (tmp_path / "away").touch()
         return Outcome(ROUNDS)
@@ -410,6 +410,45 @@ def test_a_copy_that_cannot_be_written_takes_nothing_from_the_run(
     assert "away/copy: cannot be written" in line
     names = {path.name for path in only_run(tmp_path).iterdir()}
     assert names >= {"results.json", "results.csv", "report.html"}
+
+
+def test_an_interrupted_evaluation_goes_on_with_the_files_of_its_options(
+    tmp_path, monkeypatch, capsys
+):
+    told = []
+
+    def played(config, run, work, resume):
+        told.append(resume)
+        return Outcome(ROUNDS[:1], interrupted=True)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(evaluate, "play", played)
+    monkeypatch.setattr(evaluate, "check_everything", lambda config: None)
+    arguments = ["evaluate.policies=heuristic,random", "evaluate.scenarios=pile", *SMALL]
+    files = ["--latex", "pairs.tex", "--csv", "pairs.csv", "--results", "copy.json"]
+    assert evaluate.main([*arguments, *files]) == 130
+    run = only_run(tmp_path).relative_to(tmp_path)
+    command = f"--resume {run} --results copy.json --csv pairs.csv --latex pairs.tex"
+    assert told == [command]
+    assert f"1 of 4 rounds; go on with {command}\n" in capsys.readouterr().out
+
+
+def test_the_report_of_a_column_goes_on_with_that_of_the_whole_run(tmp_path, monkeypatch, capsys):
+    told = []
+
+    def played(config, folder, work, resume):
+        told.append(resume)
+        return Outcome([], interrupted=True)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(evaluate, "play", played)
+    monkeypatch.setattr(evaluate, "check_everything", lambda *_: None)
+    arguments = ["transfer.policies=[[a, b, heuristic, null, null]]", "transfer.columns=pybullet",
+                 "evaluate.depth_noises=null", "--results", "copy.json"]  # fmt: skip
+    assert evaluate.main(arguments) == 130
+    run = only_run(tmp_path).relative_to(tmp_path)
+    assert told == [f"--resume {run} --results copy.json"]
+    assert f"interrupted; go on with {told[0]}\n" in capsys.readouterr().out
 
 
 def test_a_folder_without_meshes_is_refused(tmp_path, monkeypatch, capsys):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -13,6 +17,9 @@ from models.graspnet_scores import (
     check_graspable,
     curve_tag,
     describe_scores,
+    draw_curves,
+    draw_predictions,
+    row_in_words,
     score_labels,
     score_peak,
 )
@@ -122,3 +129,67 @@ def test_scores_are_described_in_degrees_and_millimetres():
         "the network alone, by the best grasp on each of 254 validation images: mean label 0.75 of "
         "1, 83 % positive; the nearest label is 6.0 degrees, 6.2 mm of width and 1.2 px away"
     )
+
+
+def test_a_row_of_the_history_is_printed_with_units():
+    row = {"epoch": 3, "step": 12345, "angle_loss": 2.0, "width_loss": 0.0066,
+           "label_quality": 0.75, "angle_error": np.radians(48.9), "width_error": 0.02013,
+           "distance": 73.05, "images": 254}  # fmt: skip
+    assert row_in_words(row) == (
+        "epoch 3, step 12,345, angle loss 2 nats, width loss 6.6 mm, label quality 0.75, "
+        "angle error 48.9 degrees, width error 20.1 mm, distance 73 px, images 254"
+    )
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are drawn instead of being written."""
+    figures = []
+    monkeypatch.setattr("models.graspnet_scores.save_figure", lambda _, one: figures.append(one))
+    yield figures
+    for figure in figures:
+        plt.close(figure)
+
+
+class Corners(Always):
+    """Peaks at two corners, two beside each other and one alone, of an image of 80 x 80 pixels."""
+
+    def forward(self, x: torch.Tensor, centres: bool = False):
+        rows, columns = torch.meshgrid(torch.arange(80), torch.arange(80), indexing="ij")
+        bumps = [
+            torch.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 6.0)
+            for row, column in ((0, 79), (79, 0), (40, 40), (41, 45), (58, 40))
+        ]
+        quality = torch.stack(bumps).amax(dim=0)[None, None]
+        _, angle, _ = super().forward(x)
+        return quality, angle[..., :1, :1].expand(1, BINS, 80, 80), torch.full_like(quality, 0.04)
+
+
+def test_grasps_at_the_border_do_not_move_the_columns_of_the_picture(drawn):
+    image = labelled((4, 10, 12, 0.9, 0.05), side=80)
+    draw_predictions(Path("unwritten.png"), Corners(), [image] * 2)
+    axes, places = drawn[0].axes, []
+    for axis in axes:
+        assert (axis.get_xlim(), axis.get_ylim()) == ((-0.5, 79.5), (79.5, -0.5))
+        places.append(axis.get_window_extent())
+    assert len(axes) == 8 and len(axes[0].lines) == 10, "five grasps, each with a rim"
+    assert [box.width for box in places] == pytest.approx(8 * [places[0].width])
+    assert [box.y0 for box in places[:4]] == pytest.approx(4 * [places[0].y0])
+    numbers = [text.get_window_extent() for text in axes[0].texts]
+    assert len(numbers) == 4, "of the two beside each other one has its number"
+    assert not any(one.overlaps(other) for one, other in combinations(numbers, 2))
+    for number in numbers:
+        assert places[0].x0 <= number.x0 and number.x1 <= places[0].x1
+        assert places[0].y0 <= number.y0 and number.y1 <= places[0].y1
+
+
+def test_curves_have_whole_epochs_and_a_mark_at_the_chosen_one(drawn):
+    rows = [{"epoch": n, "step": 4 * n, "loss": 1 / n, "angle_error": 0.1} for n in (1, 2, 3)]
+    draw_curves(Path("unwritten.png"), rows, chosen=2)
+    draw_curves(Path("unwritten.png"), rows)
+    for axis in drawn[0].axes:
+        ticks = axis.get_xticks()
+        assert np.array_equal(ticks, ticks.round()) and set(ticks) >= {1, 2, 3}
+        assert list(axis.lines[1].get_xdata()) == [2, 2]
+    assert "epoch 2" in drawn[0].get_suptitle()
+    assert [len(axis.lines) for axis in drawn[1].axes] == [1, 1]

@@ -92,6 +92,28 @@ def test_evaluation_gives_each_seed_its_episode():
     assert [e.total / e.length for e in episodes] == [10, 20, 30, 40, 50]
 
 
+def test_an_evaluation_in_slices_of_one_step_is_the_same(monkeypatch):
+    ppo, seeds = ppo_of(), [10, 20, 30, 40, 50]
+    whole = evaluate_policy(ppo.network, counting(), COUNTED, seeds, Stopwatch())
+    monkeypatch.setattr("models.ppo_rollouts.SLICE_SECONDS", 0.0)
+    told = []
+    sliced = evaluate_policy(
+        ppo.network, counting(), COUNTED, seeds, Stopwatch(), lambda n: told.append(n) or True
+    )
+    assert [episode.length for episode in whole] == [3, 4, 3, 4, 3]
+    assert sliced == whole
+    assert told == [0, 0, 0, 1, 2, 2, 3, 3, 4], "before each step: episodes end at 3, 6, 9; 4, 8"
+
+
+def test_an_evaluation_is_broken_off_between_two_slices(monkeypatch):
+    monkeypatch.setattr("models.ppo_rollouts.SLICE_SECONDS", 0.0)
+    envs = counting()
+    episodes = evaluate_policy(
+        ppo_of().network, envs, COUNTED, [10, 20, 30, 40], Stopwatch(), lambda n: n == 0
+    )
+    assert episodes == [] and [int(env.count[0]) for env in envs.envs] == [3, 3]
+
+
 def test_derived_seeds_are_unrelated_and_repeatable():
     assert derived_seeds(3, 1, 2) == derived_seeds(3, 1, 2)
     places = [(0, 0), (0, 1), (1, 0), (0, 0, 1)]

@@ -123,7 +123,8 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
         interrupt_after(patch, Trainer, "train_step", lambda trainer: trainer.step == stop)
         assert train_graspnet.main([*arguments, f"--weights={shipped}"]) == 130
     (run,) = Path("runs/train_graspnet").iterdir()
-    assert f"stopped after {stop} steps; go on with --resume {run}" in capfd.readouterr().out
+    command = f"--resume {run} --weights {shipped}\n"
+    assert f"stopped after {stop} steps; go on with {command}" in capfd.readouterr().out
     assert load_checkpoint(run / "last.pt", KIND)["step"] == stop
     first_epoch_is_over = stop > 4
     for name in ("results.json", "graspnet.pt"):
@@ -142,12 +143,15 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     assert shipped.read_bytes() == (run / "graspnet.pt").read_bytes()
 
 
-def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch):
+def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch, capsys):
     run, _ = finished
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     monkeypatch.chdir(tmp_path)
     assert train_graspnet.main(["--resume", str(copy)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{copy} was finished before, after 3 epochs" in printed
+    assert "best after epoch" not in printed and "evaluate.py" not in printed
     assert (copy / "last.pt").read_bytes() == (run / "last.pt").read_bytes()
     assert json.loads((copy / "results.json").read_text()) == json.loads(
         (run / "results.json").read_text()

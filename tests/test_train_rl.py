@@ -14,19 +14,23 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train_rl
+from envs.policy_approach import KNOWN_TO_A_ROBOT, check_learned
 from envs.studio import film_episode
 from envs.vector_env import WorkerError, make_env, training_envs
 from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo import KIND
+from models.ppo_observations import ObservationLayout
+from models.ppo_progress import scoring_command
 from models.ppo_rollouts import EVALUATION, derived_seeds, evaluate_policy
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
 from tests.helpers.ppo_parts import batch_of, ppo_of
 from tests.helpers.ppo_step import SIZE, take_step
-from tests.helpers.quick_envs import POINT
+from tests.helpers.quick_envs import POINT, PointEnv
 from tests.helpers.torchrun import in_two_processes
 from utils.checkpoint import load_checkpoint
 from utils.config import load_config
@@ -204,9 +208,16 @@ def test_where_the_time_went_is_printed(tmp_path, monkeypatch, capsys):
 # --- Going on ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("stop", "changes"), [(3, []), (4, ["rl.parallel=true"])])
+@pytest.mark.parametrize(
+    ("stop", "saved", "words", "changes"),
+    [
+        (3, 2, "stopped after 96 steps, but the last checkpoint is of 64: --resume {run} goes", []),
+        # The evaluation that is due is broken off, and no step is lost.
+        (4, 4, "128 steps, at a checkpoint; go on with --resume {run}\n", ["rl.parallel=true"]),
+    ],
+)
 def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
-    finished, tmp_path, monkeypatch, capsys, stop, changes
+    finished, tmp_path, monkeypatch, capfd, stop, saved, words, changes
 ):
     """A real Ctrl-C; then it goes on, in worker processes too."""
     monkeypatch.chdir(tmp_path)
@@ -214,14 +225,69 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
         interrupt_after(patch, GraspPPO, "update", lambda ppo: ppo.updates == stop)
         assert train_rl.main(POINT) == 130
     (run,) = Path("runs/train_rl").iterdir()
-    assert f"go on after 64 steps with --resume {run}" in capsys.readouterr().out
-    assert load_checkpoint(run / "last.pt", KIND)["step"] == 2
+    assert words.format(run=run) in capfd.readouterr().out
+    assert load_checkpoint(run / "last.pt", KIND)["step"] == saved
 
     assert train_rl.main(["--resume", str(run), *changes]) == 0
     for name in ("last.pt", "best.pt"):
         ours, theirs = (load_checkpoint(folder / name, KIND) for folder in (run, finished))
         for part in ("step", "model", "optimizer", "extra"):
             assert same(ours[part], theirs[part]), (name, part)
+
+
+def test_ctrl_c_breaks_off_the_first_evaluation(finished, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("models.ppo_rollouts.SLICE_SECONDS", 0.0)
+        interrupt_after(patch, PointEnv, "step", lambda env: env._steps == 3)
+        assert train_rl.main([*POINT, "--weights", "alone.pt"]) == 130
+    (run,) = Path("runs/train_rl").iterdir()
+    out, err = capfd.readouterr()
+    assert err.count("interrupted: stopping") == 1 and "evaluating: 0 of 3 episodes" in err
+    command = f"--resume {run} --weights alone.pt"
+    assert f"stopped after 0 steps, at a checkpoint; go on with {command}\n" in out
+    assert "best evaluation" not in out and not Path("alone.pt").exists()
+    assert train_rl.main(["--resume", str(run)]) == 0
+    for name in ("last.pt", "best.pt"):
+        ours, theirs = (load_checkpoint(folder / name, KIND) for folder in (run, finished))
+        for part in ("step", "model", "optimizer", "extra"):
+            assert same(ours[part], theirs[part]), (name, part)
+
+
+def test_pretraining_is_not_repeated_where_the_first_evaluation_was_broken_off(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("models.ppo_rollouts.SLICE_SECONDS", 0.0)
+        interrupt_after(patch, PointEnv, "step", lambda env: True)
+        pretrained = [*POINT, *ESTIMATED, "rl.pretraining_images=64", "rl.total_steps=32"]
+        assert train_rl.main(pretrained) == 130
+    (run,) = Path("runs/train_rl").iterdir()
+    monkeypatch.setattr(train_rl, "pretrain_estimator", None)
+    assert train_rl.main(["--resume", str(run)]) == 0
+
+
+def test_the_end_says_where_policy_and_curves_are(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert train_rl.main([*POINT, "rl.target_return=-100"]) == 0
+    (run,) = Path("runs/train_rl").iterdir()
+    out = capsys.readouterr().out
+    assert f"its policy: {run / 'best.pt'}\n" in out
+    assert f"tensorboard --logdir {run / 'tensorboard'}\n" in out
+    assert "evaluate.py" not in out, "which knows the project's own environments"
+
+
+def test_a_policy_that_sees_what_no_robot_knows_is_not_scored_beside_planners():
+    config, box = load_config(None, ["env.objects=primitives"]), spaces.Box(-1, 1, (3,))
+    seen = ObservationLayout.of(spaces.Dict({"gripper": box}))
+    assert scoring_command(config, Path("run"), seen, KNOWN_TO_A_ROBOT) == (
+        "python evaluate.py evaluate.policies=ppo:run/best.pt evaluate.scenarios=isolated "
+        "evaluate.object_sets=primitives"
+    )
+    more = ObservationLayout.of(spaces.Dict({"gripper": box, "object_offset": box}))
+    command = scoring_command(config, Path("run"), more, KNOWN_TO_A_ROBOT)
+    assert command == "python -m benchmarks.bench_policy run/best.pt"
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch):
@@ -298,7 +364,11 @@ def test_a_training_can_start_from_weights(finished, tmp_path, monkeypatch):
         (["rl.policy_observations=stat"], "'stat', expected one of state; did you mean state"),
         (["rl.policy_observations=name"], "info entry 'name' is no number"),
         (["rl.device=tpu"], "rl.device: got 'tpu'"),
-        (["rl.batch_size=12"], r"batch_size \(12\) must divide envs x rollout_steps \(32\)"),
+        (
+            ["rl.batch_size=12"],
+            r"batch_size \(12\) must divide envs x rollout_steps \(32\); use batch_size=8 or 16",
+        ),
+        (["rl.batch_size=64"], r"envs x rollout_steps \(32\); use batch_size=32"),
         (["rl.initial=nowhere.pt"], "nowhere.pt"),
     ],
 )
@@ -455,7 +525,7 @@ def test_the_pendulum_is_learned(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ppo_state", "ppo"])
-def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name):
+def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, capsys, name):
     monkeypatch.chdir(tmp_path)
     small = ["rl.envs=2", "rl.rollout_steps=8", "rl.batch_size=8", "rl.total_steps=32",
              "rl.evaluate_every=1", "rl.evaluation_episodes=2", "env.max_steps=6",
@@ -466,6 +536,13 @@ def test_the_cell_is_trained_by_the_shipped_configs(tmp_path, monkeypatch, name)
     policy = load_policy(run / "last.pt")
     keys = {part.key for part in (*policy.layout.images, *policy.layout.state)}
     assert ("object_offset" in keys) == (name == "ppo_state")
+    printed = capsys.readouterr().out
+    if name == "ppo":  # the command that is printed can be carried out
+        assert f"evaluate.policies=ppo:{run / 'best.pt'} evaluate.scenarios=isolated" in printed
+        box = load_config(None, ["evaluate.object_sets=box"])
+        check_learned(f"ppo:{run / 'best.pt'}", ["isolated"], ["open_loop"], box)
+    else:
+        assert f"benchmarks.bench_policy {run / 'best.pt'}" in printed
     first = load_checkpoint(run / "last.pt", KIND)
     shutil.rmtree("runs")
     assert train_rl.main(arguments) == 0  # the same seeds, in new processes

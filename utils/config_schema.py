@@ -9,6 +9,7 @@ module reads no files and writes no error messages (`utils.config` does).
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -409,10 +410,14 @@ class RLConfig(Section):
 
     @model_validator(mode="after")
     def _whole_minibatches(self) -> RLConfig:
-        steps = self.envs * self.rollout_steps
-        if steps % self.batch_size:
+        steps, batch = self.envs * self.rollout_steps, self.batch_size
+        if steps % batch:
+            small = [n for n in range(1, math.isqrt(steps) + 1) if steps % n == 0]
+            sizes = sorted({*small, *(steps // n for n in small)})
+            beside = [*[n for n in sizes if n < batch][-1:], *[n for n in sizes if n > batch][:1]]
             raise ValueError(
-                f"batch_size ({self.batch_size}) must divide envs x rollout_steps ({steps})"
+                f"batch_size ({batch}) must divide envs x rollout_steps ({steps}); use "
+                f"batch_size={' or '.join(map(str, beside))}"
             )
         return self
 

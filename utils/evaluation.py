@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -206,6 +206,13 @@ def interruption(rounds_done: int, config: Config) -> str | None:
     return f"interrupted: {rounds_done} of {planned} rounds" if rounds_done < planned else None
 
 
+def resumption(run: Path, files: Mapping[str, Path | None]) -> str:
+    """The arguments that go on with a run and write the files of the same options:
+    '--resume RUN --csv FILE'."""
+    named = (f" --{name} {path}" for name, path in files.items() if path is not None)
+    return f"--resume {run}{''.join(named)}"
+
+
 def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
     """Raise UserError for a closed_loop.controller that evaluate.controllers would override."""
     several, one = config.evaluate.controllers, config.closed_loop.controller
@@ -260,22 +267,29 @@ def describe_workers(config: Config) -> str:
     return f"the cluster of {scheduler}, {count or 'all'} workers"
 
 
-def play(config: Config, run: Path, work: Callable[[Config, Task], TaskResult]) -> Outcome:
+def play(
+    config: Config,
+    run: Path,
+    work: Callable[[Config, Task], TaskResult],
+    resume: str | None = None,
+) -> Outcome:
     """Play every round that rounds.jsonl in `run` does not hold yet, and add it there.
 
-    work: plays one task, in a worker process.
+    work: plays one task, in a worker process. resume: the arguments that go on, for messages; None
+    for those of `run` alone.
     Ctrl-C, a scene that cannot be made and a task that no process survives end the work early; the
     tasks under way are finished after Ctrl-C, and the outcome holds everything that was played.
     Raises UserError where another process plays the same run, or has played a round twice.
     """
     journal = run / "rounds.jsonl"
     with writing(journal):
-        return _play(config, run, journal, work)
+        return _play(config, run, journal, work, resume or f"--resume {run}")
 
 
 def _play(
-    config: Config, run: Path, journal: Path, work: Callable[[Config, Task], TaskResult]
-) -> Outcome:
+    config: Config, run: Path, journal: Path, work: Callable[[Config, Task], TaskResult],
+    resume: str,
+) -> Outcome:  # fmt: skip
     cut_torn_line(journal)
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
@@ -290,7 +304,7 @@ def _play(
             open_executor(config.compute, config.evaluate.workers) as workers,
             stop_on_interrupt(
                 "interrupted: finishing the scenes under way, each with all of its policies; "
-                f"the rest will go on with --resume {run}"
+                f"the rest will go on with {resume}"
             ) as stop,
         ):
             for result in completed(workers, partial(work, config), todo, stop):
@@ -305,8 +319,8 @@ def _play(
             outcome.interrupted = stop.is_set()
     except LostWorkerError as error:
         outcome.error = UserError(
-            f"{error}; {len(outcome.rounds)} rounds are safe in {journal}: go on with --resume "
-            f"{run}, perhaps with evaluate.workers=1"
+            f"{error}; {len(outcome.rounds)} rounds are safe in {journal}: go on with {resume}, "
+            "perhaps with evaluate.workers=1"
         )
     except UserError as error:  # a scene that cannot be made, an object that cannot be used
         outcome.error = error

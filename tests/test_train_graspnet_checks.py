@@ -1,0 +1,49 @@
+"""What train_graspnet.py checks before it makes data, which takes an hour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import train_graspnet
+from models.graspnet_training import go_on
+from utils.errors import UserError
+
+
+def no_data(*_) -> Path:
+    raise AssertionError("no data are to be made")
+
+
+def test_a_folder_that_takes_no_run_is_told_of_before_data_are_made(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_graspnet, "generate", no_data)
+    Path("runs").touch()
+    with pytest.raises(UserError, match="runs/train_graspnet: cannot be written"):
+        train_graspnet.main(["train.device=cpu"])
+    Path("runs").unlink()
+    with pytest.raises(AssertionError, match="no data"):
+        train_graspnet.main(["train.device=cpu"])
+    assert not list(tmp_path.iterdir()), "a check leaves nothing"
+
+
+def test_one_object_is_refused_before_the_folder_of_its_data_is_made(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="box holds 1 object.*give sets of two objects or more"):
+        train_graspnet.main(["train.device=cpu", "data.object_sets=box"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_check_of_the_network_says_nothing_of_its_widths(tmp_path, monkeypatch, capsys):
+    """The network of the check is not the one that is trained."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_graspnet, "generate", no_data)
+    shipped = Path(train_graspnet.__file__).parent / "checkpoints" / "graspnet.pt"
+    with pytest.raises(AssertionError, match="no data"):
+        train_graspnet.main(["train.device=cpu", f"train.initial={shipped}"])
+    assert "widths" not in capsys.readouterr().out
+
+
+def test_a_run_goes_on_with_the_file_of_its_weights():
+    assert go_on(Path("run"), None) == "go on with --resume run"
+    assert go_on(Path("run"), Path("w.pt")) == "go on with --resume run --weights w.pt"
