@@ -89,7 +89,7 @@ def test_empty_file_is_the_defaults(tmp_path):
         ("camera.up=0, 1, 0", (0, 1, 0)),
         ("evaluate.name=007", "007"),
         ("evaluate.name=null", None),
-        ("evaluate.name=a=b", "a=b"),
+        ("closed_loop.controller=a=b", "a=b"),
         ("evaluate.workers=2", 2),
         ("objects.scale=3e-1", 0.3),
         ("objects.density=1E3", 1000.0),

@@ -76,8 +76,9 @@ def test_run_folder(tmp_path):
 
 def test_run_folder_errors(tmp_path):
     for name in ("../x", "a/b", ".x", "a b", "-x"):
-        with pytest.raises(UserError, match="run name"):
-            new_run_folder("evaluate", name, CONFIG, tmp_path)
+        for section in ("evaluate", "train", "rl"):
+            with pytest.raises(ConfigError, match=f"{section}.name: got .*run's name"):
+                load_config(None, [f"{section}.name={name}"])
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot make a run folder"):
         new_run_folder("evaluate", None, CONFIG, tmp_path / "file")

@@ -27,6 +27,7 @@ from utils.config_types import (
     Pixels,
     Positive,
     RandomizationConfig,
+    RunName,
     Section,
     Several,
     Share,
@@ -223,7 +224,7 @@ class EvaluateConfig(Section):
     videos: Annotated[int, Field(ge=0)]
     film_format: Literal["mp4", "gif"]
     gallery: Annotated[int, Field(ge=0)]
-    name: Name | None
+    name: RunName | None
 
 
 class TransferPolicy(NamedTuple):
@@ -298,7 +299,7 @@ class TrainConfig(Section):
     precision: Literal["auto", "float32", "bfloat16", "float16"]
     device: Name
     workers: Annotated[int, Field(ge=0)] | None
-    name: Name | None
+    name: RunName | None
 
 
 class AdaptationConfig(Section):
@@ -391,7 +392,7 @@ class RLConfig(Section):
     target_success: Share | None
     target_return: float | None
     device: Name
-    name: Name | None
+    name: RunName | None
 
     @model_validator(mode="after")
     def _one_role_each(self) -> RLConfig:

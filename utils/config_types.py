@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -76,6 +77,16 @@ def _offered_sets(names: tuple[str, ...], sets: tuple[str, ...]) -> tuple[str, .
     return tuple(dict.fromkeys(every))
 
 
+def _plain_name(name: str) -> str:
+    """Names of runs become names of folders."""
+    if not re.fullmatch(r"\w[\w.+-]*", name):
+        raise ValueError(
+            "a run's name has letters, digits and . _ + -, and starts with a letter, digit or _"
+        )
+    return name
+
+
+RunName = Annotated[Name, AfterValidator(_plain_name)]
 SimulatorName = Annotated[Name, AfterValidator(_installed_simulator)]
 TrainingSets = Annotated[
     Names,

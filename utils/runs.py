@@ -215,13 +215,7 @@ def new_run_folder(
     """Make root/<script>/<time>-<name>/ with config.yaml and environment.json; returns its path.
 
     The time is local, to the second; a number is added where that folder already exists.
-    Raises UserError where the name would not be a plain folder name.
     """
-    if name is not None and not re.fullmatch(r"\w[\w.+-]*", name):
-        raise UserError(
-            f"run name: got {name!r}, expected letters, digits and . _ + - starting with a letter, "
-            "digit or _; choose another name"
-        )
     folder = timed_folder(root / script, name)
     write_atomic(folder / "config.yaml", dump_config(config))
     write_json_atomic(folder / "environment.json", environment())
