@@ -41,7 +41,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.cell import camera_intrinsics
-from envs.data_generation import data_folder, generate, missing_shards, object_sets
+from envs.data_generation import generate
 from envs.registries import check_names
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, epoch_loader, simulated_data, steps_per_epoch
@@ -125,8 +125,6 @@ def check_place(folder: Path) -> None:
 def make_data(config: Config, processes: Team) -> TrainingData:
     """Make the simulated images that are still missing, and open them. Raises UserError if the
     validation images show nothing graspable."""
-    if missing_shards(config, data_folder(config), processes.rank, processes.ranks):
-        object_sets(config)  # an unusable set is told of here, before there is a folder of its data
     folder = generate(config, processes.rank, processes.ranks)
     processes.wait()
     truth = label_truth(read_trials(folder))

@@ -119,13 +119,14 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
             "set camera.view=fixed"
         )
     folder = data_folder(config)
-    _claim(folder, config)
     missing = missing_shards(config, folder, rank, ranks)
+    if missing:
+        object_sets(config)  # an unusable set raises here, not in a worker, and leaves no folder
+        if config.data.executed_share:
+            check_bin(config)
+    _claim(folder, config)
     if not missing:
         return folder
-    object_sets(config)  # an unusable set raises here, not in a worker
-    if config.data.executed_share:
-        check_bin(config)
     make = partial(_make_shard, config, folder.absolute())
     try:
         with (
