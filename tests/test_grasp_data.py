@@ -22,12 +22,16 @@ SHAPE = (5, 7)
 OVERHEAD = look_at((0.5, 0.0, 0.8), (0.5, 0.0, 0.0), (1, 0, 0))
 
 
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def made_up(rng: np.random.Generator, T_WC: np.ndarray = OVERHEAD) -> LabelledFrame:
     things = [SolidObject((), rng.uniform(-0.1, 0.1, 3), 0.5) for _ in range(rng.integers(1, 4))]
     frame = RGBDFrame(
         rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8),
         rng.uniform(0, 3.2, SHAPE).astype(np.float32),
-        rng.uniform(0, 500, (3, 3)),
+        pinhole(*rng.uniform(1, 500, 4)),
         T_WC,
         rng.integers(-2, len(things), SHAPE).astype(np.int32),
         SceneGeometry(tuple(things)),

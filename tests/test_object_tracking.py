@@ -33,11 +33,15 @@ def depth_of_block(intrinsics, T_WC, T_WB):
     return np.where(enter < leave, enter, depth).astype(np.float32)
 
 
+def without_colours(depth, K, T_WC):
+    return RGBDFrame(np.zeros((*depth.shape, 3), np.uint8), depth, K, T_WC)
+
+
 @pytest.fixture(scope="module")
 def block():
     """A grasp of the block, and the tracker of what the overhead camera saw of it."""
     T_WB = planar(0.52, 0.04, 0.5)
-    frame = RGBDFrame(None, depth_of_block(OVERHEAD, FROM_ABOVE, T_WB), OVERHEAD.K, FROM_ABOVE)
+    frame = without_colours(depth_of_block(OVERHEAD, FROM_ABOVE, T_WB), OVERHEAD.K, FROM_ABOVE)
     grasp = Grasp(np.array([0.525, 0.043, 0.02]), 0.5 + np.pi / 2, 0.05, 1.0)
     template = make_template(frame, grasp)
     return T_WB, grasp, TemplateMatcher(template, WRIST.K, (WRIST.width, WRIST.height))
@@ -54,7 +58,7 @@ def test_what_is_round_is_so_wherever_it_is_grasped(block):
     top = (0.04 - eye[2]) / way[..., 2]
     at = eye[:2] + way[..., :2] * top[..., None]
     depth = np.where(np.linalg.norm(at - (0.5, 0.0), axis=-1) < 0.035, top, depth)
-    frame = RGBDFrame(None, depth.astype(np.float32), OVERHEAD.K, FROM_ABOVE)
+    frame = without_colours(depth.astype(np.float32), OVERHEAD.K, FROM_ABOVE)
     for beside in (0.0, 0.03):
         grasp = Grasp(np.array([0.5 + beside, 0.0, 0.02]), 0.4, 0.05, 1.0)
         template = make_template(frame, grasp)
@@ -127,7 +131,7 @@ def test_an_empty_table_and_a_place_outside_the_image_are_distinguished(block):
         tracker.find(empty, inverse_pose(T_WC) @ planar(1.2, 0, 0), inverse_pose(T_WC))
     with pytest.raises(TargetLostError, match="table"):
         tracker.find(np.zeros_like(empty), T_CO, inverse_pose(T_WC))
-    frame = RGBDFrame(None, empty, WRIST.K, T_WC)
+    frame = without_colours(empty, WRIST.K, T_WC)
     with pytest.raises(TargetLostError, match="nothing stands"):
         make_template(frame, grasp)
 

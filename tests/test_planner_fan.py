@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from envs.evaluation_worker import check_everything
 from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import load_object_set
-from envs.rounds import checked_grasps
+from envs.rounds import NoGraspsError, checked_grasps
 from models.grasp_critic import INPUTS
 from models.planner_antipodal import measure, search
 from models.planner_candidates import Candidates, SearchSettings
@@ -315,7 +315,7 @@ def test_closed_loops_refuse_planners_that_tilt(config) -> None:
     )
     with pytest.raises(UserError, match="heuristic6d plans .* any side.*with open_loop alone"):
         check_everything(closed)
-    with pytest.raises(ValueError, match="straight above"):
+    with pytest.raises(NoGraspsError, match="straight above"):
         checked_grasps([Grasp(np.zeros(3), 0, 0.05, 1.0, approach(30, 0))], planar=True)
 
 
