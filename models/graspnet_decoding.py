@@ -32,6 +32,9 @@ class PeakSettings:
     blur: float = 1.0  # pixels, standard deviation of the Gaussian over the quality; 0: no blur
 
 
+HIGHEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # however low it is
+
+
 class Peaks(NamedTuple):
     """N peaks of the quality map, best first.
 

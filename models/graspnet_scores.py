@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from models.graspnet import GraspNet, to_input
-from models.graspnet_decoding import Peaks, PeakSettings, find_peaks
+from models.graspnet_decoding import HIGHEST_PEAK, Peaks, PeakSettings, find_peaks
 from utils.atomic_files import save_figure
 from utils.augmentation import LabelledImage, LabelledImages
 from utils.errors import UserError
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Bbox
     from torch.utils.tensorboard import SummaryWriter
 
-_BEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
 DRAWN = PeakSettings(threshold=0.3, count=5)  # the peaks in a picture
 NO_CURVES = ("epoch", "step", "images")  # entries of a history row that are no curves
 # Where each entry of a history row comes from, and its unit; "" has none.
@@ -102,7 +101,7 @@ def score_labels(model: GraspNet, images: LabelledImages) -> LabelScores:
     for index in range(len(images)):
         image = images[index]
         if shows_a_grasp(image):
-            found = find_peaks(*predicted_maps(model, image), _BEST_PEAK)
+            found = find_peaks(*predicted_maps(model, image), HIGHEST_PEAK)
             rows.append(score_peak(found, image))
     if not rows:
         return LabelScores(0.0, 0.0, np.pi / 2, float("nan"), float("nan"), 0)

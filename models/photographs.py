@@ -19,12 +19,12 @@ import numpy as np
 import torch
 
 from models.graspnet import to_input
-from models.graspnet_decoding import find_peaks, surface_depth, surface_grasps
+from models.graspnet_decoding import HIGHEST_PEAK, find_peaks, surface_depth, surface_grasps
 from models.graspnet_io import SavedGraspNet
 from models.planner_candidates import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth, tilts
-from models.rectangle_examples import HIGHEST_PEAK, Judged, best_rectangle, judged
+from models.rectangle_examples import Judged, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.images import overhead_view

@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from models.graspnet import GraspNet, GraspTargets, targets_from_labels, to_input
 from models.graspnet_data import Example
-from models.graspnet_decoding import PeakSettings, find_peaks
+from models.graspnet_decoding import HIGHEST_PEAK, find_peaks
 from utils.atomic_files import save_figure
 from utils.augmentation import Augmentation, LabelledImage
 from utils.rectangles import (
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ANYWHERE = 0.5  # of the examples show any part of the view: its corners hold nothing to grasp
-HIGHEST_PEAK = PeakSettings(threshold=-1.0, count=1)  # the highest peak, however low
 COLUMNS = 5  # of a picture's grid
 SHOWN = 60  # images in a picture at most; of more images, some evenly spread ones
 MARGIN = 40  # pixels around all rectangles
