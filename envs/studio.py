@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from envs.objects import load_object_set
 from envs.simulators import make_cell
 from utils.atomic_files import check_writable
 from utils.errors import UserError
-from utils.runs import parse_args, run_script
+from utils.runs import parse_args, run_script, this_python
 from utils.transforms import RGBDFrame, look_at
 
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
@@ -181,7 +180,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             picture = studio.picture()
         if chosen.rgbd is not None:
             arguments = write_rgbd(cell.frame(), chosen.rgbd)
-            command = shlex.join([sys.executable, "predict.py", *arguments])
+            command = f"{this_python()} {shlex.join(['predict.py', *arguments])}"
     output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
     imageio.imwrite(output, picture)
     print(f"wrote {output}")

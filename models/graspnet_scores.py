@@ -19,6 +19,7 @@ from utils.atomic_files import save_figure
 from utils.augmentation import LabelledImage, LabelledImages
 from utils.errors import UserError
 from utils.grasp_labels import LabelSettings
+from utils.runs import this_python
 from utils.transforms import angle_difference, known_depth
 
 if TYPE_CHECKING:
@@ -178,11 +179,12 @@ def row_in_words(row: Mapping[str, float]) -> str:
 
 def closing_words(scores: Mapping[str, float], network: Path) -> str:
     """Lines about the best network, whose file is `network`, and what to do with it next."""
+    python = this_python()
     return (
         f"best after epoch {scores['epoch']:.0f}: {describe_scores(scores)}\n"
-        f"the same on test objects: python -m benchmarks.bench_graspnet --checkpoint {network}\n"
+        f"the same on test objects: {python} -m benchmarks.bench_graspnet --checkpoint {network}\n"
         "with the planner's search, which makes up for much that a weak network misses:\n"
-        f"  python evaluate.py evaluate.policies=heuristic,{network}"
+        f"  {python} evaluate.py evaluate.policies=heuristic,{network}"
     )
 
 

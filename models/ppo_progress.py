@@ -28,7 +28,7 @@ from models.ppo_rollouts import (
 )
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
-from utils.runs import Stopwatch, save_results
+from utils.runs import Stopwatch, save_results, this_python
 
 ProgressRow = dict[str, Any]
 
@@ -212,9 +212,9 @@ def scoring_command(
     known: what a robot knows; a policy that sees more is not scored beside planners."""
     best = run / "best.pt"
     if any(part.key not in known for part in layout.state):
-        return f"python -m benchmarks.bench_policy {best}"
+        return f"{this_python()} -m benchmarks.bench_policy {best}"
     return (
-        f"python evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
+        f"{this_python()} evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
         f"evaluate.object_sets={config.env.objects}"
     )
 

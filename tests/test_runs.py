@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from utils.runs import (
     run_of_job,
     run_script,
     save_results,
+    this_python,
     usable_cpus,
 )
 
@@ -82,6 +84,14 @@ def test_run_folder_errors(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot make a run folder"):
         new_run_folder("evaluate", None, CONFIG, tmp_path / "file")
+
+
+def test_commands_that_are_printed_name_the_interpreter_from_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "executable", str(Path.cwd() / ".venv" / "bin" / "python"))
+    assert this_python() == str(Path(".venv", "bin", "python"))
+    monkeypatch.setattr(sys, "executable", str(Path.cwd().parent / "a b" / "python"))
+    assert shlex.split(this_python()) == [sys.executable]
 
 
 def test_git_state_outside_a_repository(tmp_path):

@@ -36,7 +36,7 @@ from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.distributed import ALONE
 from utils.errors import UserError
-from utils.runs import Stopwatch
+from utils.runs import Stopwatch, this_python
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -282,12 +282,12 @@ def test_a_policy_that_sees_what_no_robot_knows_is_not_scored_beside_planners():
     config, box = load_config(None, ["env.objects=primitives"]), spaces.Box(-1, 1, (3,))
     seen = ObservationLayout.of(spaces.Dict({"gripper": box}))
     assert scoring_command(config, Path("run"), seen, KNOWN_TO_A_ROBOT) == (
-        "python evaluate.py evaluate.policies=ppo:run/best.pt evaluate.scenarios=isolated "
-        "evaluate.object_sets=primitives"
+        f"{this_python()} evaluate.py evaluate.policies=ppo:run/best.pt "
+        "evaluate.scenarios=isolated evaluate.object_sets=primitives"
     )
     more = ObservationLayout.of(spaces.Dict({"gripper": box, "object_offset": box}))
     command = scoring_command(config, Path("run"), more, KNOWN_TO_A_ROBOT)
-    assert command == "python -m benchmarks.bench_policy run/best.pt"
+    assert command == f"{this_python()} -m benchmarks.bench_policy run/best.pt"
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ import math
 import os
 import platform
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -104,6 +105,14 @@ class _Parser(argparse.ArgumentParser):
         if message.startswith("unrecognized"):
             message += "; a setting is written KEY=VALUE, such as evaluate.rounds=50"
         super().error(message)
+
+
+def this_python() -> str:
+    """The interpreter as a command line of the current folder names it: '.venv/bin/python'."""
+    here, interpreter = Path.cwd(), Path(sys.executable)
+    if interpreter.is_relative_to(here):
+        interpreter = interpreter.relative_to(here)
+    return shlex.quote(str(interpreter))
 
 
 def plain_remarks() -> None:
