@@ -33,7 +33,7 @@ from envs.objects import OBJECT_SETS
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
-from utils.atomic_files import check_copies
+from utils.atomic_files import check_copies, resumption
 from utils.config import Config, load_foreign, values_of
 from utils.errors import UserError
 from utils.evaluation import (
@@ -47,7 +47,6 @@ from utils.evaluation import (
     play,
     policies_of,
     replay,
-    resumption,
 )
 from utils.report import balanced, write_failures, write_report
 from utils.result_formats import (
@@ -68,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Score grasp policies on the same scenes.", _add_options)
     check_options(options)
     check_names(config)
-    check_copies({f"--{name}": path for name, path in copies(options).items()})
+    check_copies(copies(options))
     if options.compare is not None:
         return report_comparison(options)
     if options.replay is not None:
@@ -130,7 +129,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def copies(options: argparse.Namespace) -> dict[str, Path | None]:
     """The files that are written besides the run's folder, by option."""
-    return {name: getattr(options, name) for name in ("results", "csv", "latex")}
+    return {f"--{name}": getattr(options, name) for name in ("results", "csv", "latex")}
 
 
 # What plays no rounds of a config, or plays them with a config of its own, and the arguments that

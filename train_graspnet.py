@@ -54,7 +54,7 @@ from models.graspnet_scores import (
     row_in_words,
     write_curves,
 )
-from models.graspnet_training import Trainer, go_on, make_network, mean_of
+from models.graspnet_training import Trainer, make_network, mean_of
 from models.rectangle_examples import Judged
 from models.rectangle_folds import (
     Fold,
@@ -64,7 +64,7 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
-from utils.atomic_files import cannot_write, check_writable
+from utils.atomic_files import cannot_write, check_writable, resumption
 from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
@@ -105,7 +105,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if scores and not trainer.was_finished:
                     print(closing_words(scores, run / "graspnet.pt"))
                 if not finished:
-                    print(f"stopped after {trainer.step} steps; {go_on(run, options.weights)}")
+                    go_on = resumption(run, {"--weights": options.weights})
+                    print(f"stopped after {trainer.step} steps; go on with {go_on}")
     return 0 if finished else 130
 
 
@@ -229,7 +230,8 @@ def train_folds(
         history, finished = train(config, folder, fold.data, trainer)
         if not finished:
             if processes.is_main:
-                print(f"stopped in fold {fold.number}; {go_on(run, options.weights)}")
+                go_on = resumption(run, {"--weights": options.weights})
+                print(f"stopped in fold {fold.number}; go on with {go_on}")
             return 130
         if processes.is_main:
             judged[fold.number] = fold.judge(trainer.model)

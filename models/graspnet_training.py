@@ -227,11 +227,6 @@ class Trainer:
         load_weights(self.model, checkpoint, path)
 
 
-def go_on(run: Path, weights: Path | None) -> str:
-    """How to go on with a run that was to write the file `weights`, too."""
-    return f"go on with --resume {run}" + ("" if weights is None else f" --weights {weights}")
-
-
 def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
     """Average every entry over rows that have the same names."""
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

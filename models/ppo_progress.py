@@ -26,6 +26,7 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
+from utils.atomic_files import resumption
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
 from utils.runs import Stopwatch, save_results, this_python
@@ -223,7 +224,7 @@ def stopped_in_words(
     run: Path, config: Config, updates: int, history: list[ProgressRow], weights: Path | None
 ) -> str:
     """What Ctrl-C has left after so many updates, and how to go on. weights: file of --weights."""
-    command = f"--resume {run}" + ("" if weights is None else f" --weights {weights}")
+    command = resumption(run, {"--weights": weights})
     done = updates * config.rl.envs * config.rl.rollout_steps
     # Where an evaluation is due, it has written a checkpoint, or was broken off with one.
     saved = done if evaluation_due(config, updates) else history[-1]["step"]

@@ -2,12 +2,13 @@
 
 import math
 import os
+import shlex
 import stat
 from pathlib import Path
 
 import pytest
 
-from utils.atomic_files import check_writable, write_atomic, write_json_atomic
+from utils.atomic_files import check_writable, resumption, write_atomic, write_json_atomic
 from utils.errors import UserError
 
 
@@ -78,3 +79,10 @@ def test_json_refuses_nan(tmp_path):
     with pytest.raises(ValueError):
         write_json_atomic(tmp_path / "x.json", {"a": math.inf})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_goes_on_with_the_files_of_its_options():
+    assert resumption(Path("run"), {"--weights": None}) == "--resume run"
+    files = {"--csv": Path("my table.csv"), "--latex": None, "--results": Path("r.json")}
+    words = ["--resume", "run", "--csv", "my table.csv", "--results", "r.json"]
+    assert shlex.split(resumption(Path("run"), files)) == words

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import train_graspnet
-from models.graspnet_training import go_on
 from utils.errors import UserError
 
 
@@ -42,8 +41,3 @@ def test_the_check_of_the_network_says_nothing_of_its_widths(tmp_path, monkeypat
     with pytest.raises(AssertionError, match="no data"):
         train_graspnet.main(["train.device=cpu", f"train.initial={shipped}"])
     assert "widths" not in capsys.readouterr().out
-
-
-def test_a_run_goes_on_with_the_file_of_its_weights():
-    assert go_on(Path("run"), None) == "go on with --resume run"
-    assert go_on(Path("run"), Path("w.pt")) == "go on with --resume run --weights w.pt"

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import secrets
+import shlex
 import stat
 import sys
 from collections.abc import Iterator, Mapping
@@ -99,6 +100,13 @@ def check_copies(files: Mapping[str, Path | None]) -> None:
             first = options.setdefault(os.path.realpath(path), option)
             if first != option:
                 raise UserError(f"{first}, {option}: both name {path}; give each its own file")
+
+
+def resumption(run: Path, files: Mapping[str, Path | None]) -> str:
+    """The arguments that go on with a run and write the files of the same options:
+    '--resume RUN --csv FILE'."""
+    named = [part for option, path in files.items() if path for part in (option, str(path))]
+    return shlex.join(["--resume", str(run), *named])
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

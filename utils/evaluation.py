@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from utils.atomic_files import write_atomic
+from utils.atomic_files import resumption, write_atomic
 from utils.config import COMPUTE_KEYS, Config, load_config
 from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
@@ -206,13 +206,6 @@ def interruption(rounds_done: int, config: Config) -> str | None:
     return f"interrupted: {rounds_done} of {planned} rounds" if rounds_done < planned else None
 
 
-def resumption(run: Path, files: Mapping[str, Path | None]) -> str:
-    """The arguments that go on with a run and write the files of the same options:
-    '--resume RUN --csv FILE'."""
-    named = (f" --{name} {path}" for name, path in files.items() if path is not None)
-    return f"--resume {run}{''.join(named)}"
-
-
 def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
     """Raise UserError for a closed_loop.controller that evaluate.controllers would override."""
     several, one = config.evaluate.controllers, config.closed_loop.controller
@@ -283,7 +276,7 @@ def play(
     """
     journal = run / "rounds.jsonl"
     with writing(journal):
-        return _play(config, run, journal, work, resume or f"--resume {run}")
+        return _play(config, run, journal, work, resume or resumption(run, {}))
 
 
 def _play(
