@@ -55,7 +55,7 @@ from models.graspnet_scores import (
     write_curves,
 )
 from models.graspnet_training import Trainer, make_network, mean_of
-from models.rectangle_examples import Judged
+from models.rectangle_examples import JudgedRectangle
 from models.rectangle_folds import (
     Fold,
     cross_validation_results,
@@ -220,7 +220,7 @@ def train_folds(
     config: Config, folds: Sequence[Fold], run: Path, options: argparse.Namespace, processes: Team
 ) -> int:
     """The trainings of `cross_validate`, in the folder of their run."""
-    judged: dict[int, list[Judged]] = {}
+    judged: dict[int, list[JudgedRectangle]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"
         trainer = make_trainer(config, fold.data, processes)

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs.policy_approach import is_learned
-from models.planner_graspnet import Judged
+from models.planner_graspnet import WithCritic
 from models.planners import PLANNERS
 from utils.atomic_files import check_writable, write_json_atomic
 from utils.calibration import LEAST_CHANCE, ROUNDING, Calibration, calibration_error
@@ -113,7 +113,7 @@ def fitted_chances(grasps: dict[str, ExecutedGrasps]) -> dict[str, Calibration]:
 def is_judged(policy: str) -> bool:
     """Whether the critic has the last word on a policy's grasps, whose chances end at 1."""
     planner = PLANNERS.get(policy)
-    return isinstance(planner, type) and issubclass(planner, Judged)
+    return isinstance(planner, type) and issubclass(planner, WithCritic)
 
 
 def fits_of(path: Path) -> dict[str, Any]:

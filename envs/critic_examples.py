@@ -33,7 +33,7 @@ from models.planner_graspnet import (
     GraspNetDirectPlanner,
     GraspNetFanPlanner,
     GraspNetPlanner,
-    Judged,
+    WithCritic,
 )
 from utils.atomic_files import write_atomic
 from utils.config import Config, with_settings
@@ -160,7 +160,9 @@ def worth_trying(
     return np.concatenate([best, drawn]), np.arange(len(best) + len(drawn)) >= len(best)
 
 
-def judged_by(planner: Judged, frame: RGBDFrame) -> tuple[CriticInputs, np.ndarray, list[Grasp]]:
+def judged_by(
+    planner: WithCritic, frame: RGBDFrame
+) -> tuple[CriticInputs, np.ndarray, list[Grasp]]:
     """What a planner asks its critic about a frame: inputs of N candidates, the scores (N,) by
     which the search ranked them, and the grasps."""
     inputs, scores, grasps = [nothing()], [np.empty(0)], []
@@ -206,7 +208,7 @@ def _cell_of(config: Config) -> Cell:
 
 
 @kept
-def _planners_of(config: Config, as_vgn: bool) -> list[Judged]:
+def _planners_of(config: Config, as_vgn: bool) -> list[WithCritic]:
     """Those of the arm's hand, or of one that opens fully and counts as empty as VGN's does."""
     least_held = VGN_LEAST_HELD if as_vgn else 0.0
     gripper = replace(config.gripper.geometry, opens_fully=as_vgn, least_held=least_held)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from envs.policy_approach import check_learned, is_learned
 from models.photographs import judge_as_taken, judge_photographs
-from models.rectangle_examples import Judged, draw_rectangles
+from models.rectangle_examples import JudgedRectangle, draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
 from utils.errors import UserError, unknown_choice
 from utils.evaluation import depth_noises_of, policies_of
@@ -42,7 +42,7 @@ class PhotographColumn(Column):
     """A column of photographs. judge: scores a planner, given by its name, on samples with a seed:
     an entry for each sample, or None for a planner that photographs do not suffice for."""
 
-    judge: Callable[[str, Sequence[RealSample], int], list[Judged | None] | None]
+    judge: Callable[[str, Sequence[RealSample], int], list[JudgedRectangle | None] | None]
     if_empty: str | None = (
         "no photographs were scored: these need transfer.cornell=path/to/cornell, and all rounds"
     )

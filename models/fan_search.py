@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from models.fan_candidates import FanCandidates
 from models.fan_measure import cells_around, measure, turn_onto_faces
 from models.fan_views import FanViews, highest_within
-from models.grasp_critic import ACROSS, ALONG, LEAST, MOST, STEP, UNIT, GraspCritic
+from models.grasp_critic import ACROSS, ALONG, LEAST_LOGGED, MOST, STEP, UNIT, GraspCritic
 from models.planner_antipodal import EDGE_BLUR, NOWHERE
 from models.planner_candidates import FACTS, SearchSettings
 from utils.geometry import GripperGeometry, Workspace
@@ -243,9 +243,9 @@ def chances(
             (closing @ camera).abs(),
             -approach @ camera,
             camera[2].expand(len(found)),
-            found.value.clamp(min=LEAST).log(),
+            found.value.clamp(min=LEAST_LOGGED).log(),
             views.rise(found.view, tip),
-            found.score.clamp(min=LEAST).log(),
+            found.score.clamp(min=LEAST_LOGGED).log(),
             found.width,
             found.turn.abs(),
             *found.facts.T,

@@ -38,7 +38,7 @@ VIEW_INPUTS = (
 OBJECT_INPUTS = ("extent_along", "extent_across", "edge")
 # At last the width at which the hand counts as empty (`GripperGeometry.least_held`).
 INPUTS = (*VIEW_INPUTS, *FACTS, *OBJECT_INPUTS, "least_held")
-LEAST = 1e-6  # of scores and values, in their logarithms
+LEAST_LOGGED = 1e-6  # of scores and values, in their logarithms
 
 STEP = 0.004  # m between the cells of a patch
 ALONG, ACROSS = 48, 24  # cells: the whole palm along the closing line, the fingers' surroundings
@@ -136,9 +136,9 @@ def critic_inputs(
         np.abs(closing @ towards),
         np.full(count, -approach @ towards),
         np.full(count, towards[2]),
-        np.log(np.maximum(value, LEAST)),
+        np.log(np.maximum(value, LEAST_LOGGED)),
         heights.rise(tip),
-        np.log(np.maximum(found.score, LEAST)),
+        np.log(np.maximum(found.score, LEAST_LOGGED)),
         found.width,
         np.abs(found.turn),
     )

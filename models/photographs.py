@@ -24,7 +24,7 @@ from models.graspnet_io import SavedGraspNet
 from models.planner_candidates import SearchSettings
 from models.planner_graspnet import GraspNetPlanner
 from models.planners import Planner, make_planner, needs_truth, tilts
-from models.rectangle_examples import Judged, best_rectangle, judged
+from models.rectangle_examples import JudgedRectangle, best_rectangle, judged
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.images import overhead_view
@@ -71,7 +71,7 @@ def frame_of(sample: RealSample, shrunk: float = SHRUNK) -> RGBDFrame:
 
 def judge_photographs(
     planner: str, samples: Sequence[RealSample], seed: int
-) -> list[Judged | None] | None:
+) -> list[JudgedRectangle | None] | None:
     """Score the best grasp of a planner, or of a network alone, on every photograph.
 
     An entry is None where the planner finds no grasp. The result is None for a planner with an
@@ -80,7 +80,7 @@ def judge_photographs(
     planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if needs_truth(planned) or tilts(planned):
         return None
-    found: list[Judged | None] = []
+    found: list[JudgedRectangle | None] = []
     for sample in samples:
         frame = frame_of(sample)
         grasp = best_grasp(planned, frame)
@@ -93,7 +93,7 @@ def judge_photographs(
 
 def judge_as_taken(
     planner: str, samples: Sequence[RealSample], seed: int
-) -> list[Judged | None] | None:
+) -> list[JudgedRectangle | None] | None:
     """Score a network on the photographs in the view in which networks are trained on them.
 
     They are levelled and at the network's scale, but neither seen from above nor in a smaller
@@ -103,7 +103,7 @@ def judge_as_taken(
     if not isinstance(planned, GraspNetPlanner):
         return None
     model, view = planned.network.model.eval(), _as_taken(planned.network.metres_per_pixel)
-    found: list[Judged | None] = []
+    found: list[JudgedRectangle | None] = []
     for sample in samples:
         rectangle, quality = best_rectangle(model, view.levelled(sample), view, plate_length=1.0)
         half_as_long = replace(rectangle, height=rectangle.width / 2)

@@ -3,9 +3,8 @@
 A network's maps are exact to a few millimetres; fingers beside an object need better. So the
 antipodal search proposes exact poses, and the network's quality at their places and angles is a
 factor on their scores: before they are measured on the height map, so that few have to be, and
-after. Of the best, a critic says how likely they succeed (`models.grasp_critic`). In the holes of
-the depth image, colours tell which surface is seen (`table_in_holes`, `surfaces_in_holes`). Where
-the network has a centre head, its votes tell the objects apart (`models.graspnet_objects`).
+after. Of the best, a critic says how likely they succeed (`models.grasp_critic`). What the network
+tells about a frame is the subject of `models.graspnet_view`.
 """
 
 from __future__ import annotations
@@ -17,51 +16,25 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from models import fan_search
-from models.fan_candidates import FanCandidates
-from models.fan_views import FanViews, fan_views
+from models.fan_views import fan_views
 from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shipped_critic
-from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
-from models.graspnet_inference import run_network, training_scale
+from models.graspnet_decoding import PeakSettings
 from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
-from models.graspnet_objects import labelled_by_centres
+from models.graspnet_view import NetworkView
 from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_fan import SEARCH, FanPlanner, FanSettings, distinct
-from utils.depth import (
-    TABLE_FLATNESS,
-    depth_of_plane,
-    reach_in_pixels,
-    surfaces_in_holes,
-    table_in_holes,
-)
 from utils.depth_correction import corrected
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import grasp_depth
-from utils.height_map import (
-    OTHER_LABEL,
-    HeightMap,
-    height_map_from_frame,
-    tilted_height_map,
-)
-from utils.seen_heights import hides, without_holes
+from utils.height_map import OTHER_LABEL, HeightMap, tilted_height_map
 from utils.target import only_target
-from utils.transforms import (
-    PLANAR,
-    Grasp,
-    RGBDFrame,
-    deproject,
-    inverse_pose,
-    known_depth,
-    project,
-    top_down_pose,
-    transform_points,
-)
+from utils.transforms import PLANAR, Grasp, RGBDFrame, known_depth, top_down_pose
 
 # Half the heuristic's angles: turning onto the faces and the network make up for it. The split
 # factor is strict because the votes separate objects better than height alone.
@@ -69,13 +42,10 @@ SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0
 # Of the planner without a search: many peaks, because the height map decides which of them fit.
 PEAKS = PeakSettings(threshold=0.02, count=80, radius=3)
 DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of the labels
-BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
-CROP_MARGIN = 0.04  # m around what stands on the table
 # Candidates that the critic judges: of a planar search, and of each view of a fan; no two of them
 # are both closer and less turned than this, m and rad.
 PLANAR_JUDGED, VIEW_JUDGED = 40, 12
 JUDGED_DISTANCE, JUDGED_TURN = 0.01, np.deg2rad(20)
-LEAST = 0.02  # lowest quality, so that grasps which fit are ranked where the network sees none
 
 Judge = Callable[[HeightMap, Candidates, CriticInputs], np.ndarray]
 
@@ -96,7 +66,7 @@ def chances_by(critic: GraspCritic) -> Judge:
     return lambda heights, found, inputs: critic.chance(inputs)
 
 
-class Judged:
+class WithCritic:
     """What the planners share whose candidates a critic may judge last (`models.grasp_critic`).
 
     judge: from a map, candidates and what the critic sees of them to their chances (N,); None
@@ -118,7 +88,7 @@ class Judged:
         return replace(found, score=self.judge(heights, found, inputs)).best(len(found))
 
 
-class GraspNetPlanner(Judged, SearchPlanner):
+class GraspNetPlanner(WithCritic, SearchPlanner):
     """Antipodal search ranked by a network, then by a critic, on the RGB-D image alone.
 
     checkpoint: file of the network, unless `network` is given. critic: has the last word; where
@@ -218,7 +188,7 @@ JUDGED_FAN = FanSettings(tilt_scale=3.0)
 LIKELY = 0.975
 
 
-class GraspNetFanPlanner(Judged, FanPlanner):
+class GraspNetFanPlanner(WithCritic, FanPlanner):
     """From straight above where that is likely to succeed, as `GraspNetPlanner` plans for a hand
     with a wrist; elsewhere in a fan of views, too: a network values the candidates by the image
     that was taken, and a critic has the last word on each view's: the shipped one, unless `critic`
@@ -329,161 +299,3 @@ class GraspNetFanPlanner(Judged, FanPlanner):
             Grasp.from_pose(poses[kept], float(opening[order[kept]]), float(score[order[kept]]))
             for kept in distinct(poses, self.fan)
         ]
-
-
-class NetworkView:
-    """What a network tells about a frame: heights with its objects, and the quality of candidates.
-
-    The given frame is corrected by its table (`utils.depth_correction`). frame: the same, holes of
-    its depth filled where colours tell what is there. holeless: that frame `without_holes`.
-    heights: the map from above. crop: whether only the part of the image is looked at in which
-    something stands. below: as in `height_map_from_frame`. Where the frame has a second
-    one, its network maps serve for what the first does not show. towards: (3,) unit vector in W
-    from the middle of the workspace to the camera. Raises UserError for an image that
-    the network cannot take.
-    """
-
-    def __init__(
-        self,
-        network: SavedGraspNet,
-        frame: RGBDFrame,
-        workspace: Workspace,
-        crop: bool = False,
-        below: bool = False,
-    ):
-        table = workspace.table_height
-        self._first = _Prediction(network, frame, table, crop)
-        self._second = None
-        if frame.second is not None and known_depth(frame.second.depth).any():
-            self._second = _Prediction(network, frame.second, table)
-        self.frame = self._first.frame
-        towards = frame.T_WC[:3, 3] - [*workspace.centre, table]
-        self.towards = towards / np.linalg.norm(towards)
-        self.holeless = without_holes(self.frame, workspace)
-        self.heights = height_map_from_frame(
-            self.frame, workspace, below=below, holeless=self.holeless
-        )
-        if network.model.centre_head is not None:
-            offset = self._first.maps[3][0].numpy()
-            scaling = self._first.scaling
-            self.heights = labelled_by_centres(self.heights, self.frame, scaling, offset)
-
-    def peaks(self, settings: PeakSettings) -> np.ndarray:
-        """(N, 3) points in W of the surface at the peaks of the quality, the highest peak first."""
-        quality, angle, width = self._first.maps[:3]
-        found = find_peaks(quality, angle, width, settings)
-        pixels = self._first.scaling.original_pixels(found.pixel)
-        depth = surface_depth(self.frame.depth, pixels)
-        points = deproject(pixels, depth, self.frame.K, self.frame.T_WC)
-        return points[np.isfinite(depth)]
-
-    def value(self, heights: HeightMap, candidates: Candidates) -> np.ndarray:
-        """(N,) the network's quality of candidates on a height map of the scene."""
-        xy, (along, _) = candidates.xy, candidates.axes()
-        surface = np.column_stack([xy, heights.height[heights.index(xy)]])
-        ends = surface + 0.01 * np.stack([-along, along]) @ np.eye(2, 3)
-        ends = transform_points(heights.T_WV, ends)
-        quality = self._first.quality(ends)
-        if self._second is not None:
-            hidden = hides(self.frame, ends.mean(axis=0))
-            quality[hidden] = self._second.quality(ends[:, hidden])
-        return np.maximum(quality, LEAST)
-
-    def values(self, views: FanViews, candidates: FanCandidates) -> torch.Tensor:
-        """(N,) the same of candidates in the views of a fan, by the first frame alone."""
-        view, (along, _) = candidates.view, candidates.axes()
-        height = views.height.flatten()[views.cells(view, candidates.xy)].double()
-        xy = candidates.xy + 0.01 * torch.stack([-along, along])
-        ends = torch.cat([xy, height[None, :, None].expand(2, -1, -1)], dim=2)
-        frames = views.T_WV[view]
-        ends = (frames[:, :3, :3] @ ends[..., None])[..., 0] + frames[:, :3, 3]
-        return self._first.qualities(ends).clamp(min=LEAST)
-
-
-class _Prediction:
-    """A network's maps of one image. frame: as in `NetworkView`, the part that was looked at."""
-
-    def __init__(self, network: SavedGraspNet, frame: RGBDFrame, table: float, crop: bool = False):
-        self.scaling = training_scale(frame, network.metres_per_pixel)
-        if crop:
-            frame = around_matter(frame, table)
-        self.frame = surfaces_in_holes(table_in_holes(frame, table))
-        model = network.model
-        self._device = next(model.parameters()).device
-        self.maps = run_network(model, self.frame, self.scaling, model.centre_head is not None)
-
-    def quality(self, ends: np.ndarray) -> np.ndarray:
-        """(N,) quality of closing along the lines between points (2, N, 3) in W."""
-        pixels, _ = project(ends, self.frame.K, self.frame.T_WC)
-        return quality_between(self._blurred, self.maps[1], *self.scaling.pixels(pixels))
-
-    def qualities(self, ends: torch.Tensor) -> torch.Tensor:
-        """(N,) the same as tensors on the network's device."""
-        quality, angle = self._maps_there
-        to_image = self.scaling.intrinsics(self.frame.K) @ inverse_pose(self.frame.T_WC)[:3]
-        to_image, shift = to_image[:, :3].T, to_image[:, 3]
-        pixels = ends @ ends.new_tensor(to_image) + ends.new_tensor(shift)
-        depth = pixels[..., 2:]
-        ahead = (depth > 1e-9).all(dim=0)[:, 0]
-        start, end = pixels[..., :2] / torch.where(ahead[:, None], depth, 1.0)
-        rows, columns = quality.shape
-        column, row = ((start + end) / 2).round().long().T
-        column, row = column.clamp(0, columns - 1), row.clamp(0, rows - 1)
-        share = angle[:, row, column].softmax(dim=0) ** (1 / 3)
-        bins, each = len(share), torch.arange(len(row), device=ends.device)
-        du, dv = (end - start).T
-        place = torch.atan2(dv, du).remainder(np.pi) * bins / np.pi
-        below, part = place.floor().long(), place - place.floor()
-        at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
-        return torch.where(ahead, quality[row, column] * at / share.amax(dim=0), 0.0)
-
-    @functools.cached_property
-    def _maps_there(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The blurred quality (H, W) and the angles' logits (K, H, W), where the network is."""
-        return torch.from_numpy(self._blurred).to(self._device), self.maps[1][0].to(self._device)
-
-    @functools.cached_property
-    def _blurred(self) -> np.ndarray:
-        """(H, W) the quality."""
-        return cv2.GaussianBlur(self.maps[0][0, 0].numpy(), (0, 0), BLUR)
-
-
-def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The part of a frame in which something stands on the table, or may stand unseen: all that is
-    left out is table. The whole frame where nothing does."""
-    high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)
-    high |= ~known_depth(frame.depth)
-    # Single pixels are noise.
-    pieces = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    left, top, width, height = cv2.boundingRect(pieces)
-    if width == 0:
-        return frame
-    margin = reach_in_pixels(frame, CROP_MARGIN)
-    return frame.part(
-        slice(max(top - margin, 0), top + height + margin),
-        slice(max(left - margin, 0), left + width + margin),
-    )
-
-
-def quality_between(
-    quality: np.ndarray, angle: torch.Tensor, start: np.ndarray, end: np.ndarray
-) -> np.ndarray:
-    """(N,) quality of closing along the lines from `start` to `end` (N, 2), in pixels of the maps
-    quality (H, W) and angle (1, K, H, W), logits.
-
-    It is the quality at a line's middle, times the quality of the line's angle relative to the best
-    angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`).
-    It is 0 for lines that the camera cannot see, whose pixels are NaN.
-    """
-    ahead = np.isfinite(start + end).all(axis=1)
-    start, end = (np.where(ahead[:, None], pixels, 0.0) for pixels in (start, end))
-    u, v = np.rint((start + end) / 2).astype(int).T
-    u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
-    share = angle[0, :, v, u].softmax(dim=0).numpy()
-    bins, each = len(share), np.arange(len(u))
-    du, dv = (end - start).T
-    place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
-    below, part = np.floor(place).astype(int), place - np.floor(place)
-    at = (1 - part) * np.cbrt(share[below % bins, each])
-    at += part * np.cbrt(share[(below + 1) % bins, each])
-    return np.where(ahead, quality[v, u] * at / np.cbrt(share.max(axis=0)), 0.0)

@@ -130,7 +130,7 @@ class RectangleExamples(Dataset):
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedRectangle:
     """The score of a network's best grasp on one image.
 
     rectangle: in pixels of the data set's image. iou, angle_error: to the label with the largest
@@ -189,7 +189,7 @@ def best_rectangle(
 
 def judge(
     model: GraspNet, samples: Sequence[RealSample], view: View, plate_length: float
-) -> list[Judged]:
+) -> list[JudgedRectangle]:
     """Score the best grasp on every image; the model ends in evaluation mode."""
     model.eval()
     return [
@@ -197,12 +197,12 @@ def judge(
     ]
 
 
-def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Judged:
+def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> JudgedRectangle:
     """Score a grasp on an image, in that image's pixels, by the rectangle metric."""
     overlaps = [intersection_over_union(rectangle, label) for label in sample.positives]
     nearest = int(np.argmax(overlaps))
     error = angle_difference(rectangle.angle, sample.positives[nearest].angle)
-    return Judged(
+    return JudgedRectangle(
         sample.name, sample.object_id, rectangle, quality,
         rectangle_match(rectangle, sample.positives), overlaps[nearest], float(error),
     )  # fmt: skip
@@ -212,7 +212,7 @@ def judged(sample: RealSample, rectangle: GraspRectangle, quality: float) -> Jud
 
 
 def draw_rectangles(
-    path: Path, samples: Sequence[RealSample], judged: Sequence[Judged], shown: int = SHOWN
+    path: Path, samples: Sequence[RealSample], judged: Sequence[JudgedRectangle], shown: int = SHOWN
 ) -> None:
     """Draw a grid of images with their labels (green) and the prediction (blue if correct, else
     red); the thick sides are the plates."""

@@ -19,7 +19,7 @@ from models.graspnet import GraspNet
 from models.graspnet_data import TrainingData
 from models.graspnet_io import save_graspnet
 from models.rectangle_examples import (
-    Judged,
+    JudgedRectangle,
     RectangleExamples,
     RectangleImages,
     draw_rectangles,
@@ -153,7 +153,7 @@ class Fold:
     view: View
     plate_length: float
 
-    def judge(self, model: GraspNet) -> list[Judged]:
+    def judge(self, model: GraspNet) -> list[JudgedRectangle]:
         """Score a network on the test images by the rectangle metric."""
         return judge(model, self.test_samples, self.view, self.plate_length)
 
@@ -203,7 +203,7 @@ def _fold(
 
 
 def save_fold(
-    config: Config, folder: Path, fold: Fold, judged: Sequence[Judged], model: GraspNet,
+    config: Config, folder: Path, fold: Fold, judged: Sequence[JudgedRectangle], model: GraspNet,
     weights: Path | None,
 ) -> None:  # fmt: skip
     """Save a fold's network alone (to `weights`, too, if given) and pictures of its test images."""
@@ -216,7 +216,7 @@ def save_fold(
     draw_rectangles(folder / "predictions.png", fold.test_samples, judged)
 
 
-def describe_fold(fold: Fold, judged: Sequence[Judged]) -> str:
+def describe_fold(fold: Fold, judged: Sequence[JudgedRectangle]) -> str:
     """Describe a fold in two lines: the accuracy, and the names of its images."""
     right = sum(one.correct for one in judged)
     wrong = " ".join(one.name for one in judged if not one.correct)
@@ -227,7 +227,7 @@ def describe_fold(fold: Fold, judged: Sequence[Judged]) -> str:
     )
 
 
-def describe_folds(config: Config, judged: Mapping[int, Sequence[Judged]]) -> str:
+def describe_folds(config: Config, judged: Mapping[int, Sequence[JudgedRectangle]]) -> str:
     """Describe all folds together in one line."""
     right, count, (low, high) = pooled(judged)
     which = f"{len(judged)} of {config.data.folds} folds by {config.data.split}"
@@ -238,7 +238,7 @@ def describe_folds(config: Config, judged: Mapping[int, Sequence[Judged]]) -> st
     )
 
 
-def pooled(judged: Mapping[int, Sequence[Judged]]) -> tuple[int, int, tuple[float, float]]:
+def pooled(judged: Mapping[int, Sequence[JudgedRectangle]]) -> tuple[int, int, tuple[float, float]]:
     """Return the number of correct images, of all, and the 95 % interval, over all folds. Images of
     one object are not independent."""
     every = [one for fold in judged.values() for one in fold]
@@ -248,7 +248,7 @@ def pooled(judged: Mapping[int, Sequence[Judged]]) -> tuple[int, int, tuple[floa
 
 
 def cross_validation_results(
-    folds: Sequence[Fold], judged: Mapping[int, Sequence[Judged]]
+    folds: Sequence[Fold], judged: Mapping[int, Sequence[JudgedRectangle]]
 ) -> dict[str, Any]:
     """Return plain data for results.json: the accuracy of the folds tested so far, and every
     prediction."""

@@ -9,13 +9,11 @@ import torch
 
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_objects import VoteSettings, labelled_by_centres, vote_centres
+from models.graspnet_view import CROP_MARGIN, around_matter, quality_between
 from models.planner_graspnet import (
-    CROP_MARGIN,
     GraspNetDirectPlanner,
     GraspNetFanPlanner,
     GraspNetPlanner,
-    around_matter,
-    quality_between,
 )
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.fixed_maps import FixedMaps

@@ -21,7 +21,7 @@ from envs.transfer_plan import (
     evaluations_of,
     score_photographs,
 )
-from models.rectangle_examples import Judged
+from models.rectangle_examples import JudgedRectangle
 from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
 from utils.evaluation import Outcome, depth_noises_of
@@ -184,7 +184,7 @@ def test_photographs_of_one_object_are_not_taken_as_independent(tmp_path, monkey
 
 
 def judgement(right):
-    return Judged("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, right, 1.0, 0.0)
+    return JudgedRectangle("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, right, 1.0, 0.0)
 
 
 @pytest.mark.parametrize("ended", [{"interrupted": True}, {"error": UserError("no room")}, {}])
