@@ -162,7 +162,7 @@ PARTS = (
                     "evaluate.object_sets=benchmarks.bowls:bowls", noises=NOISY_FIRST, kept=3),
     )),
     Part("scenes", "scenes that ask for grasps from the side", 20, tuple(
-        _evaluation(name, 15, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={scenarios} "
+        _evaluation(name, 30, f"evaluate.policies={ANY_SIDE} evaluate.scenarios={scenarios} "
                     f"evaluate.object_sets={name}", noises="realsense", kept=3)
         for name, scenarios in (("tall", "tall,wall,shelf"), ("flat", "wall,flat"))
     )),
@@ -200,8 +200,8 @@ PARTS = (
                     "evaluate.scenarios=retrieve evaluate.object_sets=random_urdfs,primitives",
                     noises="realsense", kept=3),
     )),
-    Part("vgn", "the field's protocols with a floating hand and side views", 20, tuple(
-        _evaluation(name, 15, f"--config configs/{name}.yaml evaluate.policies=graspnet,graspnet6d "
+    Part("vgn", "the field's protocols with a floating hand and side views", 30, tuple(
+        _evaluation(name, 50, f"--config configs/{name}.yaml evaluate.policies=graspnet,graspnet6d "
                     "evaluate.object_sets=random_urdfs", noises=noise, kept=3)
         for name, noise in (("vgn", "gaussian"), ("giga", "gamma"))
     )),
