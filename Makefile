@@ -80,8 +80,8 @@ typecheck: $(VENV)/.installed-dev
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.bench_env $(ARGS)
 
-# Every table of README and docs/results.md: make results PARTS=scoreboard,servo. With SCALE below 1 the
-# docs are written with WRITE=1 only: make results PARTS=clutter15 SCALE=0.5 WRITE=1
+# Every table of README and docs/results.md: make results PARTS=scoreboard,servo. With SCALE below 1 other
+# scenes are played and no docs written, but with WRITE=1: make results PARTS=clutter15 SCALE=0.5 WRITE=1
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell $(CORNELL)) $(if $(YCB),--ycb $(YCB)) $(if $(CLUTTER),--clutter $(CLUTTER)) $(ARGS)
 

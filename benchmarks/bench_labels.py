@@ -13,7 +13,13 @@ from time import process_time
 import cv2
 import numpy as np
 
-from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
+from benchmarks.metrics import (
+    Metric,
+    benchmark_parser,
+    natural_number,
+    positive_int,
+    report,
+)
 from envs.cell import Cell
 from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
@@ -35,7 +41,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--scenes", type=positive_int, default=15, help="scenes labelled and executed"
     )
-    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="of the first scene")
+    parser.add_argument(
+        "--seed", type=natural_number, default=FIRST_SEED, help="of the first scene"
+    )
     options = parser.parse_args(argv)
     cv2.setNumThreads(1)
     config = load_config(None, ["sim.renderer=tiny", "objects.split=train"])

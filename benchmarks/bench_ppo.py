@@ -27,7 +27,13 @@ import psutil
 from gymnasium.wrappers import FilterObservation, FlattenObservation
 from scipy.stats import t as student
 
-from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
+from benchmarks.metrics import (
+    Metric,
+    benchmark_parser,
+    check_installed,
+    positive_int,
+    report,
+)
 from utils.config import Config, load_config
 from utils.runs import REPOSITORY, run_script
 
@@ -102,8 +108,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--run", nargs=2, metavar=("WHO", "SEED"), help="one training, as JSON")
     options = parser.parse_args(argv)
+    check_installed("stable_baselines3")
     if options.run:
         who, seed = options.run
+        if who not in RUN or not seed.isdecimal():
+            parser.error(f"--run {who} {seed}: expected {' or '.join(RUN)}, and a seed from 0 on")
         print(json.dumps(RUN[who](options.env[0], int(seed), options.steps)))
         return
     seeds = 2 if options.quick else options.seeds

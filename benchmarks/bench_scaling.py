@@ -24,8 +24,6 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
-import psutil
-from distributed import Client
 
 from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from envs.evaluation_worker import work
@@ -35,6 +33,14 @@ from utils.executor import Workers, completed, open_executor
 from utils.result_records import RoundRecord, append_round, differing_rounds
 from utils.runs import run_script
 from utils.worker_process import worker_environment
+
+try:
+    import psutil
+    from distributed import Client
+except ModuleNotFoundError as error:
+    raise SystemExit(
+        f"error: {error.name} is not installed; pip install -r requirements-dev.txt"
+    ) from None
 
 SCENES = ("evaluate.policies=heuristic", "evaluate.scenarios=pile",
           "evaluate.object_sets=primitives", "evaluate.depth_noises=none",

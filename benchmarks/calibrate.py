@@ -54,6 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     lines, found = [], {}
     policies = list(dict.fromkeys(record.policy for record in rounds))
     names = [name for name in policies if states_chances(name)]
+    if not rounds:
+        raise UserError(f"no round was played in {', '.join(map(str, options.runs))}")
     if not names:
         raise UserError(
             f"no policy of these runs has scores to fit chances to: {', '.join(policies)}; play "

@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from utils.atomic_files import check_writable
+from utils.atomic_files import check_writable, save_figure
 from utils.errors import UserError
 from utils.runs import run_script
 
@@ -38,15 +38,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     axis.set(xlabel="environment steps", ylabel="episodes that succeed", ylim=(-0.03, 1.03))
     axis.grid(alpha=0.3)
     axis.legend()
-    figure.savefig(options.output, dpi=110)
+    save_figure(options.output, figure)
     print(f"wrote {options.output}")
 
 
 def draw(axis: plt.Axes, run: Path, label: str) -> None:
     steps, success = training_success(run)
     (line,) = axis.plot(steps, smoothed(steps, success, SMOOTHED), label=label)
-    history = evaluations(run)
-    axis.plot(*zip(*history), "o", color=line.get_color())
+    at, shares = np.array(evaluations(run)).reshape(-1, 2).T
+    axis.plot(at, shares, "o", color=line.get_color())
 
 
 def training_success(run: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -71,6 +71,8 @@ def evaluations(run: Path) -> list[tuple[int, float]]:
         return [(row["step"], row["success"]) for row in history]
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
+    if "evaluation/success" not in events.Tags()["scalars"]:  # none yet
+        return []
     return [(p.step, p.value) for p in events.Scalars("evaluation/success")]
 
 

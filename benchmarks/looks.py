@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.table_cells import Figures, Say, noise_of, table
+from benchmarks.table_cells import Figures, Say, noise_of, percent, table
 from utils.atomic_files import write_json_atomic
 from utils.result_records import CLEAN
 
@@ -29,14 +29,14 @@ _OF_TARGETS = {"cleared": "targets_in_hand", "objects": "targets"}
 
 
 def add_look(folder: Path, part: Figures) -> None:
-    """Add a part's figures to the looks of a folder. The same commit at the same scale, published
-    again, is no new look; figures without a planner of PLANNERS are none."""
+    """Add a part's figures to the looks of a folder. The same figures, published again, are no new
+    look; those without a planner of PLANNERS are none."""
     look, file = look_of(part), folder / FILE
     if not look["noises"]:
         return
     looks: dict[str, list[Figures]] = json.loads(file.read_text()) if file.exists() else {}
     earlier = looks.setdefault(part["part"], [])
-    if all((one["commit"], one["scale"]) != (look["commit"], look["scale"]) for one in earlier):
+    if look not in earlier:
         earlier.append(look)
     write_json_atomic(file, looks)
 
@@ -76,5 +76,5 @@ def _shares(counts: dict[str, int] | None) -> str:
     """'97 %, 95 %': success and cleared; '-' without attempts."""
     if counts is None or counts["attempts"] == 0:
         return "-"
-    success = counts["successes"] / counts["attempts"]
-    return f"{100 * success:.0f} %, {100 * counts['cleared'] / counts['objects']:.0f} %"
+    success = percent(counts["successes"], counts["attempts"])
+    return f"{success} %, {percent(counts['cleared'], counts['objects'])} %"

@@ -8,11 +8,13 @@ from __future__ import annotations
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from utils.atomic_files import write_json_atomic
+from utils.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,18 @@ def positive_int(text: str) -> int:
     if value < 1:
         raise ArgumentTypeError(f"got {text}, expected a whole number of at least 1")
     return value
+
+
+def natural_number(text: str) -> int:
+    """The type of an argument such as a seed."""
+    return 0 if text == "0" else positive_int(text)
+
+
+def check_installed(*modules: str) -> None:
+    """Raise UserError where a peer, or what a benchmark needs besides the project, is missing."""
+    for module in modules:
+        if find_spec(module) is None:
+            raise UserError(f"{module} is not installed; pip install -r requirements-dev.txt")
 
 
 def benchmark_parser(description: str) -> ArgumentParser:

@@ -202,13 +202,13 @@ def overview(say: Say, *parts: Figures) -> str:
     for part in parts:
         cells: dict[tuple[str, str, str], dict[str, str]] = {}
         for row in (row for command in part["commands"].values() for row in command["rows"]):
-            if noise_of(row) != CLEAN and row["attempts"]:
+            if noise_of(row) != CLEAN:
                 scene = row["scenario"], row["objects"].rpartition(":")[2], noise_of(row)
                 shares = (
                     (row["successes"], row["attempts"]),
                     (row["objects_cleared"], row["objects_total"]),
                 )
-                both = ", ".join(percent(*share) for share in shares)
+                both = ", ".join(percent(*share) if share[1] else "-" for share in shares)
                 cells.setdefault(scene, {})[row["policy"]] = both
         page = OVERVIEW[part["part"]]
         for (scenario, objects, noise), of in cells.items():

@@ -2,7 +2,7 @@
 
     make results                                  # all parts, ten hours: --list says how long
     make results PARTS=scoreboard,servo           # some of them
-    make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, no docs
+    make results PARTS=servo SCALE=0.05           # a trial: a twentieth of the rounds, other scenes
     make results PARTS=clutter15 SCALE=0.5 WRITE=1  # half of the rounds, in the docs
     make results PARTS=cornell,ycb,clutter CORNELL=path/to/cornell YCB=... CLUTTER=...
     python -m benchmarks.results --list           # the parts, their commands and how long they take
@@ -17,7 +17,7 @@ rounds each row has. Each part has a file of its own, so that parts may have dif
 publication adds a look at the sealed scenes to docs/results/looks.json (`benchmarks.looks`).
 
 Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/choices.md tells
-on which seeds choices were made.
+on which seeds choices were made. A trial, whose figures no page shows, plays none of these scenes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 SEALED = REPOSITORY / "configs" / "sealed.yaml"  # what is kept for the tables
 SEED = load_config(SEALED).seed
 SPLIT = load_config(SEALED).objects.split
+TRIAL_SEED, TRIAL_SPLIT = 900, "test"  # of trials
 FIGURES = Path("docs/results")  # what the tables are written from
 RUNS = Path("runs/results")
 Folders = Mapping[str, Path]  # of what SOURCES names
@@ -74,7 +75,7 @@ class Command:
 
     arguments: the folders of SOURCES stand there by their names in capitals. rounds: of each row,
     None for what has no rounds. kept: rounds of each row that stay in the repository, so that a
-    reader can check them in minutes.
+    reader can check them in minutes. seed, split: of the scenes and the objects.
     """
 
     name: str
@@ -83,6 +84,12 @@ class Command:
     rounds: int | None = None
     kept: int = 10
     split: str = SPLIT
+    seed: int = SEED
+
+    def trial(self) -> Command:
+        """The same on scenes that are not sealed."""
+        split = TRIAL_SPLIT if self.split == SPLIT else self.split
+        return replace(self, split=split, seed=TRIAL_SEED)
 
     def scaled(self, scale: float) -> int | None:
         return None if self.rounds is None else max(1, round(self.rounds * scale))
@@ -92,7 +99,7 @@ class Command:
         start = self.program if self.program.endswith(".py") else f"-m benchmarks.{self.program}"
         parts = [f"python {start}"]
         if self.program.endswith(".py"):
-            parts += [f"seed={SEED}", f"objects.split={self.split}"]
+            parts += [f"seed={self.seed}", f"objects.split={self.split}"]
         parts += [self.arguments] if self.arguments else []
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")
@@ -265,18 +272,21 @@ PARTS = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
+    if not FIGURES.parent.is_dir():
+        raise UserError(f"results: no {FIGURES.parent} here; start it in {REPOSITORY}")
     parts = chosen_parts(options.parts)
     if not 0 < options.scale < math.inf:
         raise UserError(f"--scale: got {options.scale:g}, expected a positive number such as 0.05")
     folders = {name: getattr(options, name) for name in SOURCES if getattr(options, name)}
+    if not writes_docs(options):
+        parts = [
+            replace(part, commands=tuple(one.trial() for one in part.commands)) for part in parts
+        ]
     if options.list:
         print_parts(parts, options.scale)
         return 0
     if not options.write:
-        if options.commit is None:
-            commit = code_commit()
-        else:
-            commit = _git("rev-parse", "--verify", f"{options.commit}^{{commit}}")
+        commit = code_commit() if options.commit is None else commit_named(options.commit)
         for part in parts:
             if options.commit is not None and not is_finished(part, commit, options.scale):
                 print(f"{part.name}: skipped, because {RUNS / commit} does not hold all of it")
@@ -290,8 +300,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                     write_tables(FIGURES)
         if not writes_docs(options):
             print(
-                f"the figures are in {RUNS / commit}; the docs stay as they are, because --scale "
-                "is below 1: add --write-docs (make results WRITE=1) to write them there"
+                f"the figures are in {RUNS / commit}; they are of scenes with seed {TRIAL_SEED}, "
+                "because --scale is below 1: --write-docs (make results WRITE=1) plays the sealed "
+                "ones and writes the docs"
             )
             return 0
     print(f"wrote {', '.join(map(str, write_tables(FIGURES)))}", flush=True)
@@ -305,7 +316,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--write-docs",
         action="store_true",
-        help="write figures of a scale below 1 to the docs, too",
+        help="with a scale below 1, too, play the sealed scenes and write the docs",
     )
     for name, what in SOURCES.items():
         parser.add_argument(f"--{name}", type=Path, help=f"folder of {what}")
@@ -348,6 +359,14 @@ def code_commit() -> str:
     return _git("log", "-1", "--format=%H", "--", *CODE)
 
 
+def commit_named(name: str) -> str:
+    """The whole hash of a commit. Raises UserError where there is none of that name."""
+    try:
+        return _git("rev-parse", "--verify", f"{name}^{{commit}}")
+    except UserError:
+        raise UserError(f"--commit {name}: no commit of this repository; see git log") from None
+
+
 def _git(*arguments: str) -> str:
     try:
         command = ["git", "-C", str(REPOSITORY), *arguments]
@@ -361,14 +380,20 @@ def _git(*arguments: str) -> str:
 
 def measure(part: Part, commit: str, scale: float, folders: Folders = NOWHERE) -> None:
     """Run a part's commands that are not finished yet. Raises UserError where one was measured, or
-    begun, with another folder of SOURCES."""
+    begun, with another folder of SOURCES, and where the code changes while one runs."""
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
         run = latest_run(Path(command.program).stem, file.stem)
         if run is not None:
             check_folders(command, run, file, folders)
         if not file.exists():
-            write_json_atomic(file, run_command(part, command, scale, commit, folders))
+            figures = run_command(part, command, scale, commit, folders)
+            if (now := code_commit()) != commit:
+                raise UserError(
+                    f"results: the code went from commit {commit[:10]} to {now[:10]} while "
+                    f"{part.name} was measured, so that its figures are of neither; start again"
+                )
+            write_json_atomic(file, figures)
 
 
 def publish(part: Part, commit: str, scale: float) -> None:
@@ -381,6 +406,11 @@ def publish(part: Part, commit: str, scale: float) -> None:
         figures.setdefault("date", str(date.fromtimestamp(file.stat().st_mtime)))
         if "run" in figures:
             run = Path(figures.pop("run"))
+            if command.kept and not (run / "environment.json").is_file():
+                raise UserError(
+                    f"results: {run} is gone, whose first rounds belong to the docs; delete "
+                    f"{file} and measure {part.name} again"
+                )
             if command.kept:
                 keep_rounds(part, command, run)
         measured[command.name] = figures

@@ -72,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also keep the table there")
     parser.add_argument("--list", action="store_true", help="print the parts and try nothing")
     options = parser.parse_args(argv)
-    names = list(PARTS) if options.parts is None else options.parts.split(",")
+    wanted = PARTS if options.parts is None else options.parts.split(",")
+    names = [name.strip() for name in wanted]
     for name in names:
         if name not in PARTS:
             raise UserError(f"--parts: {name!r} is no part; choose among {', '.join(PARTS)}")

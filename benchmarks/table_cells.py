@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from utils.result_formats import rate_in_percent
 from utils.result_records import CLEAN
-from utils.statistics import wilson_interval
+from utils.statistics import FEW_ROUNDS, wilson_interval
 
 Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
 Say = Callable[[str], str]  # a word in the page's language
@@ -19,11 +20,7 @@ Say = Callable[[str], str]  # a word in the page's language
 
 
 def percent(successes: int, trials: int) -> str:
-    """'97'; '99.6' where a share below 1 would be rounded to 100."""
-    share = f"{100 * successes / trials:.0f}"
-    if share == "100" and successes < trials:
-        return f"{1000 * successes // trials / 10:.1f}"
-    return share
+    return rate_in_percent(successes / trials)
 
 
 def rate(successes: int, trials: int, interval: Sequence[float] | None = None) -> str:
@@ -43,12 +40,14 @@ def cleared(row: Figures) -> str:
 
 
 def points(difference: Figures | None) -> str:
-    """'+1.5 [+0.7, +2.2]' percentage points."""
+    """'+1.5 [+0.7, +2.2]' percentage points; an interval of few rounds would be too narrow."""
     if difference is None:
         return "-"
     value, low, high = (100 * difference[key] for key in ("value", "low", "high"))
     if value == low == high == 0:
-        return "0 (alike in every round)"
+        return "0 (in every resample)"
+    if difference["rounds"] < FEW_ROUNDS:
+        return f"{value:+.1f} (few rounds)"
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 

@@ -85,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise UserError(f"--scenes {chosen.scenes}: give {HELD_OUT} or more, a tenth is held out")
     device = choose_device(config.train.device)
     initial = None if chosen.initial is None else load_critic(chosen.initial)
+    others = [path for folder in chosen.more for path in shards(folder)]
     examples = collect(config, chosen.scenes, chosen.examples)
     if chosen.folds is not None:
         assert initial is not None  # checked above
@@ -96,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         before = judged(initial, examples.where(held_out))
         scores |= {f"{name} before": value for name, value in before.items()}
     # Another folder may have the same scenes with other labels.
-    more = [Examples.load(path) for folder in chosen.more for path in shards(folder)]
+    more = [Examples.load(path) for path in others]
     more = [part.where(part.scene % HELD_OUT != 0) for part in more]
     learned = Examples.joined([examples.where(~held_out), *more])
     critic = fit(learned, config.seed, initial=initial, device=device)

@@ -37,7 +37,7 @@ def row(
 def figures(folder, name: str, rows: list[dict]) -> None:
     pair = {
         "first": "graspnet", "second": "heuristic", "scenario": "pile", "objects": "random_urdfs",
-        "success": {"value": 0.015, "low": -0.002, "high": 0.0311}, "cleared": None,
+        "success": {"value": 0.015, "low": -0.002, "high": 0.0311, "rounds": 100}, "cleared": None,
     }  # fmt: skip
     command = {"command": "python evaluate.py seed=2027", "rows": rows, "comparisons": [pair]}
     part = {"part": name, "commit": 40 * "a", "seed": 2027, "date": "2026-11-22"}
@@ -90,7 +90,7 @@ def test_the_overview_has_a_line_for_each_noisy_scene(tmp_path):
         [
             row("graspnet", 81, 263) | noisy,
             row("oracle6d", 250, 250) | noisy,
-            row("graspnet", 0, 0, bowls) | noisy,  # no attempt: no success to state
+            row("graspnet", 0, 0, bowls) | noisy,  # no attempt: nothing cleared, no success
             row("graspnet6d", 450, 500, bowls) | noisy,
         ],
     )
@@ -98,7 +98,7 @@ def test_the_overview_has_a_line_for_each_noisy_scene(tmp_path):
     where = "[from any side](six_dof.md#figures)"
     assert page.splitlines()[3:-1] == [
         f"| pile | `random_urdfs` | `realsense` | 31, 16 | - | 100, 50 | {where} |",
-        f"| pile | `bowls` | `realsense` | - | 90, 90 | - | {where} |",
+        f"| pile | `bowls` | `realsense` | -, 0 | 90, 90 | - | {where} |",
     ]
 
 
@@ -270,7 +270,20 @@ def test_commands_are_valid_and_take_fresh_seeds(capsys):
                 overrides = [w for w in words[2:] if "=" in w and "path/to" not in w]
                 config = load_config(None, overrides)
                 assert (config.seed, config.objects.split) == (sealed.seed, command.split)
-    assert main(["--list", "--scale", "0.1"]) == 0
+    assert main(["--list"]) == 0
+    assert f"seed={sealed.seed} objects.split=sealed" in capsys.readouterr().out
+
+
+def test_a_trial_plays_no_sealed_scene(capsys):
+    """A look at them is one, whatever the share of the rounds."""
+    assert main(["--list", "--scale", "0.99"]) == 0
+    lines = capsys.readouterr().out
+    assert "seed=900 objects.split=test" in lines and "objects.split=unseen_families" in lines
+    scripts = [line for line in lines.splitlines() if ".py seed=" in line]
+    sealed = load_config(results.SEALED)
+    assert len(scripts) > 20
+    assert not [line for line in scripts if f"seed={sealed.seed}" in line or "sealed" in line]
+    assert main(["--list", "--scale", "0.99", "--write-docs"]) == 0
     assert f"seed={sealed.seed} objects.split=sealed" in capsys.readouterr().out
 
 
@@ -327,6 +340,8 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
         return {"command": lines[-1], "rows": [row(command.name, 3, 4)]}
 
     monkeypatch.setattr(results, "run_command", run_command)
+    monkeypatch.setattr(results, "code_commit", lambda: "c0ffee")
+    (tmp_path / "docs").mkdir()
     (part,) = chosen_parts("ppo")
     with pytest.raises(KeyboardInterrupt):
         results.measure(part, "c0ffee", 0.1)
@@ -352,6 +367,7 @@ def test_a_run_of_another_folder_is_not_gone_on_with(tmp_path, monkeypatch):
     (run / "config.yaml").write_text(dump_config(config))
     played = []
     monkeypatch.setattr(results, "run_command", lambda *job: played.append(job) or {"rows": []})
+    monkeypatch.setattr(results, "code_commit", lambda: "c0ffee")
     refused = r"results: .*ycb.* has evaluate\.object_sets=old/ycb and does not go on with new/ycb"
     for _ in range(2):
         with pytest.raises(UserError, match=refused):
@@ -359,6 +375,16 @@ def test_a_run_of_another_folder_is_not_gone_on_with(tmp_path, monkeypatch):
         assert len(played) < 2
         results.measure(part, "c0ffee", 0.1, {"ycb": tmp_path / "old" / "ycb"})
     assert len(played) == 1
+
+
+def test_figures_of_code_that_changed_meanwhile_are_dropped(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(results, "run_command", lambda *job: {"rows": []})
+    monkeypatch.setattr(results, "code_commit", lambda: "dead")
+    (part,) = chosen_parts("retrieve")
+    with pytest.raises(UserError, match="from commit c0ffee to dead while retrieve was measured"):
+        results.measure(part, "c0ffee", 1.0)
+    assert not results.is_finished(part, "c0ffee", 1.0)
 
 
 @pytest.fixture
@@ -387,7 +413,7 @@ def two_parts(tmp_path, monkeypatch):
 def test_a_trial_leaves_the_docs_alone(two_parts, capsys):
     before = two_parts.read_text()
     assert main(["--parts", "mujoco", "--scale", "0.1"]) == 0
-    assert "the docs stay as they are" in capsys.readouterr().out
+    assert "they are of scenes with seed 900" in capsys.readouterr().out
     assert two_parts.read_text() == before and not results.FIGURES.exists()
     assert main(["--parts", "mujoco", "--scale", "0.1", "--write-docs"]) == 0
     assert "(5 rounds a row)" in two_parts.read_text()
@@ -405,7 +431,8 @@ def test_each_part_has_its_own_scale_and_the_date_of_its_measuring(two_parts):
 
 def test_every_look_at_sealed_scenes_is_kept(tmp_path):
     """97 of 100 and 45 of 50 grasps of two noisy rows are 95 %, 142 of 1,000 objects 14 %; clean
-    rows stand beside them where there are no others; another measuring is another look."""
+    rows stand beside them where there are no others. The same figures, published again, are no
+    look; others are one, though the commit may be the same."""
     noisy = [
         row("graspnet", 97, 100) | {"depth_noise": "realsense"},
         row("graspnet", 45, 50, objects="primitives") | {"depth_noise": "realsense"},
@@ -413,8 +440,8 @@ def test_every_look_at_sealed_scenes_is_kept(tmp_path):
     clean = [row("graspnet6d", 3, 4), row("heuristic", 1, 4)]
     target = [row("graspnet", 8, 10) | {"targets": 5, "targets_in_hand": 4}]
     for name, commit, rows in [
-        ("scoreboard", "a", noisy + clean), ("scoreboard", "a", noisy), ("mujoco", "b", clean),
-        ("scoreboard", "b", clean), ("retrieve", "b", target), ("servo", "b", clean[1:]),
+        ("scoreboard", "a", noisy), ("scoreboard", "a", noisy), ("mujoco", "b", clean),
+        ("scoreboard", "a", clean), ("retrieve", "b", target), ("servo", "b", clean[1:]),
     ]:  # fmt: skip
         part = {"part": name, "commit": 40 * commit, "date": "2026-01-02", "scale": 1.0}
         first, second = {"rows": rows[:1]}, {"rows": rows[1:]}

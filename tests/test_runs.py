@@ -26,6 +26,7 @@ from utils.runs import (
     check_resume,
     environment,
     git_state,
+    named_files,
     new_run_folder,
     open_run,
     parse_args,
@@ -158,6 +159,30 @@ def test_a_run_that_another_commit_began_goes_on_with_a_remark(tmp_path):
         check_resume(CONFIG, run, [])
 
 
+def test_a_run_goes_on_with_a_remark_where_what_it_names_has_changed(tmp_path, monkeypatch):
+    """The weights of a policy, and the module of a plug-in; a package."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("weights.pt").write_bytes(b"first")
+    Path("my_own_planner.py").write_text("def plan(frame): ...\n")
+    policies = "evaluate.policies=ppo:weights.pt,my_own_planner:plan"
+    config = load_config(None, [policies])
+    digest = "a7937b64b8caa58f03721bb6bacf5c78cb235febe0e70b1b84cd99541461a08e"  # of sha256sum
+    assert named_files(config)["ppo:weights.pt"] == digest
+    run = new_run_folder("evaluate", None, config, tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_resume(config, run, [])
+    Path("my_own_planner.py").write_text("def plan(frame): return []\n")
+    with pytest.warns(UserWarning, match="begun with another content of my_own_planner:plan; wh"):
+        check_resume(config, run, [])
+    facts = json.loads((run / "environment.json").read_text())
+    packages = facts["packages"] | {"numpy": "0.1"}
+    write_json_atomic(run / "environment.json", facts | {"packages": packages})
+    with pytest.warns(UserWarning, match="with numpy 0.1 and goes on with "):
+        check_resume(config, run, [])
+
+
 def test_an_unknown_option_is_told_how_a_setting_is_written(capsys):
     with pytest.raises(SystemExit, match="2"):
         parse_args(["--rounds", "3"], "a script")
@@ -210,6 +235,9 @@ def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
 
 def test_resume_takes_the_run_s_config(tmp_path):
     (tmp_path / "config.yaml").write_text("seed: 9\n")
+    with pytest.raises(ConfigError, match=r"no environment\.json"):  # a config is not yet a run
+        parse_args(["--resume", str(tmp_path)], "a script")
+    (tmp_path / "environment.json").write_text("{}")
     config, options = parse_args(["--resume", str(tmp_path), "evaluate.rounds=4"], "a script")
     assert (config.seed, config.evaluate.rounds, options.resume) == (9, 4, tmp_path)
     with pytest.raises(ConfigError, match=r"no such folder"):

@@ -27,7 +27,13 @@ from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UserError
 from utils.image_overlay import NEAR, close_up, contact_sheet, write_picture
-from utils.result_formats import columns_of, depth_in_words, failures_in_words, has_interval
+from utils.result_formats import (
+    columns_of,
+    depth_in_words,
+    failures_in_words,
+    has_interval,
+    rate_in_percent,
+)
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stated_chances, stop_reasons
 from utils.runs import git_state
@@ -273,9 +279,12 @@ def _data_url(content: bytes, kind: str) -> str:
 
 
 def _percent(rate: float | None, sign: bool = False) -> str:
-    """A rate as whole percent; a true minus, because a hyphen is hard to see."""
+    """A rate, or with `sign` a difference, in percent; a true minus, because a hyphen is hard to
+    see."""
     if rate is None:
         return "–"
+    if not sign:
+        return rate_in_percent(rate)
     whole = round(100 * rate)
     return f"{whole:{'+' if sign and whole else ''}d}".replace("-", "−")
 

@@ -117,7 +117,13 @@ def _share(rate: float | None, interval: tuple[float, float], k: int, n: int) ->
     if rate is None:
         return "-"
     low, high = interval
-    return f"{100 * rate:3.0f} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
+    return f"{rate_in_percent(rate):>3} % [{100 * low:.0f}, {100 * high:.0f}] {k}/{n}"
+
+
+def rate_in_percent(rate: float) -> str:
+    """'97' of a rate in [0, 1]; '99.6' where one below 1 would be rounded to 100."""
+    percent = f"{100 * rate:.0f}"
+    return f"{min(100 * rate, 99.9):.1f}" if percent == "100" and rate < 1 else percent
 
 
 def _decimal(value: float | None, digits: int) -> str:
@@ -138,7 +144,7 @@ def cleared_in_words(row: Row) -> str:
 
 def firm_in_words(row: Row) -> str:
     """'94 %': share of the attempts in which the object also kept its place in the hand."""
-    return f"{100 * row.firm / row.attempts:.0f} %" if row.attempts else "-"
+    return f"{rate_in_percent(row.firm / row.attempts)} %" if row.attempts else "-"
 
 
 def graspable_in_words(row: Row) -> str:
@@ -148,7 +154,7 @@ def graspable_in_words(row: Row) -> str:
         (row.graspable_successes, row.graspable_attempts),
         (row.graspable_successes, row.graspable_total),
     )
-    return ", ".join(f"{100 * k / n:.0f} % {k}/{n}" if n else "-" for k, n in shares)
+    return ", ".join(f"{rate_in_percent(k / n)} % {k}/{n}" if n else "-" for k, n in shares)
 
 
 def turn_ms_in_words(row: Row) -> str:

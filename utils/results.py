@@ -8,6 +8,7 @@ that both have played. `utils.result_records` has the records, `utils.result_for
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from utils.calibration import calibration_error
 from utils.config import read_config
 from utils.errors import UserError
 from utils.result_records import CLEAN, FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
+from utils.runs import begun_with
 from utils.statistics import (
     Difference,
     clustered_interval,
@@ -303,6 +305,7 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
     one of the second. Runs with one depth noise each are compared whatever these are: where they
     differ, the noise is named 'first - second'.
 
+    Warns where the runs are of two commits, at which a scene of the same seed may lie otherwise.
     Raises UserError where a folder holds no evaluation, and where the scenes do not match.
     """
     (config, before), (other, after) = (_read_run(folder) for folder in (first, second))
@@ -322,6 +325,13 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
         raise UserError(
             f"--compare {first} {second}: they have no scene in common; compare runs with the same "
             "seed, evaluate.scenarios, evaluate.object_sets and evaluate.depth_noises"
+        )
+    one, another = (begun_with(folder).get("commit") for folder in (first, second))
+    if one and another and one != another:
+        warnings.warn(
+            f"--compare {first} {second}: played at commit {one[:10]} and at {another[:10]}; "
+            "where these lay objects otherwise, scenes of the same seed are not the same",
+            stacklevel=2,
         )
     names = [list(dict.fromkeys(record.policy for record in rounds)) for rounds in (before, after)]
     common = [name for name in names[0] if name in names[1]]

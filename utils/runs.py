@@ -9,6 +9,8 @@ computes.
 from __future__ import annotations
 
 import argparse
+import hashlib
+import importlib.util
 import json
 import math
 import os
@@ -32,6 +34,7 @@ from typing import Any, NamedTuple, NoReturn
 from utils.atomic_files import DISK_ERRORS, locked, write_atomic, write_json_atomic
 from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError, one_line
+from utils.plugins import is_import_path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = (  # whose versions may change a result
@@ -91,8 +94,12 @@ def parse_args(
     path = options.config
     if resumes and options.resume is not None:
         path = options.resume / "config.yaml"
-        if not path.is_file():
-            lack = "no config.yaml in there" if options.resume.is_dir() else "no such folder"
+        missing = [
+            file for file in (path, options.resume / "environment.json") if not file.is_file()
+        ]
+        if missing:
+            there = options.resume.is_dir()
+            lack = f"no {missing[0].name} in there" if there else "no such folder"
             raise ConfigError(
                 f"--resume {options.resume}: {lack}; give the folder of a run, such as "
                 f"runs/{Path(parser.prog).stem}/20250131-120000"
@@ -227,7 +234,7 @@ def new_run_folder(
     """
     folder = timed_folder(root / script, name)
     write_atomic(folder / "config.yaml", dump_config(config))
-    write_json_atomic(folder / "environment.json", environment())
+    write_json_atomic(folder / "environment.json", environment() | {"files": named_files(config)})
     return folder
 
 
@@ -266,8 +273,8 @@ def check_resume(
     but for the dotted keys in `free_keys`.
 
     checkpoints: patterns of files such as "last.pt", of which the run must hold at least one.
-    run: None where a new run is started, which is always allowed. Warns where the run was begun by
-    another commit, which results.json will not name.
+    run: None where a new run is started, which is always allowed. Warns where the run was begun
+    with other code, packages or files than it goes on with, which results.json will not name.
     """
     if run is None:
         return
@@ -282,21 +289,74 @@ def check_resume(
             f"--resume {run}: only {', '.join(sorted(free_keys))} may differ from the run that is "
             "resumed; start a new run for anything else"
         )
-    begun, goes_on = _begun_at(run), git_state().commit
-    if begun is not None and goes_on is not None and begun != goes_on:
+    changed = _changed_since(run, config)
+    if changed:
         warnings.warn(
-            f"--resume {run}: it was begun at commit {begun[:10]} and goes on at {goes_on[:10]}; "
-            "where the two compute otherwise, its figures are of neither",
+            f"--resume {run}: it was begun {', '.join(changed)}; where the two compute otherwise, "
+            "its figures are of neither",
             stacklevel=2,
         )
 
 
-def _begun_at(run: Path) -> str | None:
-    """The commit that a run folder was made at; None where that is not known."""
+def begun_with(run: Path) -> dict[str, Any]:
+    """The environment.json of a run folder; empty where that is not known."""
     try:
-        return json.loads((run / "environment.json").read_text(encoding="utf-8")).get("commit")
+        return dict(json.loads((run / "environment.json").read_text(encoding="utf-8")))
     except (OSError, ValueError):
-        return None
+        return {}
+
+
+def _changed_since(run: Path, config: Config) -> list[str]:
+    """What is not as it was when a run began, in words; what was not noted counts as the same."""
+    begun, now = begun_with(run), environment()
+    changed = []
+    if None not in (begun.get("commit"), now["commit"]) and begun["commit"] != now["commit"]:
+        changed.append(f"at commit {begun['commit'][:10]} and goes on at {now['commit'][:10]}")
+    elif begun.get("changes", now["changes"]) != now["changes"]:
+        changed.append("with other changes to the code since the last commit")
+    for name, version_then in begun.get("packages", {}).items():
+        version_now = now["packages"].get(name, version_then)
+        if version_now != version_then:
+            changed.append(f"with {name} {version_then} and goes on with {version_now}")
+    files = named_files(config)
+    for name, digest in begun.get("files", {}).items():
+        if files.get(name, digest) != digest:
+            changed.append(f"with another content of {name}")
+    return changed
+
+
+def named_files(config: Config) -> dict[str, str]:
+    """SHA-256 of each file that a config names, and of the module of each plug-in, by their names
+    there. Folders are left out: `object_sets` and data may be large."""
+    found = {}
+    for text in _texts(config.model_dump(mode="json")):
+        with suppress(OSError, ValueError, ImportError):  # no path of this system, or no module
+            file = _file_named(text)
+            if file is not None:
+                found[text] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return found
+
+
+def _texts(values: Any) -> Iterator[str]:
+    """All texts in the plain data of a config."""
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping):
+        for value in values.values():
+            yield from _texts(value)
+    elif isinstance(values, list | tuple):
+        for value in values:
+            yield from _texts(value)
+
+
+def _file_named(text: str) -> Path | None:
+    """The file that FILE, KIND:FILE or MODULE:NAME names, if there is one."""
+    if is_import_path(text):
+        spec = importlib.util.find_spec(text.partition(":")[0])
+        if spec is not None and spec.has_location:
+            return Path(str(spec.origin))
+    files = (Path(name) for name in (text, text.partition(":")[2]))
+    return next((file for file in files if file.is_file()), None)
 
 
 def save_results(path: Path, content: Mapping[str, Any]) -> None:
@@ -332,6 +392,7 @@ def environment() -> dict[str, Any]:
     return {
         "commit": commit,
         "dirty": dirty,
+        "changes": _changes() if dirty else None,
         "command": sys.argv,
         "torchrun_job": torchrun_job(),
         "python": platform.python_version(),
@@ -358,6 +419,12 @@ def git_state(folder: Path = REPOSITORY) -> GitState:
     commit = _git(folder, "rev-parse", "--verify", "HEAD")
     changes = _git(folder, "status", "--porcelain", "--untracked-files=no") if commit else None
     return GitState(commit, None if changes is None else bool(changes))
+
+
+def _changes() -> str | None:
+    """A digest of the repository's uncommitted changes."""
+    changes = _git(REPOSITORY, "diff", "HEAD")
+    return None if changes is None else hashlib.sha256(changes.encode()).hexdigest()
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
