@@ -541,7 +541,7 @@ def test_depth_noise_comes_and_goes(scene):
         assert (cell.frame().depth > 0).all()
 
 
-def test_textures_stick_to_a_moved_object(scene, make):
+def test_a_textured_table_is_no_longer_of_one_colour(scene, make):
     config = only(camera_fov="1,1,uniform,scale,episode", colour_share=1.0, texture_share=1.0)
     with make(config) as cell:
         cell.build(scene)

@@ -19,6 +19,7 @@ from utils.grasp_labels import (
     GraspLabels,
     LabelSettings,
     Trial,
+    _support,
     bin_angles,
     dense_labels,
     draw_pairs,
@@ -26,6 +27,7 @@ from utils.grasp_labels import (
     grasp_depth,
     label_truth,
 )
+from utils.grasp_quality import _Faces, _quality
 from utils.transforms import (
     Grasp,
     ImageGrasp,
@@ -107,6 +109,71 @@ def test_width_is_the_opening_that_clears_both_sides_from_the_pixel(side: float)
     assert len(expected) > 20
     assert labels.width[bin_][near_middle] == pytest.approx(np.minimum(expected, 0.08), abs=0.002)
     assert labels.width.max() <= GripperGeometry().max_opening + 1e-6
+
+
+def quality_of(changes: dict, friction: float = 1.0) -> float:
+    """Of one grasp: a face of 4 cm that both pads cover whole, 2 cm deep, gripped at its centre of
+    mass with room to spare, but for `changes` of the face or of the arms to the centre of mass."""
+    face = {
+        "touched": True, "label": 0, "left": -0.02, "right": 0.02, "engagement": 0.02,
+        "wedge": 0.0, "turn": 0.0, "tilt": 0.0, "cover": 1.0,
+    }  # fmt: skip
+    hand = GripperGeometry()
+    arms = {"along": 0.0, "across": 0.0, "up": hand.pad_height / 2, "half": 0.03}
+    face |= {name: changes.pop(name) for name in list(changes) if name in face}
+    assert changes.keys() <= arms.keys()
+    arms |= changes
+    one = _Faces(**{name: np.array([value]) for name, value in face.items()})
+    along, across, up, half = (np.array([value]) for value in arms.values())
+    settings = LabelSettings()
+    return _quality(one, along, across, up, np.array([friction]), half, hand, settings).item()
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, 1.0),
+        ({"wedge": 0.1}, np.exp(-((0.1 / 0.35) ** 2))),
+        ({"turn": -0.2}, np.exp(-((0.2 / 0.30) ** 2))),
+        ({"tilt": 0.3}, np.exp(-((0.3 / 0.50) ** 2))),
+        ({"across": -0.02}, np.exp(-((0.02 / 0.03) ** 2))),
+        ({"along": 0.04}, np.exp(-((0.04 / 0.08) ** 2))),
+        ({"up": GripperGeometry().pad_height / 2 + 0.04}, np.exp(-((0.04 / 0.08) ** 2))),
+        # 1 cm off the middle, and off the centre of mass, which stays under the pixel
+        ({"left": -0.01, "right": 0.03, "half": 0.04},
+         np.exp(-((0.01 / 0.025) ** 2) - (0.01 / 0.08) ** 2)),
+        ({"cover": 0.5}, 0.6 + 0.4 * 0.5),
+        ({"engagement": 0.01}, 0.01 / 0.02),
+        ({"engagement": 0.006}, 0.4),  # at the least
+        ({"engagement": 0.005}, 0.0),  # too little
+        ({"half": 0.0235}, 0.9),  # 3.5 mm of room, halfway from 2 to 5 mm
+        ({"half": 0.022}, 0.8),
+        ({"touched": False}, 0.0),
+    ],
+)  # fmt: skip
+def test_quality_is_the_product_of_its_factors(changes, expected) -> None:
+    assert quality_of(dict(changes)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("angle", ["wedge", "tilt"])
+def test_faces_beyond_the_friction_cone_slip(angle) -> None:
+    """At 0.4 rad a coefficient of 0.3, a cone of atan 0.3 = 0.29 rad, does not hold, one of 0.5 or
+    0.7 does; 30 degrees are the most."""
+    held = [quality_of({angle: 0.4}, friction) > 0 for friction in (0.3, 0.5, 0.7)]
+    assert held == [False, True, True]
+    assert quality_of({angle: np.deg2rad(31)}, 0.7) == 0 < quality_of({angle: np.deg2rad(29)}, 0.7)
+
+
+def test_support_counts_the_feasible_ones_around() -> None:
+    """27 of 27 inside a block of five bins, 2 x 9 in its last bin, 3 x 6 at its edge, 3 x 4 at its
+    corner; bins 17 and 0 are neighbours."""
+    feasible = np.zeros((18, 20, 20), bool)
+    feasible[4:9, 5:12, 5:12] = True
+    feasible[[16, 17, 0], 15:18, 15:18] = True
+    share = _support(feasible)
+    places = ((6, 8, 8), (8, 8, 8), (6, 5, 8), (6, 5, 5), (17, 16, 16), (0, 16, 16), (12, 8, 8))
+    counts = [27, 18, 18, 12, 27, 18, 0]
+    assert [share[place] * 27 for place in places] == pytest.approx(counts, abs=1e-4)
 
 
 def test_a_ball_is_grasped_alike_from_all_sides() -> None:

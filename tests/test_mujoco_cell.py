@@ -4,7 +4,6 @@ import os
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 import pytest
 
 from envs.cell import PhysicsError
@@ -16,6 +15,7 @@ from envs.mujoco_cell import MujocoCell
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from models.planners import make_planner
+from tests.helpers.simulators import pybullet
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import position_quaternion

@@ -12,9 +12,7 @@ from models.grasp_policy import (
     GraspPPO,
     load_policy,
 )
-from models.ppo_observations import (
-    ObservationLayout,
-)
+from models.ppo_observations import ObservationLayout, Observations
 from models.ppo_rollouts import (
     NotFinite,
     RolloutCollector,
@@ -122,11 +120,17 @@ def test_what_an_update_learns_from():
     assert first.approx_kl.item() == 0 and first.clip_fraction.item() == 0  # the ratio is 1
 
 
-def test_the_loss_is_that_of_stable_baselines3():
+@pytest.mark.parametrize(
+    ("clip", "value", "entropy_coef", "largest"), [(0.2, 0.5, 0.02, 0.5), (0.1, 0.25, 0.01, 0.2)]
+)
+def test_the_loss_is_that_of_stable_baselines3(clip, value, entropy_coef, largest):
     """Its policy with our weights, and the lines of its PPO.train for one minibatch."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
-    ppo = ppo_of("rl.entropy_coef=0.02", "rl.normalise_observations=false", actions=2)
+    ppo = ppo_of(
+        f"rl.clip_epsilon={clip}", f"rl.value_coef={value}", f"rl.entropy_coef={entropy_coef}",
+        f"rl.max_gradient_norm={largest}", "rl.normalise_observations=false", actions=2,
+    )  # fmt: skip
     theirs = ActorCriticPolicy(
         spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1, 1, (2,)), lambda _: 3e-4,
         net_arch={"pi": [16, 16], "vf": [16, 16]},
@@ -143,24 +147,25 @@ def test_the_loss_is_that_of_stable_baselines3():
     values, log_prob, entropy = theirs.evaluate_actions(batch.observations.state, batch.latents)
     advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)
     ratio = (log_prob - batch.log_probs).exp()
-    policy_loss = -torch.min(advantages * ratio, advantages * ratio.clamp(0.8, 1.2)).mean()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    policy_loss = -torch.min(advantages * ratio, advantages * clipped).mean()
     value_loss = F.mse_loss(batch.returns, values.flatten())
-    loss = policy_loss - 0.02 * entropy.mean() + 0.5 * value_loss
+    loss = policy_loss - entropy_coef * entropy.mean() + value * value_loss
 
     found = ppo.losses(batch)
     for mine, yours in (
         (found.loss, loss), (found.policy_loss, policy_loss), (found.value_loss, value_loss),
         (found.entropy, entropy.mean()),
-        (found.clip_fraction, ((ratio - 1).abs() > 0.2).float().mean()),
+        (found.clip_fraction, ((ratio - 1).abs() > clip).float().mean()),
         (found.approx_kl, ((ratio - 1) - ratio.log()).mean()),
     ):  # fmt: skip
         torch.testing.assert_close(mine, yours, rtol=1e-5, atol=1e-6)
 
     norm = ppo.gradient(found.loss)
     loss.backward()
-    unclipped = torch.nn.utils.clip_grad_norm_(theirs.parameters(), 0.5)
-    assert norm == pytest.approx(unclipped.item(), rel=1e-4) and norm > 0.5
-    assert ppo.weights.grad.norm().item() == pytest.approx(0.5, rel=1e-4)
+    unclipped = torch.nn.utils.clip_grad_norm_(theirs.parameters(), largest)
+    assert norm == pytest.approx(unclipped.item(), rel=1e-4) and norm > largest
+    assert ppo.weights.grad.norm().item() == pytest.approx(largest, rel=1e-4)
     for mine, yours in ((ours.actor, extractor.policy_net), (ours.value_head, theirs.value_net)):
         for a, b in zip(mine.parameters(), yours.parameters()):
             torch.testing.assert_close(a.grad, b.grad, rtol=1e-4, atol=1e-6)
@@ -176,11 +181,89 @@ def test_the_learning_rate_is_annealed():
 
 
 def test_an_update_stops_at_the_target_kl():
-    free, held = (
-        ppo_of("rl.lr=0.05", f"rl.target_kl={kl}", "rl.epochs=10") for kl in ("null", 0.01)
-    )
+    """Before the first step from a policy that has gone more than one and a half times as far, as
+    OpenAI's baselines do."""
+    ppo = ppo_of("rl.target_kl=0.01", "rl.epochs=10")
+    gone, losses = iter([0.0, 0.0149, 0.0149, 0.0151, 0.0]), ppo.losses
+    ppo.losses = lambda batch: losses(batch)._replace(approx_kl=torch.tensor(next(gone)))
+    assert ppo.update(rollout_of(ppo))["minibatches"] == 4
+    (state,) = ppo.optimizer.state_dict()["state"].values()
+    assert state["step"] == 3
+    free = ppo_of("rl.target_kl=null", "rl.epochs=10", "rl.lr=0.05")
     assert free.update(rollout_of(free))["minibatches"] == 40
-    assert held.update(rollout_of(held))["minibatches"] < 40
+
+
+def test_explained_variance_is_that_of_stable_baselines3():
+    from stable_baselines3.common.utils import explained_variance
+
+    ppo = ppo_of("rl.gamma=0.5")
+    rollout = rollout_of(ppo)
+    rollout.rewards = rollout.observations.state[..., 0].double().numpy()  # values can explain some
+    batch, explained = ppo._prepare(rollout)
+    with torch.no_grad():
+        values = ppo.network.value(None, batch.observations.state, torch.empty(64, 0))
+    theirs = explained_variance(values.numpy(), batch.returns.numpy())
+    assert explained == pytest.approx(theirs, abs=1e-5) and abs(theirs) > 1e-3
+
+
+def test_rewards_are_divided_by_the_deviation_of_discounted_returns():
+    """Of all that was seen so far, in numpy; what happens in one rollout goes on in the next."""
+    scaled, plain = (ppo_of(f"rl.normalise_rewards={on}", "rl.gamma=0.9") for on in ("true", "no"))
+    running, seen = np.zeros(4), []
+    for number in range(2):
+        rollout, by_hand = (rollout_of(ppo, seed=number) for ppo in (scaled, plain))
+        for rewards, ended in zip(rollout.rewards, rollout.terminated | rollout.truncated):
+            running = 0.9 * running + rewards
+            seen.append(running)
+            running = np.where(ended, 0, running)
+        by_hand.rewards = rollout.rewards / np.std(seen)
+        one, another = (
+            ppo._prepare(part)[0] for ppo, part in ((scaled, rollout), (plain, by_hand))
+        )
+        torch.testing.assert_close(one.returns, another.returns, rtol=1e-4, atol=1e-5)
+    assert not 0.9 < np.std(seen) < 1.1
+
+
+def estimating(*overrides: str) -> GraspPPO:
+    """A policy that estimates the privileged number from its state."""
+    space = spaces.Dict({name: spaces.Box(-np.inf, np.inf, (1,)) for name in ("seen", "truth")})
+    layout = ObservationLayout.of(space, ["seen"], ["truth"])
+    return ppo_of("rl.estimated_observations=truth", *overrides, layout=layout)
+
+
+def test_estimates_learn_from_new_and_from_remembered_steps():
+    """Of 64 steps in minibatches of 16, each with three times as many remembered ones: they are
+    earlier steps, known by their numbers."""
+    ppo = estimating("rl.estimate_epochs=2", "rl.estimate_recall=3", "rl.estimate_memory=100")
+    sizes, numbers, loss = [], [], ppo.network.estimate_loss
+
+    def spied(image, state, privileged):
+        sizes.append(len(state))
+        numbers.append(state[:, 0])
+        return loss(image, state, privileged)
+
+    ppo.network.estimate_loss = spied
+    for first in (0, 64):
+        state = torch.arange(first, first + 64.0)[:, None]
+        ppo.update_estimator(Observations((), state, state / 100), rate=1e-3)
+    assert sizes == 8 * [16] + 8 * [64]
+    new, old = (
+        torch.cat([seen[part] for seen in numbers[8:]]) for part in (np.s_[:16], np.s_[16:])
+    )
+    assert sorted(new.tolist()) == sorted(2 * list(range(64, 128)))
+    assert old.max() < 64 and len(old.unique()) > 50
+
+
+def test_the_learning_rate_of_estimates_is_annealed():
+    ppo = estimating("rl.estimate_lr=0.01", "rl.estimate_memory=0")
+    rollout = rollout_of(ppo)
+    truth = rollout.observations.state / 10
+    rollout.observations = rollout.observations._replace(privileged=truth)
+    rollout.last = rollout.last._replace(privileged=torch.zeros(4, 1))
+    rollout.cut_final = ppo.layout.empty(0)
+    ppo.update(rollout, progress=0.75)
+    (group,) = ppo.estimator_optimizer.param_groups
+    assert group["lr"] == pytest.approx(0.0025)
 
 
 def test_statistics_change_after_an_update_only():
@@ -249,12 +332,21 @@ def test_exploration_stays_within_its_limits(start, sign):
     assert ppo.network.log_std.item() == start
 
 
-def test_a_seed_gives_an_order_of_minibatches():
-    parts = ppo_of().network, COUNTED, ppo_of().settings
-    first, again, other = (GraspPPO(*parts, seed=seed) for seed in (3, 3, 4))
-    order = torch.randperm(100, generator=first.generator)
-    assert torch.equal(order, torch.randperm(100, generator=again.generator))
-    assert not torch.equal(order, torch.randperm(100, generator=other.generator))
+def test_each_epoch_takes_all_steps_in_an_order_of_its_own():
+    def orders(seed: int) -> torch.Tensor:
+        parts = ppo_of("rl.epochs=3", "rl.target_kl=null")
+        ppo = GraspPPO(parts.network, COUNTED, parts.settings, seed=seed)
+        rollout, seen, losses = rollout_of(ppo), [], ppo.losses
+        ppo.losses = lambda batch: seen.append(batch.latents[:, 0]) or losses(batch)
+        ppo.update(rollout)
+        places = torch.cat(seen).reshape(3, 64)[..., None] == rollout.latents.flatten()
+        return places.long().argmax(dim=-1)
+
+    order = orders(3)
+    in_turn = torch.arange(64).expand(3, 64)
+    assert torch.equal(order.sort(dim=1).values, in_turn)
+    assert len({tuple(one.tolist()) for one in (*order, in_turn[0], *orders(4))}) == 7
+    assert torch.equal(order, orders(3))
 
 
 def test_a_resumed_training_is_the_same_bit_for_bit(tmp_path, config):

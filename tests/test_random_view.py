@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from utils.errors import UserError
-from utils.random_view import TextureRandomizer
+from utils.random_view import RandomView, TextureRandomizer
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def pictures(tmp_path_factory):
     return folder
 
 
-def test_textures_come_back_from_json_and_stick_to_the_object(pictures):
+def test_textures_come_back_from_json(pictures):
     randomizer, rng = TextureRandomizer(pictures), np.random.default_rng(1)
     points = rng.uniform(-0.1, 0.1, (500, 3))
     kinds = set()
@@ -55,6 +55,36 @@ def test_picture_factors(pictures):
     bright = np.array([50, 100, 200]) / (350 / 6)  # RGB; the picture's mean is 350 / 6
     expected = np.where((x % 0.1 > 0.05)[:, None], bright, 0)
     np.testing.assert_allclose(seen, expected)
+
+
+def test_textures_stick_to_a_body_that_moves(pictures):
+    """A plane 1 m in front of a camera of 100 pixels: 3 cm are 3 pixels, a quarter turn about the
+    optical axis turns the picture."""
+    texture = TextureRandomizer.make(
+        {
+            "kind": "picture", "file": str(pictures / "halves.png"), "size": 0.1,
+            "axes": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "offset": [0.0, 0.0],
+        }
+    )  # fmt: skip
+    K = np.array([[100.0, 0, 20], [0, 100, 20], [0, 0, 1]])
+    pose = np.eye(4)
+    view = RandomView(lambda frame: {}, 0, 0, False, {7: texture}, lambda body: pose)
+    grey, depth = np.full((41, 41, 3), 100, np.uint8), np.ones((41, 41), np.float32)
+    bodies = np.full((41, 41), 7)
+    bodies[:, :2] = 8  # another body, without a texture
+
+    def seen() -> np.ndarray:
+        view.begin_frame()
+        return view.develop(grey, depth, bodies, K, np.eye(4))[0]
+
+    # Half a pixel aside, so that no point lies on an edge of the picture.
+    pose[:2, 3] = 0.005
+    before = seen()
+    assert (before[:, :2] == 100).all() and len(np.unique(before[:, 2:])) > 2
+    pose[0, 3] += 0.03
+    np.testing.assert_array_equal(seen()[:, 5:], before[:, 2:-3])
+    pose[:2, :2], pose[:2, 3] = [[0, -1], [1, 0]], [-0.005, 0.005]
+    np.testing.assert_array_equal(seen()[2:, 2:], before[2:, 2:].transpose(1, 0, 2))
 
 
 def test_wrong_textures_are_refused(tmp_path):

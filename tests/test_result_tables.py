@@ -22,6 +22,14 @@ from utils.result_records import append_round, read_sample
 from utils.statistics import wilson_interval
 
 
+# Tests that look at names and numbers of the sealed objects, and play nothing.
+SPLIT_NAMED_IN = [
+    "tests/test_objects.py",
+    "tests/test_planner_fan.py",
+    "tests/test_result_tables.py",
+]
+
+
 def row(
     policy: str, successes: int, attempts: int, objects: str = "random_urdfs", rounds: int = 100
 ) -> dict:
@@ -320,13 +328,34 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
     assert line.endswith("transfer.columns=cornell,cornell_as_taken transfer.cornell=YCB/cornell")
 
 
-def test_sealed_scenes_are_named_by_the_tables_alone():
-    """In code, configs and tests, neither the seed nor the objects appear anywhere else."""
-    seed, named = str(load_config(results.SEALED).seed), []
-    for folder in ("envs", "models", "utils", "benchmarks", "configs", "tests", "."):
-        files = [*Path(folder).glob("*.py"), *Path(folder).glob("*.yaml")]
-        named += [file.name for file in files if seed in file.read_text()]
-    assert named == ["sealed.yaml"]
+def names_sealed_scenes(root: Path) -> list[str]:
+    """Files below `root` that name the sealed seed or the sealed objects, but for those that make
+    and keep them."""
+    seed, split = str(load_config(results.SEALED).seed), results.SPLIT
+    named = re.compile(rf"\b{seed}\b|split\W{{1,4}}{split}\b|{split}\W{{1,4}}split")
+    found = []
+    for folder in ("envs", "models", "utils", "benchmarks", "configs", "tests", "checkpoints", "."):
+        files = (root / folder).glob("*") if folder == "." else (root / folder).rglob("*")
+        found += [
+            str(file.relative_to(root))
+            for file in files
+            if file.suffix in {".py", ".yaml", ".toml", ".sh", ".j2"}
+            and named.search(file.read_text(encoding="utf-8"))
+        ]
+    return sorted(set(found))
+
+
+def test_sealed_scenes_are_named_by_the_tables_alone(tmp_path):
+    """In code, configs and tests, neither the seed nor the objects' split is chosen elsewhere. The
+    Makefile and the workflow name neither."""
+    assert names_sealed_scenes(results.REPOSITORY) == ["configs/sealed.yaml", *SPLIT_NAMED_IN]
+    for name in ("Makefile", ".ci/run"):
+        file = results.REPOSITORY / name
+        assert not file.exists() or "sealed" not in file.read_text()
+    for place, text in (("tests/helpers", f"SEED = {results.SEED}"), ("configs", "split: sealed")):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "planted.yaml").write_text(text)
+    assert names_sealed_scenes(tmp_path) == ["configs/planted.yaml", "tests/helpers/planted.yaml"]
 
 
 def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):

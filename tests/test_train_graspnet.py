@@ -178,7 +178,8 @@ def test_mistakes_are_refused_before_a_run_folder_is_made(
     monkeypatch.chdir(tmp_path)
     empty = tmp_path / "empty"
     empty.mkdir()
-    shutil.copy(run / "config.yaml", empty)
+    for name in ("config.yaml", "environment.json"):
+        shutil.copy(run / name, empty)
     diverged = create_model(name="tutorial_skip", max_width=0.08)
     next(diverged.parameters()).data.fill_(float("nan"))
     save_graspnet(tmp_path / "diverged.pt", diverged, 0.002)

@@ -110,7 +110,9 @@ def test_the_best_policy_alone_acts_as_in_its_run(tmp_path, monkeypatch):
         value.data = value.data.half().float() if value.dim() > 1 else value.data
     assert alone(seen).tolist() == best(seen).tolist()  # but for half precision
     assert alone.config == best.config
-    assert Path("alone.pt").stat().st_size < (run / "best.pt").stat().st_size
+    held, whole = (torch.load(file, weights_only=True) for file in ("alone.pt", run / "best.pt"))
+    assert not held["optimizer"] and not held["rng"] and whole["optimizer"]
+    assert {value.dtype for value in held["model"].values() if value.dim() > 1} == {torch.float16}
     with pytest.raises(UserError, match="existing folder"):
         train_rl.main([*POINT, "--weights", "nowhere/alone.pt"])
 
@@ -330,6 +332,9 @@ def test_what_cannot_be_resumed(finished, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     shutil.copy(finished / "config.yaml", empty)
+    with pytest.raises(UserError, match=r"no environment\.json"):
+        train_rl.main(["--resume", str(empty)])
+    shutil.copy(finished / "environment.json", empty)
     with pytest.raises(UserError, match="no last.pt"):
         train_rl.main(["--resume", str(empty)])
     (empty / "last.pt").write_bytes((finished / "last.pt").read_bytes()[:-300])
