@@ -136,7 +136,6 @@ def test_a_mirrored_patch_is_that_of_the_turned_hand() -> None:
     found.xy += (0.013, 0.007)
     found.label[:] = 0
     one, turned = critic_inputs(found, heights, np.ones(2), UPWARDS, 0.0).patches
-    np.testing.assert_allclose(turned, one[:, ::-1, ::-1], atol=60)
     assert np.mean(turned != one[:, ::-1, ::-1]) < 0.01  # rounding to cells
 
     class Always:

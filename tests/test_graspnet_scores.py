@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from torch import nn
 from models.graspnet_decoding import Peaks
 from models.graspnet_scores import (
     LabelScores,
+    centre_error,
     check_graspable,
     curve_tag,
     describe_scores,
@@ -96,6 +98,29 @@ def test_scores_are_means_over_images_with_something_to_grasp():
     assert scores.distance == pytest.approx(2.0, abs=1e-4)  # 0 and 4 pixels
     nothing = score_labels(Always(), [labelled()])
     assert (nothing.images, nothing.label_quality, nothing.precision) == (0, 0.0, 0.0)
+
+
+def test_the_error_of_centres_is_a_median_over_objects_and_a_mean_over_images():
+    """On 13 of an object's 25 pixels the network points (3, 4) pixels beside, on 12 far away: 5.
+    In the second image the centre lies there: 0. A third one shows no object."""
+    centre = torch.full((2, 20, 20), torch.nan)
+    centre[:, 5:10, 5:10] = torch.tensor([7.0, 7.0])[:, None, None]
+
+    class Pointing(Always):
+        def forward(self, x, centres=False):
+            rows, columns = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
+            offset = torch.stack([7.0 - columns, 7.0 - rows])
+            beside = torch.tensor([3.0, 4.0])[:, None, None].expand(2, 20, 20).clone()
+            beside.view(2, -1)[:, (5 * 20 + 5) + torch.arange(5)] = 300.0
+            beside.view(2, -1)[:, (6 * 20 + 5) + torch.arange(5)] = 300.0
+            beside.view(2, -1)[:, (7 * 20 + 5) + torch.arange(2)] = 300.0
+            return *super().forward(x), (offset + beside)[None]
+
+    first = replace(labelled(), centre=centre)
+    nothing = replace(labelled(), centre=torch.full((2, 20, 20), torch.nan))
+    exact = replace(labelled(), centre=centre + torch.tensor([3.0, 4.0])[:, None, None])
+    assert centre_error(Pointing(), [first, nothing]) == pytest.approx(5.0)
+    assert centre_error(Pointing(), [first, exact, nothing]) == pytest.approx(2.5)
 
 
 def test_a_network_that_sees_nothing_is_scored_too():

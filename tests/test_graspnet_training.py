@@ -10,7 +10,12 @@ import torch
 
 from models.graspnet import create_model
 from models.graspnet_io import save_graspnet
-from models.graspnet_training import Trainer, choose_precision, warm_up_and_cosine
+from models.graspnet_training import (
+    GRADIENT_LIMIT,
+    Trainer,
+    choose_precision,
+    warm_up_and_cosine,
+)
 from tests.helpers.compare import same
 from tests.helpers.one_step import joint_batch, part_of, take_steps
 from tests.helpers.torchrun import REPOSITORY, in_two_processes
@@ -43,6 +48,25 @@ def test_the_learning_rate_follows_the_schedule():
         trainer.train_step(joint_batch(step))
     cosine = 0.5 * (1 + math.cos(math.pi / 18))
     assert rates == pytest.approx([0.01 / 3, 0.02 / 3, 0.01, 0.01 * cosine])
+
+
+def test_a_step_is_adamws_with_the_norm_of_the_gradient_limited():
+    """The first one, by hand: a weight shrinks by lr times decay, and moves by lr g / (|g| + eps),
+    Adam's moments being g and its square. The gradient keeps its direction; its norm ends at 5."""
+    loud = ["train.quality_weight=1e4", "train.lr=0.01", "train.warmup_share=0"]
+    trainer, twin = (trainer_of(*loud, "train.weight_decay=0.1") for _ in range(2))
+    total, _ = twin.losses(joint_batch(0))
+    total.backward()
+    norm = torch.cat([p.grad.flatten() for p in twin.model.parameters()]).norm()
+    assert norm > 50
+    trainer.train_step(joint_batch(0))
+    for mine, plain in zip(trainer.model.parameters(), twin.model.parameters()):
+        gradient = plain.grad * GRADIENT_LIMIT / norm
+        torch.testing.assert_close(mine.grad, gradient, rtol=1e-4, atol=1e-6)
+        moved = gradient / (gradient.abs() + 1e-8)
+        expected = plain.detach() * (1 - 0.01 * 0.1) - 0.01 * moved
+        sure = gradient.abs() > 1e-5  # of smaller ones rounding decides the sign
+        torch.testing.assert_close(mine[sure], expected[sure], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("backbone", ["ggcnn", "tutorial_skip"])

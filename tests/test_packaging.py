@@ -44,9 +44,11 @@ def test_what_pip_installs_is_there():
         for pattern in patterns
         for file in (ROOT / package).glob(pattern)
     }
+    command = ["git", "ls-files", *settings["packages"]]
     listed = subprocess.run(
-        ["git", "ls-files", *settings["packages"]], cwd=ROOT, capture_output=True, text=True
+        command, cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split()
+    assert "configs/default.yaml" in listed
     assert {ROOT / name for name in listed if not name.endswith(".py")} <= data
     for file in settings["dynamic"]["dependencies"]["file"]:
         assert (ROOT / file).is_file()

@@ -6,8 +6,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from models.planner_candidates import Candidates
-from models.planner_contacts import exact_contacts, scored_by_contacts
-from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject
+from models.planner_contacts import (
+    _pad_contacts,
+    buried_share,
+    exact_contacts,
+    scored_by_contacts,
+)
+from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject, Workspace
+from utils.height_map import height_map_from_scene
 
 HAND = GripperGeometry()
 HEIGHT = 0.05  # of the prisms
@@ -59,3 +65,59 @@ def test_a_chance_counts_only_where_the_pads_do_not_slip_off(right: int, left_ov
     assert exact_contacts(over_the_edge(), scene, HAND)[0][0] == 0
     found = scored_by_contacts(over_the_edge(), scene, HAND, np.zeros(1), fallback=np.full(1, 0.02))
     assert len(found) == left_over
+
+
+def grade(scene: SceneGeometry, y: float = 0.0, depth: float = 0.03) -> float:
+    """Of one closing along x, this far from the middle of a prism and below its upper edge."""
+    centre, along, across = np.array([[[0, y, HEIGHT - depth]], [[1, 0, 0]], [[0, 1, 0]]], float)
+    return float(_pad_contacts(centre, along, across, np.array([0.04]), scene, HAND)[0][0])
+
+
+def box(friction: float = 1.0) -> SceneGeometry:
+    """4 x 10 x 5 cm; its centre of mass is 2.5 cm high."""
+    return prism(0, 0, friction, thick=0.04)
+
+
+# Lines across a pad lie at 0.08, 0.37, 0.66 and 0.95 of its height.
+ABOVE = abs(0.025 - (HEIGHT - 0.03) - 0.515 * HAND.pad_height)
+
+
+def test_contacts_far_from_the_centre_of_mass_are_worse() -> None:
+    over = np.exp(-((ABOVE / 0.06) ** 2))
+    assert grade(box()) == pytest.approx(over, rel=1e-6)
+    assert grade(box(), y=0.015) == pytest.approx(over * np.exp(-((0.015 / 0.02) ** 2)), rel=1e-6)
+
+
+def test_contacts_of_a_quarter_of_the_pads_are_worse() -> None:
+    """The lowest of four lines meets the box alone: 0.3 + 0.7 x 0.25 / 0.5."""
+    depth = 0.2 * HAND.pad_height
+    above = abs(0.025 - (HEIGHT - depth) - 0.08 * HAND.pad_height)
+    expected = 0.65 * np.exp(-((above / 0.06) ** 2))
+    assert grade(box(), depth=depth) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("lean", "friction"), [(3, 1.0), (5, 1.0), (5, 0.4)])
+def test_contacts_off_the_closing_line_are_worse(lean: float, friction: float) -> None:
+    """Both faces lean by so many degrees; 0.7 of nine tenths of the friction cone is the scale."""
+    cone = 0.9 * np.arctan(friction)
+    straight, leaning = (grade(prism(angle, angle, friction, thick=0.02)) for angle in (0.0, lean))
+    wedge = prism(lean, lean, friction, thick=0.02)
+    higher = abs(wedge.objects[0].centre_of_mass[2] - 0.025)
+    assert higher < 1e-9  # the mean of the corners
+    expected = np.exp(-((np.deg2rad(lean) / (0.7 * cone)) ** 2))
+    assert leaning / straight == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_plate_is_buried_by_as_much_as_a_box_covers() -> None:
+    """3 of its 8 cm, seen from above; what lies beside it is not."""
+
+    def block(low, high) -> SolidObject:
+        corners = np.stack(np.meshgrid(*zip(low, high)), axis=-1).reshape(-1, 3)
+        return SolidObject((ConvexSolid.from_vertices(corners),), corners.mean(axis=0), 0.5)
+
+    plate = block((0.46, -0.02, 0.0), (0.54, 0.02, 0.01))
+    above = block((0.44, -0.04, 0.02), (0.49, 0.04, 0.05))
+    beside = block((0.60, -0.02, 0.0), (0.63, 0.02, 0.05))
+    scene = SceneGeometry((plate, above, beside))
+    share = buried_share(scene, height_map_from_scene(scene, Workspace()))
+    assert share == pytest.approx([0.375, 0.0, 0.0], abs=0.04)  # a cell of 1.5 mm of 40 mm

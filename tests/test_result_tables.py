@@ -21,7 +21,6 @@ from utils.errors import UserError
 from utils.result_records import append_round, read_sample
 from utils.statistics import wilson_interval
 
-
 # Tests that look at names and numbers of the sealed objects, and play nothing.
 SPLIT_NAMED_IN = [
     "tests/test_objects.py",

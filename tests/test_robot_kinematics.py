@@ -20,14 +20,47 @@ from envs.robot_kinematics import (
     geometric_jacobian,
     inverse_kinematics,
     link_poses,
+    must_flip,
     pose_error,
     postures,
     rotation_vector,
+    should_flip,
     tip_twists,
 )
 from utils.transforms import top_down_pose
 
 HOME = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+
+
+def wrist_at(angle: float) -> np.ndarray:
+    """HOME with the last joint at an angle in radians."""
+    return np.append(HOME[:-1], angle)
+
+
+def test_a_gripper_is_flipped_on_its_way_where_its_wrist_meets_a_limit():
+    """0.1 rad before the limit there is no room; flipped, with another elbow, there is."""
+    home = wrist_at(JOINT_UPPER[-1] - 0.1)
+    pose = forward_kinematics(home)
+    found = postures(pose, home)
+    flipped = found[True][-1]
+    assert found[False] == pytest.approx(home, abs=1e-6) and abs(flipped) < JOINT_UPPER[-1] - 0.3
+    assert must_flip(pose, home, wrist_at(flipped - 2.7))
+    assert not must_flip(pose, home, wrist_at(flipped - 2.9))  # more than a law turns that way
+    assert not must_flip(forward_kinematics(HOME), home, HOME)
+    out_of_reach = pose.copy()
+    out_of_reach[0, 3] += 2.0
+    assert not must_flip(out_of_reach, home, HOME)
+
+
+def test_a_gripper_sets_out_flipped_where_that_turns_the_wrist_less():
+    """Where both postures have room the nearer one wins; 0.1 rad before the limit there is none."""
+    roomy = forward_kinematics(wrist_at(0.9))
+    kept, flipped = (posture[-1] for posture in postures(roomy, HOME).values())
+    assert max(abs(kept), abs(flipped)) < JOINT_UPPER[-1] - 0.6 and kept - flipped > 1
+    assert not should_flip(roomy, HOME, wrist_at(kept - 0.1))
+    assert should_flip(roomy, HOME, wrist_at(flipped + 0.1))
+    tight = wrist_at(JOINT_UPPER[-1] - 0.1)
+    assert should_flip(forward_kinematics(tight), tight, tight)
 
 
 joint_positions = st.tuples(*(st.floats(a, b) for a, b in zip(JOINT_LOWER, JOINT_UPPER)))

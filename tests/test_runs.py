@@ -95,6 +95,23 @@ def test_commands_that_are_printed_name_the_interpreter_from_here(tmp_path, monk
     assert shlex.split(this_python()) == [sys.executable]
 
 
+def test_git_state_is_that_of_git(tmp_path):
+    def git(*arguments: str) -> str:
+        names = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        command = ["git", "-C", str(tmp_path), *names, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    git("init")
+    file = tmp_path / "code.py"
+    file.write_text("1\n")
+    git("add", "code.py")
+    git("commit", "-m", "first")
+    (tmp_path / "notes.txt").write_text("git does not track this file\n")
+    assert git_state(tmp_path) == (git("rev-parse", "HEAD"), False)
+    file.write_text("2\n")
+    assert git_state(tmp_path) == (git("rev-parse", "HEAD"), True)
+
+
 def test_git_state_outside_a_repository(tmp_path):
     assert git_state(tmp_path) == (None, None)
     assert set(environment()) >= {"commit", "dirty", "platform", "packages", "cpu_count"}

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binomtest, norm
 
 from utils.statistics import (
     clustered_interval,
@@ -53,6 +53,22 @@ def test_clustered_interval_by_hand():
     z2 = 3.841459
     spread = np.sqrt(z2 * (0.25 / 3 + z2 / 36)) / (1 + z2 / 3)
     assert clustered_interval(rounds) == pytest.approx((0.5 - spread, 0.5 + spread), abs=1e-6)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.99])
+def test_intervals_of_other_confidences(confidence):
+    """The clustered one as above; the bootstrap's of 400 paired outcomes is d +- z se, up to the
+    noise of its resamples."""
+    z = norm.ppf(0.5 + confidence / 2)
+    spread = np.sqrt(z**2 * (0.25 / 3 + z**2 / 36)) / (1 + z**2 / 3)
+    found = clustered_interval([(5, 5), (0, 5), (5, 5), (0, 5)], confidence)
+    assert found == pytest.approx((0.5 - spread, 0.5 + spread), abs=1e-9)
+    a, b = np.random.default_rng(0).random((2, 400)) < [[0.8], [0.6]]
+    gain = a.astype(float) - b
+    half = z * gain.std() / np.sqrt(400)
+    found = paired_difference_interval(a, b, confidence)
+    expected = (gain.mean() - half, gain.mean() + half)
+    assert (found.low, found.high) == pytest.approx(expected, abs=0.08 * half)
 
 
 def test_clustered_interval_is_wilsons_where_rounds_do_not_matter():
