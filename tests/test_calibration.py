@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from envs.next_grasp import least_quality
 from envs.rounds import run_round
 from envs.simulators import make_cell
 from models.graspnet_io import SHIPPED
+from models.planner_candidates import with_chances
 from models.planners import (
     PLANNERS,
     calibration_of,
@@ -34,6 +36,7 @@ from utils.calibration import (
     calibration_error,
     draw_reliability,
     error_by_chance,
+    load_calibrations,
     reliability,
     risk_coverage,
     unlikely_ones,
@@ -459,3 +462,30 @@ def test_the_diagram_has_a_line_for_each_name() -> None:
         "a: error 0.550", "b: error 0.450",
     ]  # fmt: skip
     assert len(risks.lines) == 2
+
+
+def test_all_five_numbers_of_a_calibration_are_read(tmp_path):
+    file = tmp_path / "fits.json"
+    fits = {"a": {"slope": 2.0, "offset": 0.3, "penalty": 40.0, "doubt": 0.7, "upper": 0.5}}
+    fits["old"] = {"slope": 1.5, "offset": -0.5}
+    file.write_text(json.dumps({"planners": fits}))
+    found = load_calibrations(file)
+    assert astuple(found["a"]) == (2.0, 0.3, 40.0, 0.7, 0.5)
+    assert astuple(found["old"]) == (1.5, -0.5, 0.0, 0.0, 0.0)
+    logit = 2 * np.log(0.8) - 0.5 * np.log(1 - 0.8) + 0.3  # clean, and after no failure
+    assert found["a"](0.8) == pytest.approx(1 / (1 + np.exp(-logit)), abs=1e-6)
+
+
+def test_a_chance_of_1_belongs_to_the_last_bin():
+    """Two failures at 1 and 0.8 in bins of their own: (1 + 0.8) / 2; a bin of 1 and 0.95 has one
+    success, and its mean chance is 0.475 too high."""
+    assert calibration_error([1.0, 0.8], [False, False]) == pytest.approx(0.9)
+    assert calibration_error([1.0, 0.95], [True, False]) == pytest.approx(0.475)
+
+
+def test_chances_of_grasps_know_how_rough_the_frame_was():
+    grasp = Grasp(np.zeros(3), 0.0, 0.04, 0.8)
+    for roughness in (0.0, 0.002):
+        (found,) = with_chances([grasp], Calibration(1.0, 0.0, penalty=500.0), roughness)
+        odds = 0.8 * np.exp(-500 * roughness)  # log odds are log score minus penalty
+        assert found.quality == pytest.approx(odds / (1 + odds), abs=1e-6)

@@ -41,6 +41,19 @@ def test_a_rollout_keeps_final_observations():
     assert going_on.episodes[0].total == 6
 
 
+def test_each_environment_explores_with_noise_of_its_own():
+    """The first action of each: its mean and its own column of a generator's draws."""
+    ppo = ppo_of("rl.normalise_observations=false")
+    collector = RolloutCollector(counting(), COUNTED, 5, Stopwatch())
+    collector.restart([0, 1])
+    rollout = collector.collect(ppo.network, torch.Generator().manual_seed(3))
+    noise = torch.randn((5, 2, 1), generator=torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        mean = ppo.network(None, rollout.observations.state.flatten(0, 1)).mean.reshape(5, 2, 1)
+    expected = mean + ppo.network.log_std.detach().exp() * noise
+    torch.testing.assert_close(rollout.latents, expected, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("bad", ["observation", "reward"])
 def test_numbers_that_are_not_finite_are_refused(bad):
     class Broken(Count):

@@ -181,3 +181,14 @@ def test_rounds_differ_in_outcomes_not_in_wall_clock_times():
     assert differing_rounds(ROUNDS[1:2], [played(9.0, 6)]) == []
     assert differing_rounds(ROUNDS[1:2], [played(0.06, 6.1)]) == ROUNDS[1:2]
     assert differing_rounds(ROUNDS, ROUNDS[:3]) == ROUNDS[3:]
+
+
+def test_a_round_keeps_all_five_numbers_of_its_calibration(tmp_path):
+    """Of older files, which have fewer, the others are 0."""
+    file = tmp_path / "rounds.jsonl"
+    whole = replace(ROUNDS[0], calibration=(1.57, -0.53, 600.0, 0.4, 1.07))
+    append_round(file, whole)
+    (text,) = file.read_text().splitlines()
+    file.write_text(text + "\n" + text.replace(", 0.4, 1.07", "") + "\n")
+    read = [record.calibration for record in read_rounds(file, "none")]
+    assert read == [(1.57, -0.53, 600.0, 0.4, 1.07), (1.57, -0.53, 600.0, 0.0, 0.0)]

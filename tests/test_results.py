@@ -11,6 +11,7 @@ from utils.errors import UserError
 from utils.result_formats import firm_in_words
 from utils.result_records import RoundRecord, append_round, policy_name
 from utils.results import compare, compare_runs, stop_reasons, summarise
+from utils.statistics import paired_difference_interval
 
 
 def test_summary_by_hand():
@@ -227,3 +228,46 @@ def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):
         compare_runs(before, a_run(tmp_path / "later", later))
     with pytest.raises(UserError, match="not the folder of an evaluation"):
         compare_runs(before, tmp_path)
+
+
+def test_rounds_of_several_object_sets_with_the_same_seeds_count_apart():
+    """Together they are as many rounds as in both sets; `seed` is that of the bootstrap."""
+    rng = np.random.default_rng(0)
+    rounds, counts = [], {"random": [], "heuristic": []}
+    for objects in ("box", "toys"):
+        for policy in ("heuristic", "random"):
+            for number in range(12):
+                wins, tries = rng.integers(0, 4), 5
+                made = [attempt("success")] * wins + [attempt("missed")] * (tries - wins)
+                record = a_round(policy, number, 5, wins, made)
+                rounds.append(replace(record, objects=objects))
+                counts[policy].append((wins, tries))
+    together = compare(rounds, seed=7)[-1]
+    assert (together.scenario, together.objects) == ("pile", "box + toys")
+    expected = paired_difference_interval(*counts.values(), seed=7)
+    assert together.success == expected and expected.rounds == 24
+    assert expected != paired_difference_interval(*counts.values(), seed=0)
+
+
+def test_picks_to_a_target_are_a_mean():
+    rounds = [
+        replace(
+            a_round(
+                "heuristic", seed, 9, picks, [attempt("success")] * picks, "target", "retrieve"
+            ),
+            target_in_hand=True,
+        )
+        for seed, picks in enumerate((1, 2, 6))
+    ]
+    (row,) = summarise(rounds, seed=0)
+    assert row.picks_to_target == 3.0
+
+
+def test_planning_takes_time_without_a_success_too():
+    (row,) = summarise([a_round("x", 0, 5, 0, [attempt("missed", plan=0.01)])], seed=0)
+    assert row.plan_ms_median == pytest.approx(10) and row.picks_per_hour is None
+
+
+def test_a_success_needs_no_reason():
+    seen = [replace(attempt("success"), detail="a second look showed 20 cm3")]
+    assert stop_reasons([a_round("x", 0, 5, 1, seen)]) == []

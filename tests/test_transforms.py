@@ -1,5 +1,7 @@
 """Frames and grasps: closed forms and round trips."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.helpers.servo_cases import directions, twists
 from utils.errors import UserError
+from utils.geometry import SceneGeometry
 from utils.transforms import (
     Grasp,
     ImageGrasp,
@@ -19,6 +22,7 @@ from utils.transforms import (
     image_to_grasp,
     inverse_pose,
     look_at,
+    planar_part,
     pose_exp,
     pose_matrix,
     position_quaternion,
@@ -256,3 +260,30 @@ def test_a_frame_takes_lists_for_its_matrices() -> None:
 def test_a_width_in_millimetres_is_refused() -> None:
     with pytest.raises(ValueError, match="Grasp.width is in metres, 0 to 1, got 80"):
         Grasp(np.zeros(3), 0.0, 80.0, 1.0)
+
+
+def test_a_grasp_comes_back_from_a_camera_whose_pixels_are_not_square():
+    """Beside the middle of an image with other focal lengths and another middle along u and v."""
+    K = np.array([[400.0, 0, 120], [0, 300, 90], [0, 0, 1]])
+    T_WC = look_at((0.3, -0.2, 0.7), (0.5, 0.0, 0.0))
+    grasp = Grasp(np.array([0.45, 0.06, 0.02]), 0.6, 0.05, 0.9)
+    back = image_to_grasp(grasp_to_image(grasp, K, T_WC), K, T_WC)
+    np.testing.assert_allclose(back.position, grasp.position, atol=1e-12)
+    assert back.angle == pytest.approx(0.6, abs=1e-9)
+
+
+def test_the_turn_of_a_pose_that_leans_is_the_nearest_one():
+    """Leaning by a about x after a turn by t about z: the entries' sum and difference give t."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zx", (0.5, 0.1)).as_matrix()  # first z, then x, of the parent
+    assert planar_part(T) == pytest.approx((0.0, 0.0, 0.5), abs=1e-12)
+
+
+def test_a_blinded_frame_hides_the_truth_of_its_second_one():
+    rgb, depth = np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), np.float32)
+    K = np.array([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]])
+    truth = SceneGeometry(())
+    second = RGBDFrame(rgb, depth, K, np.eye(4), np.zeros((4, 4), np.int32), truth)
+    seen = replace(second, second=second).without_truth()
+    for frame in (seen, seen.second):
+        assert frame.truth is None and frame.segmentation is None
