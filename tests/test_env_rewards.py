@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from envs.env_rewards import (
     GoalView,
     GraspGoals,
     Outline,
+    OutlineView,
     RewardState,
     make_reward,
     progress,
@@ -85,6 +87,46 @@ def test_goals_go_with_their_object():
     after = goals.seen_from(moved, motion @ hand([0.52, 0.07, 0.2], 0.4))
     np.testing.assert_allclose(after.vector()[:9], before.vector()[:9], atol=1e-9)
     np.testing.assert_allclose(after.vector()[9:], before.vector()[9:] + 0.01, atol=1e-9)
+
+
+def test_goals_lie_on_the_object_however_it_is_turned():
+    """On the long axis of a brick of 4 x 10 x 5 cm; and where the brick goes, they go."""
+    goals, moved = brick(), pose((0.3, -0.2, 0.4), yaw=1.2)
+    assert len(goals) > 1
+    along = []
+    for index in range(len(goals)):
+        (x, y, _), angle, *_ = goals.goal(index, pose())
+        in_brick = Rotation.from_euler("z", -YAW).apply([x - PLACE[0], y - PLACE[1], 0])
+        assert abs(in_brick[0]) < 0.003 and abs(in_brick[1]) < 0.05
+        assert math.sin(angle - YAW) == pytest.approx(0, abs=0.05)
+        along.append(in_brick[1])
+        there = goals.goal(index, moved)
+        back = (np.array(there.position) - (0.3, -0.2, 0.4)) @ moved[:3, :3]
+        here = (np.array(goals.goal(index, pose()).position) - PLACE) @ pose()[:3, :3]
+        np.testing.assert_allclose(back, here, atol=1e-12)
+    assert np.ptp(along) > 0.02
+
+
+def test_what_a_goal_costs_by_hand():
+    """0.3 m for a quality of 0 instead of 1, and 0.3 for each metre that the hand has to close."""
+    goals = brick()
+    expected = 0.3 * (1 - goals.quality) + 0.3 * (0.08 - goals._wide)
+    np.testing.assert_allclose(goals._price, expected)
+
+
+def test_a_goal_off_the_middle_leaves_less_room(monkeypatch):
+    """The hand, 4 cm wide on either side of a pixel, moves 5 mm to the middle of what it grips,
+    2 cm on either side: it may be open from 2 (2 + 0.5) to 2 (4 - 0.5) cm."""
+
+    def judged(surface, *_):
+        columns = {"quality": 1.0, "middle": 0.005, "reach": 0.02, "widest": 0.04}
+        return SimpleNamespace(
+            **{name: np.full(len(surface), one) for name, one in columns.items()}
+        )
+
+    monkeypatch.setattr("envs.env_rewards.grasp_quality", judged)
+    goals = brick()
+    np.testing.assert_allclose([goals._narrow, goals._wide], [[0.05], [0.07]] * np.ones(len(goals)))
 
 
 def test_leaning():
@@ -162,6 +204,20 @@ def test_the_way_to_a_grasp_by_hand():
     assert way(opening=0.0) == pytest.approx(0.07)
     assert way(x=0.1) == pytest.approx(0.1 + 0.05)
     assert way(x=0.1, z=0.05) == pytest.approx(0.1)
+
+
+def test_when_the_way_down_is_blocked_by_hand(monkeypatch):
+    """From 1.5 cm off the middle along the pads, 8 mm along the closing line, over another 1 cm.
+    What reaches 6 cm up between fingers of 3.5 cm keeps them 2.5 cm higher."""
+    monkeypatch.setattr("envs.env_rewards.way_to_grasp", lambda *place, **more: more)
+
+    def way(x: float, y: float, top: float = 0.03) -> dict:
+        return OutlineView(np.array([x, y, 0.0]), np.full(8, 0.06), top, 0.0).way(0.08)
+
+    blocked = [way(*place)["blocked"] for place in ((0.012, 0), (0, 0.012), (0.019, 0), (0, 0.03))]
+    assert blocked == pytest.approx([0.0, 0.4, 0.4, 1.0])
+    assert way(0, 0, top=0.06)["down"] == pytest.approx(0.025)
+    assert way(0, 0, top=0.03)["down"] == 0.0 and way(0, 0, top=0.03)["over"] == 0.05
 
 
 def test_an_outline_by_hand():

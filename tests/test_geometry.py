@@ -11,6 +11,7 @@ from utils.errors import UserError
 from utils.geometry import (
     ConvexSolid,
     GripperGeometry,
+    SceneGeometry,
     Workspace,
     intersect_lines,
 )
@@ -63,6 +64,23 @@ def test_a_moved_solid_is_hit_where_the_moved_line_was() -> None:
     )
     assert moved.enter == pytest.approx(still.enter) and moved.leave == pytest.approx(still.leave)
     np.testing.assert_allclose(moved.enter_normal, still.enter_normal @ T[:3, :3].T, atol=1e-9)
+
+
+def test_walls_move_with_their_scene_and_hang_where_they_leave_room_below() -> None:
+    """Over a table 10 cm high a board from 26 cm on hangs, 16 cm over it; a block from 12 cm on,
+    and a wall from the table on, do not: less than 5 cm of room is none."""
+
+    def block(low: float, high: float) -> ConvexSolid:
+        corners = CORNERS * (0.1, 0.1, (high - low) / 2) + (0, 0, (high + low) / 2)
+        return ConvexSolid.from_vertices(corners)
+
+    board, low, wall = (block(*ends) for ends in ((0.26, 0.28), (0.12, 0.30), (0.10, 0.40)))
+    scene = SceneGeometry((), 0.10, (board, low, wall))
+    assert scene.uncovered().walls == (low, wall)
+    T = np.eye(4)
+    T[:3, 3] = 0.0, 0.2, 0.1
+    moved = scene.transformed(T).walls[0]
+    np.testing.assert_allclose(moved.vertices, board.vertices + T[:3, 3])
 
 
 def test_the_configs_default_hand_is_the_pandas_own() -> None:

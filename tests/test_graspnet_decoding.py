@@ -202,3 +202,10 @@ def test_predict_grasp_keeps_the_tutorials_dict_and_adds_metric_grasps() -> None
     assert project(grasp.position, K, T_WC)[0] == pytest.approx((40, 16), abs=0.5)
     with pytest.raises(ValueError, match="batch of 2"):
         model.predict_grasp(torch.zeros(2, 4, 64, 80))
+
+
+def test_between_two_surfaces_the_nearer_one_counts() -> None:
+    """Of two known depths around a pixel the median is the smaller one."""
+    depth = np.zeros((5, 5), np.float32)
+    depth[1, 1], depth[3, 3] = 0.6, 0.5
+    assert surface_depth(depth, np.array([[2.0, 2.0]])) == pytest.approx([0.5])

@@ -22,6 +22,7 @@ from utils.height_map import (
     local_maxima,
     tilted_height_map,
     tilted_view,
+    without_rims,
 )
 from utils.seen_heights import HOLE_RISE, without_holes
 from utils.transforms import inverse_pose, project, transform_points
@@ -80,6 +81,28 @@ def test_height_maps_of_a_known_box() -> None:
         np.testing.assert_allclose(heights.height[outside], 0.0, atol=1e-4)
         assert set(heights.label[inside]) == {0} and set(heights.label[outside]) == {-1}
         np.testing.assert_allclose(heights.centres, [[0.47, 0.03, 0.025]], atol=0.0015)
+
+
+@pytest.mark.parametrize("tops", [(0.10, 0.04), (0.04, 0.10)])
+def test_the_highest_of_several_objects_counts_in_whatever_order(tops) -> None:
+    """A tower within the outline of a flat box: its top is seen, in its own label."""
+    boxes = [((0.03 if top > 0.05 else 0.08,) * 2 + (top,), 0.0, (0.5, 0.0)) for top in tops]
+    heights = height_map_from_scene(boxes_frame(boxes).truth, Workspace())
+    tower, beside = (heights.index(np.array(place)) for place in ((0.5, 0.0), (0.53, 0.0)))
+    assert heights.height[tower] == pytest.approx(0.10) and heights.label[tower] == np.argmax(tops)
+    assert heights.height[beside] == pytest.approx(0.04)
+
+
+def test_pieces_keep_numbers_without_gaps_where_a_rim_is_dropped() -> None:
+    """A strip along a block's edge, 5 mm over it, is part of the block; a box far away is not."""
+    cell, fixed = 0.002, np.full((60, 60), -np.inf)
+    fixed[20:40, 20:40] = 0.05
+    label, height = np.full((60, 60), -1), np.where(fixed > 0, fixed, 0.0)
+    label[20:40, 39], height[20:40, 39] = 0, 0.055
+    label[2:8, 50:56], height[2:8, 50:56] = 1, 0.04
+    left = without_rims(label, height, fixed, cell)
+    assert (left[20:40, 39] == WALL_LABEL).all() and (left[2:8, 50:56] == 0).all()
+    assert sorted(np.unique(left)) == [WALL_LABEL, -1, 0]
 
 
 def test_walls_around_the_workspace_are_obstacles_and_no_objects() -> None:

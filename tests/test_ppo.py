@@ -254,6 +254,16 @@ def test_estimates_learn_from_new_and_from_remembered_steps():
     assert old.max() < 64 and len(old.unique()) > 50
 
 
+def test_the_loss_of_estimates_by_hand():
+    """Huber's: e^2 / (2 beta) up to beta = 0.1, from there on e - beta / 2."""
+    ppo = estimating("rl.normalise_observations=false")
+    state, truth = torch.zeros(8, 1), torch.ones(8, 1)
+    for error, loss in ((0.05, 0.0125), (0.5, 0.45)):
+        ppo.network.estimate = lambda image, state, error=error: truth + error
+        found = ppo.network.estimate_loss(None, state, truth).item()
+        assert found == pytest.approx(loss, rel=1e-5)
+
+
 def test_the_learning_rate_of_estimates_is_annealed():
     ppo = estimating("rl.estimate_lr=0.01", "rl.estimate_memory=0")
     rollout = rollout_of(ppo)

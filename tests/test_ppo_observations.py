@@ -102,3 +102,12 @@ def test_rewards_are_scaled_as_by_stable_baselines3():
     scaled = scaler.scale(rewards[30:], ended[30:])  # goes on with the episodes under way
     np.testing.assert_allclose(scaler.moments.variance, theirs.var)
     np.testing.assert_allclose(scaled, rewards[30:] / np.sqrt(theirs.var), rtol=1e-6)
+
+
+def test_rewards_end_at_ten_deviations():
+    """As VecNormalize of Stable-Baselines3 clips them: a spike in 1,000 is some 30 deviations."""
+    rewards = np.ones((1001, 1))
+    rewards[-1] = 1e6
+    scaled = RewardScaler(0.0).scale(rewards, np.ones_like(rewards, bool))
+    assert scaled.max() == 10.0 and RewardScaler(0.0).scale(-rewards, rewards > 0).min() == -10.0
+    assert scaled[0, 0] == pytest.approx(1 / rewards.std(), rel=1e-3)

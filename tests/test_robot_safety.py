@@ -20,7 +20,7 @@ from envs.robot_kinematics import (
     geometric_jacobian,
     tip_position,
 )
-from envs.robot_safety import ArmGate, ArmStoppedError, SafetyGate
+from envs.robot_safety import ArmGate, ArmStoppedError, SafetyGate, reaching_down
 from envs.simulators import make_cell
 from utils.config import load_config
 from utils.errors import UserError
@@ -378,3 +378,26 @@ def test_settings_that_make_no_sense_are_refused():
     for key in "watchdog", "linear_speed", "angular_speed", "contact_stop":
         with pytest.raises(UserError, match=f"safety.{key}"):
             load_config(None, [f"safety.{key}=0"])
+
+
+def test_a_velocity_beyond_its_limit_is_slowed_down_where_the_reference_stands_still():
+    one = arm_gate()
+    _, velocity = one.passed(HOME, 2 * np.array(one.speeds))
+    np.testing.assert_allclose(velocity, one.speeds)
+
+
+def test_a_box_that_reaches_lower_than_the_floor_stays_as_it_is():
+    safety = settings_of("safety.box_lower=[0.15,-0.5,-0.1]").safety
+    assert reaching_down(safety, 0.0).box_lower == (0.15, -0.5, -0.1)
+    assert reaching_down(safety, -0.2).box_lower == (0.15, -0.5, -0.2)
+
+
+def test_an_arm_that_has_come_back_into_its_box_may_not_leave_it_again():
+    """E is at a height of 0.485 m at home, over a box that ends at 0.48."""
+    one = arm_gate("safety.box_upper=[0.80,0.55,0.48]")
+    lower = HOME + np.linalg.pinv(geometric_jacobian(HOME)[:3]) @ (0, 0, -0.02)
+    assert tip_position(lower.tolist())[2] < 0.475
+    one.admit(HOME)  # outside, but no farther
+    one.admit(lower)
+    with pytest.raises(ArmStoppedError):
+        one.admit(HOME)

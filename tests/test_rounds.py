@@ -112,6 +112,29 @@ def test_a_round_with_a_target_ends_when_it_is_in_the_bin(cell, box_set):
     assert (record.ended, record.target_in_hand) == ("no_plan", False)
 
 
+def test_a_target_that_falls_off_while_another_thing_is_picked_is_lost(
+    cell, box_set, monkeypatch
+) -> None:
+    """So is one of two things without a target, of which the other was picked."""
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    places = np.array([(0.5, 0.06, 0.03), (0.5, -0.06, 0.03)])
+    placements = tuple(Placement(box_set[0], place, level) for place in places)
+
+    def execute(cell, grasp, approach, **how):
+        cell.remaining.clear()  # the first in the bin, the second beside the table
+        return GraspOutcome("success", 5.0, object_index=0)
+
+    monkeypatch.setattr("envs.rounds.execute_grasp", execute)
+    settings = {"policy": "x", "objects": "box", "max_failures": 9}
+    plan = Targeted([cube_grasp(offset=(0, 0.06, 0))])
+    record = run_round(cell, Scene("retrieve", 0, placements, target=1), plan, **settings)
+    assert (record.ended, record.target_in_hand) == ("lost", False)
+    record = run_round(cell, Scene("retrieve", 0, placements, target=0), plan, **settings)
+    assert (record.ended, record.target_in_hand) == ("target", True)
+    record = run_round(cell, Scene("pile", 0, placements), plan, **settings)
+    assert (record.ended, record.objects_cleared, record.target_in_hand) == ("lost", 1, None)
+
+
 def test_after_a_failure_another_object_comes_first() -> None:
     near, far = cube_grasp(offset=(0.03, 0, 0)), cube_grasp(offset=(0.06, 0, 0))
     poor = replace(cube_grasp(offset=(0.1, 0, 0)), quality=0.4)

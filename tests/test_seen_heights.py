@@ -153,6 +153,18 @@ def test_what_a_frame_sees_through_and_what_it_hides() -> None:
     assert not sees_through(blind, points).any() and hides(blind, points).all()
 
 
+def test_a_point_is_seen_through_at_its_own_pixel() -> None:
+    """A step from 0.5 to 0.8 m between pixels 9 and 10; the surface's last 4 mm may be noise."""
+    depth = np.full((20, 20), 0.8, np.float32)
+    depth[:, :10] = 0.5
+    K = np.array([[100.0, 0, 10], [0, 100, 10], [0, 0, 1]])
+    frame = RGBDFrame(np.zeros((20, 20, 3), np.uint8), depth, K, np.eye(4))
+    pixels = np.array([(9, 5), (10, 5), (5, 10), (15, 10), (15, 10)])
+    z = np.array([0.7, 0.7, 0.49, 0.798, 0.79])
+    points = np.column_stack([(pixels - 10) / 100 * z[:, None], z])
+    assert sees_through(frame, points).tolist() == [False, True, True, False, True]
+
+
 def test_only_the_first_frame_tells_a_privileged_planner_the_truth() -> None:
     frame = seen_from(0, 180).without_truth()
     assert frame.truth is None and frame.second.truth is None
