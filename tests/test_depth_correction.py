@@ -139,6 +139,14 @@ def test_roughness_is_the_standard_deviation() -> None:
     assert table_roughness(replace(frame, depth=depth), 0.0) == pytest.approx(0.004, rel=0.03)
 
 
+def test_roughness_is_that_of_the_corrected_depth() -> None:
+    """2 mm of a camera that measures 5 % too near are 2 / 0.95 mm once it is corrected."""
+    frame, rng = scene(), np.random.default_rng(1)
+    noise = rng.normal(0, 0.002, frame.depth.shape)
+    near = replace(frame, depth=(0.95 * frame.depth + noise).astype(np.float32))
+    assert table_roughness(near, 0.0) == pytest.approx(0.002 / 0.95, rel=0.02)
+
+
 def test_a_good_camera_s_frame_stays_as_it_is() -> None:
     frame, rng = scene(0.4), np.random.default_rng(0)
     same = corrected(frame, 0.0)

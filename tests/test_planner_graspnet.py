@@ -243,6 +243,23 @@ def test_boxes_that_touch_are_told_apart() -> None:
     assert found.height is heights.height and found.ceiling is heights.ceiling
 
 
+def test_centres_rise_with_the_table() -> None:
+    """The same image 10 cm higher in the world."""
+    frame = boxes_frame(TOUCHING)
+    T_WC = frame.T_WC.copy()
+    T_WC[2, 3] += 0.1
+    centres = [
+        labelled_by_centres(
+            height_map_from_frame(seen, table), seen, SAME, true_offset(frame)
+        ).centres
+        for seen, table in (
+            (frame, Workspace()),
+            (replace(frame, T_WC=T_WC), Workspace(table_height=0.1)),
+        )
+    ]
+    np.testing.assert_allclose(centres[1] - centres[0], [(0, 0, 0.1)] * len(centres[0]), atol=1e-6)
+
+
 def test_votes_at_another_resolution_lead_to_the_same_centres() -> None:
     frame = boxes_frame(TOUCHING)
     heights = height_map_from_frame(frame, Workspace())
