@@ -186,6 +186,11 @@ def test_a_run_goes_on_with_a_remark_where_what_it_names_has_changed(tmp_path, m
     config = load_config(None, [policies])
     digest = "a7937b64b8caa58f03721bb6bacf5c78cb235febe0e70b1b84cd99541461a08e"  # of sha256sum
     assert named_files(config)["ppo:weights.pt"] == digest
+    Path("package").mkdir()
+    Path("package", "__init__.py").write_text("raise RuntimeError('not to be run')\n")
+    Path("package", "inner.py").write_text("first")
+    inner = load_config(None, ["evaluate.policies=package.inner:plan,package.none:plan"])
+    assert named_files(inner) == {"package.inner:plan": digest}
     run = new_run_folder("evaluate", None, config, tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

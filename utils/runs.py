@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib.util
 import json
 import math
 import os
@@ -26,6 +25,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
@@ -302,7 +302,7 @@ def begun_with(run: Path) -> dict[str, Any]:
     """The environment.json of a run folder; empty where that is not known."""
     try:
         return dict(json.loads((run / "environment.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError):
         return {}
 
 
@@ -330,7 +330,7 @@ def named_files(config: Config) -> dict[str, str]:
     there. Folders are left out: `object_sets` and data may be large."""
     found = {}
     for text in _texts(config.model_dump(mode="json")):
-        with suppress(OSError, ValueError, ImportError):  # no path of this system, or no module
+        with suppress(OSError, ValueError):  # no path of this system
             file = _file_named(text)
             if file is not None:
                 found[text] = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -351,12 +351,21 @@ def _texts(values: Any) -> Iterator[str]:
 
 def _file_named(text: str) -> Path | None:
     """The file that FILE, KIND:FILE or MODULE:NAME names, if there is one."""
-    if is_import_path(text):
-        spec = importlib.util.find_spec(text.partition(":")[0])
-        if spec is not None and spec.has_location:
-            return Path(str(spec.origin))
+    if is_import_path(text) and (module := _file_of_module(text.partition(":")[0])) is not None:
+        return module
     files = (Path(name) for name in (text, text.partition(":")[2]))
     return next((file for file in files if file.is_file()), None)
+
+
+def _file_of_module(name: str) -> Path | None:
+    """The file that a dotted module would be loaded from; no code of it or its packages runs."""
+    folders, spec = None, None
+    for depth in range(1, name.count(".") + 2):
+        spec = PathFinder.find_spec(".".join(name.split(".")[:depth]), folders)
+        if spec is None:
+            return None
+        folders = spec.submodule_search_locations
+    return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
 
 
 def save_results(path: Path, content: Mapping[str, Any]) -> None:
@@ -422,8 +431,8 @@ def git_state(folder: Path = REPOSITORY) -> GitState:
 
 
 def _changes() -> str | None:
-    """A digest of the repository's uncommitted changes."""
-    changes = _git(REPOSITORY, "diff", "HEAD")
+    """A digest of the repository's uncommitted changes, but for those of pages and tables."""
+    changes = _git(REPOSITORY, "diff", "HEAD", "--", ".", ":(exclude)docs", ":(exclude)*.md")
     return None if changes is None else hashlib.sha256(changes.encode()).hexdigest()
 
 
