@@ -20,6 +20,10 @@ from envs.studio import write_film
 from utils.config import with_settings
 from utils.runs import new_run_folder, parse_args
 
+# Of the way down that is left, in one action: the arm still moves by what it was told before. With
+# all of it the hand would go a centimetre too far and press its palm on the cube.
+SHARE_DOWN = 0.5
+
 PHASES = {
     "approach": "the hand moves over the cube",
     "descend": "the hand goes down around it",
@@ -84,6 +88,8 @@ def scripted_pick(env: RobotGraspingEnv, info: dict[str, Any]) -> tuple[str, np.
     closing = info["grasped"] or opening < 0.07 or (over_it and abs(offset[2]) < 0.01)
     if closing:
         offset[:] = 0.0, 0.0, 0.05 if info["grasped"] else 0.0
+    elif over_it:
+        offset[2] *= SHARE_DOWN
     move = np.clip(offset / env.settings.position_step, -1, 1)
     turn = 0.0 if closing else np.clip(_turn_to_sides(env) / env.settings.rotation_step, -1, 1)
     action = np.array([*move, turn, -1.0 if closing else 1.0], dtype=np.float32)
