@@ -12,7 +12,7 @@ from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
-from tests.helpers.simulators import INSTALLED
+from tests.helpers.simulators import INSTALLED, needs_pybullet
 from utils.transforms import Grasp
 
 G = 9.81
@@ -85,6 +85,7 @@ def test_a_bar_that_turns_in_the_hand_is_reported(config, box_set):
     assert centred.motion.slid < 0.005
 
 
+@needs_pybullet  # whose random_urdfs these are
 def test_contacts_turn_with_the_hand(cell, config):
     """A mesh, gripped and turned by 120 degrees in a second: the fingers press along their closing
     line as before. (Bullet's own contacts keep their direction in the world.)"""
