@@ -64,7 +64,7 @@ def test_equals_the_loops_and_is_much_faster():
     one_step = 0.81**2 / FB / 8
     assert abs(measured - expected)[~same].max(initial=0) < one_step
     assert 0.01 < (expected == 0).mean() < 0.5  # there was something to get wrong
-    assert min(slow) > min(fast)  # by some 100 on an idle machine
+    assert min(slow) / min(fast) > 15
 
 
 @pytest.mark.parametrize("image_focal", [200.0, 900.0])
