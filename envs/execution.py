@@ -48,9 +48,11 @@ from utils.transforms import Grasp
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
 _CLOSE_SECONDS = 0.4  # longest wait for the fingers to close, beside the time that their way takes
 _LEAST_FRICTION = 0.4  # that a grip counts on
-# Times robot.grip_force, with which a hand lifts after an attempt that lost what it had gripped:
-# most such things are bowls, of whose friction cone the leaning wall takes the larger part.
+# Times robot.grip_force, with which a hand lifts what gives way in it, and after an attempt that
+# lost what it had gripped: most such things are bowls, of whose friction cone the leaning wall
+# takes the larger part.
 FIRM = 4.0
+_GIVES = 0.005  # m by which fingers close on what gives way between them; things settle by less
 _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs beside its middle
 # Times the closing force, along the closing line, that the arm feels when one finger presses alone
 # (it feels 2, and of a grip of both a few tenths); steps in which it feels; m and number of shifts.
@@ -89,17 +91,25 @@ def holding_force(pull: float) -> float:
 
 
 class WeighingGrip:
-    """Presses as hard as the weight needs that the arm feels, and never less than `least`, N, or
-    robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one."""
+    """Presses as hard as the weight needs that the arm feels, and never less than
+    robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one.
 
-    def __init__(self, robot: Robot, least: float = 0.0):
-        self._robot, self._force = robot, robot.grip_force
+    firmly: press with `FIRM` times that force at least, as it does from the moment in which the
+    fingers have closed by more than `_GIVES` since the grip was made.
+    """
+
+    def __init__(self, robot: Robot, firmly: bool = False):
+        self._robot, self._force, self._gripped = robot, robot.grip_force, robot.opening
+        self._firm = FIRM * robot.grip_force
         self._felt: list[float] = []  # N, since the last look
-        self._press_with(least)
+        if firmly:
+            self._press_with(self._firm)
 
     def feel(self) -> None:
         """Ask once after every physics step."""
         self._felt.append(self._robot.external_force())
+        if self._gripped - self._robot.opening > _GIVES:
+            self._press_with(self._firm)
 
     def press(self) -> None:
         """Press as hard as what was felt since the last time needs, or harder."""
@@ -227,7 +237,7 @@ def execute_grasp(
         closed = _grip(cell, grasp, approach)
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
-        grip = WeighingGrip(cell.robot, FIRM * cell.robot.grip_force if firmly else 0.0)
+        grip = WeighingGrip(cell.robot, firmly)
         _carry_to_bin(cell, held, closed, max(grasp.position[2], closed[2, 3]), motion, grip)
     except UnreachableError:
         reason = "ik"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
-from envs.execution import execute_grasp, reaches
+from envs.execution import WeighingGrip, execute_grasp, reaches
 from envs.object_bodies import native_object
 from envs.object_primitives import NativeShape
 from envs.robot_kinematics import forward_kinematics
@@ -159,3 +159,47 @@ def test_a_frictionless_object_slips(cell, box_set):
             physicsClientId=cell.client,
         )  # fmt: skip
     assert execute_grasp(cell, cube_grasp()).reason == "slipped"
+
+
+class _FeltRobot:
+    """Fingers that close as a test says; what they were told is noted, newtons a finger."""
+
+    grip_force, opening = 10.0, 0.050
+
+    def __init__(self, pull: float):
+        self._pull, self.told = pull, [self.grip_force]
+
+    def external_force(self) -> float:
+        return self._pull
+
+    def command_gripper(self, width: float, force: float) -> None:
+        assert width == 0.0
+        self.told.append(force)
+
+
+@pytest.mark.parametrize(
+    ("closed_by", "firmly", "force"),
+    [(0.0, False, 10.0), (0.0049, False, 10.0), (0.0051, False, 40.0), (0.0, True, 40.0)],
+)
+def test_what_gives_way_between_the_fingers_is_gripped_firmly(closed_by, firmly, force):
+    robot = _FeltRobot(pull=1.0)  # 3 x 1 N / (2 x 0.4) = 3.75 N a finger would do
+    grip = WeighingGrip(robot, firmly)
+    robot.opening -= closed_by
+    grip.feel()
+    grip.press()
+    assert robot.told[-1] == force
+
+
+def test_a_grip_that_gave_way_stays_as_hard_as_the_weight_needs():
+    robot = _FeltRobot(pull=14.4)
+    grip = WeighingGrip(robot)
+    grip.feel()
+    grip.press()
+    assert robot.told[-1] == pytest.approx(54.0)  # 3 x 14.4 N / (2 x 0.4)
+    robot.opening -= 0.01
+    grip.feel()
+    assert robot.told[-1] == pytest.approx(54.0)  # no softer
+    robot.opening += 0.01  # turned back
+    grip.feel()
+    grip.press()
+    assert robot.told[-1] == pytest.approx(54.0)
