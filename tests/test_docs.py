@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.result_parts import PARTS
 from benchmarks.result_tables import PAGES, with_tables
-from benchmarks.results import FIGURES, PARTS
+from benchmarks.results import FIGURES
 from utils.config import load_config
 
 ROOT = Path(__file__).resolve().parent.parent

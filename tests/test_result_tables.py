@@ -12,8 +12,9 @@ import pytest
 
 from benchmarks import results
 from benchmarks.looks import add_look
+from benchmarks.result_parts import PARTS, REPOSITORY, SEALED, SEED, SPLIT
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
-from benchmarks.results import PARTS, chosen_parts, main
+from benchmarks.results import chosen_parts, main
 from benchmarks.table_cells import cleared, rate, success
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
@@ -254,7 +255,7 @@ def test_a_table_that_is_not_measured_says_how_to(tmp_path):
 
 
 def test_every_table_stands_on_a_page_and_needs_known_parts():
-    marked = "".join((results.REPOSITORY / page).read_text(encoding="utf-8") for page in PAGES)
+    marked = "".join((REPOSITORY / page).read_text(encoding="utf-8") for page in PAGES)
     assert all(f"<!-- results:{name} -->" in marked for name in TABLES)
     # The soak measures the one, every part adds to the other.
     parts = {part.name for part in PARTS} | {"reliability", "looks"}
@@ -269,7 +270,7 @@ def test_parts_are_chosen_by_name():
 
 def test_commands_are_valid_and_take_fresh_seeds(capsys):
     """Seeds used while developing stand in docs/choices.md; the tables' is none of them."""
-    sealed = load_config(results.SEALED)
+    sealed = load_config(SEALED)
     for part in PARTS:
         for command in part.commands:
             words = shlex.split(command.line(command.scaled(0.001)))
@@ -287,7 +288,7 @@ def test_a_trial_plays_no_sealed_scene(capsys):
     lines = capsys.readouterr().out
     assert "seed=900 objects.split=test" in lines and "objects.split=unseen_families" in lines
     scripts = [line for line in lines.splitlines() if ".py seed=" in line]
-    sealed = load_config(results.SEALED)
+    sealed = load_config(SEALED)
     assert len(scripts) > 20
     assert not [line for line in scripts if f"seed={sealed.seed}" in line or "sealed" in line]
     assert main(["--list", "--scale", "0.99", "--write-docs"]) == 0
@@ -330,7 +331,7 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
 def names_sealed_scenes(root: Path) -> list[str]:
     """Files below `root` that name the sealed seed or the sealed objects, but for those that make
     and keep them."""
-    seed, split = str(load_config(results.SEALED).seed), results.SPLIT
+    seed, split = str(load_config(SEALED).seed), SPLIT
     named = re.compile(rf"\b{seed}\b|split\W{{1,4}}{split}\b|{split}\W{{1,4}}split")
     found = []
     for folder in ("envs", "models", "utils", "benchmarks", "configs", "tests", "checkpoints", "."):
@@ -347,11 +348,11 @@ def names_sealed_scenes(root: Path) -> list[str]:
 def test_sealed_scenes_are_named_by_the_tables_alone(tmp_path):
     """In code, configs and tests, neither the seed nor the objects' split is chosen elsewhere. The
     Makefile and the workflow name neither."""
-    assert names_sealed_scenes(results.REPOSITORY) == ["configs/sealed.yaml", *SPLIT_NAMED_IN]
+    assert names_sealed_scenes(REPOSITORY) == ["configs/sealed.yaml", *SPLIT_NAMED_IN]
     for name in ("Makefile", ".ci/run"):
-        file = results.REPOSITORY / name
+        file = REPOSITORY / name
         assert not file.exists() or "sealed" not in file.read_text()
-    for place, text in (("tests/helpers", f"SEED = {results.SEED}"), ("configs", "split: sealed")):
+    for place, text in (("tests/helpers", f"SEED = {SEED}"), ("configs", "split: sealed")):
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / "planted.yaml").write_text(text)
     assert names_sealed_scenes(tmp_path) == ["configs/planted.yaml", "tests/helpers/planted.yaml"]
@@ -378,7 +379,7 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
     assert not results.FIGURES.exists(), "measuring alone writes no docs"
     results.publish(part, "c0ffee", 0.1)
     content = json.loads((results.FIGURES / "ppo.json").read_text())
-    assert (content["commit"], content["seed"]) == ("c0ffee", results.SEED)
+    assert (content["commit"], content["seed"]) == ("c0ffee", SEED)
     assert list(content["commands"]) == ["box", "random_urdfs", "primitives"]
     assert results.is_finished(part, "c0ffee", 0.1) and not results.is_finished(part, "dead", 0.1)
 
