@@ -346,7 +346,6 @@ class Cell(ABC):
                     tuple(solid.transformed(T) for solid in model.geometry()),
                     T[:3, 3],
                     model.friction,
-                    model.mass,
                 )
             )
         return SceneGeometry(tuple(solids), walls=tuple(wall.solid() for wall in self.scene.walls))

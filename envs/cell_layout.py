@@ -23,6 +23,8 @@ from envs.object_primitives import NativeShape
 from utils.config import Config
 from utils.geometry import ConvexSolid
 
+GRAVITY = 9.81  # m/s^2
+
 TABLE_CENTRE = np.array([0.35, 0.0])  # m in W; the robot's base stands on the table
 TABLE_SIZE = np.array([1.20, 1.50])  # m along x and y; its top is z = 0
 TABLE_THICKNESS = 0.04  # m

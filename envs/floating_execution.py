@@ -14,10 +14,9 @@ import numpy as np
 
 from envs.arm_paths import LIFT_MARGIN
 from envs.cell import Cell
-from envs.cell_layout import REST_SPEED, rest_check_steps, table_box
+from envs.cell_layout import GRAVITY, REST_SPEED, rest_check_steps, table_box
 from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers, holding_force
 from envs.floating_hand import FloatingHand, meets_box, park
-from utils.geometry import GRAVITY
 from utils.result_records import loose
 from utils.transforms import Grasp
 

@@ -16,6 +16,7 @@ from typing_extensions import Self
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
     CERTAIN_REST_CHECKS,
+    GRAVITY,
     REST_SPEED,
     TABLE_COLOUR,
     WALL_COLOUR,
@@ -28,7 +29,6 @@ from envs.cell_layout import (
 from envs.mujoco_panda import load_mujoco
 from envs.object_primitives import NativeShape
 from utils.config import Config
-from utils.geometry import GRAVITY
 from utils.transforms import position_quaternion
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ from typing_extensions import Self
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
     BIN_COLOUR,
+    GRAVITY,
     REST_SPEED,
     TABLE_COLOUR,
     WALL_COLOUR,
@@ -33,7 +34,6 @@ from envs.cell_layout import (
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
 from utils.config import Config, SimConfig
-from utils.geometry import GRAVITY
 from utils.transforms import position_quaternion
 
 # (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more

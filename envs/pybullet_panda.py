@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
+from envs.cell_layout import GRAVITY
 from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import CARRIAGE_FORCE, FINGER_DRIVE_INERTIA
 from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Hand, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
-from utils.geometry import GRAVITY, GripperGeometry
+from utils.geometry import GripperGeometry
 from utils.transforms import position_quaternion
 
 # Link numbers in the URDF of `envs.panda_urdf`; the hand is part of the last arm link.

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from models.planner_candidates import Candidates
-from utils.geometry import GRAVITY, GripperGeometry, SceneGeometry, Workspace, intersect_lines
+from utils.geometry import GripperGeometry, SceneGeometry, Workspace, intersect_lines
 from utils.height_map import HeightMap, height_map_from_scene
 
 # Pose errors under which a grasp should hold: (along, across) in metres, then angle in radians.
@@ -30,13 +30,6 @@ PERTURBATIONS = np.array(
 # grasps under 35 % succeeded.
 _HOPELESS = 1e-3
 
-# N m that both pads hold about the closing line, for a friction of 1: two patches, each 2/3 of
-# their radius times the largest force of the hand (`envs.panda_model`; a test compares them).
-TWIST = 2 * 2 / 3 * 0.0075 * 70.0
-# A thing that turns in the hand may hang there all the same: YCB's hammer at 1.7 times that moment
-# came into the bin twice of two times, a board with a knob from 2.0 times on once of seven times.
-_TURNS = 1.85
-
 
 def scored_by_contacts(
     found: Candidates,
@@ -52,9 +45,9 @@ def scored_by_contacts(
     (N,) small scores, which decide where no contacts are antipodal, unless the pads would slip off;
     by default those of the height map.
     """
-    quality, lost = exact_contacts(found, scene, gripper)
+    quality, slips = exact_contacts(found, scene, gripper)
     least = 0.01 * found.score if fallback is None else fallback
-    least = np.where(lost, 0.0, least)
+    least = np.where(slips, 0.0, least)
     score = (found.score * quality + least) * (1 - 0.7 * buried[found.label])
     found = replace(found, score=np.where(score >= _HOPELESS, score, 0.0))
     return found.best(len(found))
@@ -70,17 +63,15 @@ def exact_quality(
 def exact_contacts(
     candidates: Candidates, scene: SceneGeometry, gripper: GripperGeometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How well the pads hold, and whether they cannot.
+    """How well the pads hold, and whether they slip off.
 
     Returns the quality (N,) in [0, 1] of the pads' contacts, at the nominal pose and at
-    `PERTURBATIONS`, and (N,) bool whether at the nominal one the pads slip off upwards, or the
-    object turns out of them.
+    `PERTURBATIONS`, and (N,) bool whether the pads slip off upwards at the nominal one.
 
     The quality of a pose is 0 unless both pads first meet the same object with normals inside the
     friction cone (Nguyen 1988: two soft contacts whose line lies in both cones close by force).
     Pads slip off where the two faces rise towards the hand, on average, by more than that cone's
-    angle: no turn of the object makes such a wedge narrower. An object turns out of the hand where
-    its weight's moment about the closing line is more than `_TURNS` times what the pads hold.
+    angle: no turn of the object makes such a wedge narrower.
     """
     N, P = len(candidates), len(PERTURBATIONS)
     along, across = candidates.axes()
@@ -92,20 +83,19 @@ def exact_contacts(
     centre = np.column_stack([candidates.xy, candidates.tip])[:, None]
     centre = centre + PERTURBATIONS[:, :1] * along + PERTURBATIONS[:, 1:2] * across
     along, across = cos * along + sin * across, cos * across - sin * along
-    value, lost = _pad_contacts(
+    value, slips = _pad_contacts(
         centre.reshape(-1, 3), along.reshape(-1, 3), across.reshape(-1, 3),
         np.repeat(candidates.opening / 2, P), scene, gripper,
     )  # fmt: skip
-    value, lost = value.reshape(N, P), lost.reshape(N, P)[:, 0]
+    value, slips = value.reshape(N, P), slips.reshape(N, P)[:, 0]
     quality = 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
-    return quality, lost
+    return quality, slips
 
 
 def _pad_contacts(
     centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) quality in [0, 1] of the contacts of two closing pads, and (N,) whether they slip off,
-    or what they hold turns out of them.
+    """(N,) quality in [0, 1] of the contacts of two closing pads, and (N,) whether they slip off.
 
     centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
     """
@@ -175,17 +165,13 @@ def _pad_contacts(
     slips = slope.mean(axis=0) > cone
     worst = angle.max(axis=0)
     to_mass = np.array([item.centre_of_mass for item in scene.objects])[held] - centre
-    weight = GRAVITY * np.array([item.mass for item in scene.objects])[held]
-    lever = to_mass - (0, 0, gripper.pad_height / 2)
-    moment = weight * np.abs((np.cross(lever, scene.down) * along).sum(axis=1))
-    turns = (held >= 0) & (moment > _TURNS * TWIST * friction)
     arm = np.abs((to_mass * across).sum(axis=1) - point[..., 0].mean(axis=0))
     above = np.abs(to_mass[:, 2] - point[..., 1].mean(axis=0))
     value = np.exp(-((worst / (0.7 * cone)) ** 2)) * np.exp(
         -((arm / 0.02) ** 2) - (above / 0.06) ** 2
     )
     value = value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
-    return np.where(turns, 0.0, value), slips | turns
+    return value, slips
 
 
 def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from envs.cell import wrist_mount
+from envs.cell_layout import GRAVITY
 from envs.mujoco_cell import MujocoCell
 from envs.robot_kinematics import inverse_kinematics
 from envs.scenarios import (
@@ -23,7 +24,6 @@ from envs.scenarios import (
 )
 from envs.simulators import make_cell
 from utils.config import load_config
-from utils.geometry import GRAVITY
 from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, top_down_pose
 

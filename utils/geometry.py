@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from utils.errors import UserError
-from utils.transforms import DOWN, transform_points
+from utils.transforms import transform_points
 
-GRAVITY = 9.81  # m/s^2
 HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
 
 
@@ -45,24 +44,21 @@ class ConvexSolid:
 
 @dataclass(frozen=True)
 class SolidObject:
-    """One object in the world frame: its convex solids, centre of mass (3,), friction and mass in
-    kg, which is 0 where nobody asks for it."""
+    """One object in the world frame: its convex solids, centre of mass (3,) and friction."""
 
     solids: tuple[ConvexSolid, ...]
     centre_of_mass: np.ndarray
     friction: float
-    mass: float = 0.0
 
 
 @dataclass(frozen=True)
 class SceneGeometry:
     """All objects of a scene in W; the table is the half-space z <= table_height, and walls stand
-    on it. down: (3,) unit vector in which things fall."""
+    on it."""
 
     objects: tuple[SolidObject, ...]
     table_height: float = 0.0
     walls: tuple[ConvexSolid, ...] = ()
-    down: np.ndarray = DOWN  # type: ignore[assignment]
 
     def transformed(self, T: np.ndarray) -> SceneGeometry:
         """The objects and walls in another frame, in which the table is no longer level; `T` (4, 4)
@@ -76,7 +72,7 @@ class SceneGeometry:
             for item in self.objects
         )
         walls = tuple(wall.transformed(T) for wall in self.walls)
-        return SceneGeometry(objects, self.table_height, walls, T[:3, :3] @ self.down)
+        return SceneGeometry(objects, self.table_height, walls)
 
     def uncovered(self) -> SceneGeometry:
         """The scene in W without walls that hang over the table."""
