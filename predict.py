@@ -29,10 +29,11 @@ replace an earlier run's. Each grasp has `pixel` (u, v) and `image_angle` (from 
 where its position and closing line lie on the image, `width` between the finger pads, `tilt` of the
 approach from the table's normal, and in `camera` and `world` the pose of the middle between the
 pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
-line. `quality` is the chance of success where `calibrated` is true, and else the planner's score. A
-robot here tries none under 0.5; planners from any side prefer steep approaches to slightly likelier
-ones. Units are metres and radians; quaternions are x, y, z, w. If there is nothing to grasp the
-list is empty. `remarks` say what to mistrust. Bad input ends with one sentence and status 2.
+line. `quality` is the chance of success where `calibrated`, beside `grasps`, is true, and else the
+planner's score. A robot here tries none under 0.5; planners from any side prefer steep approaches
+to slightly likelier ones. Units are metres and radians; quaternions are x, y, z, w. If there is
+nothing to grasp the list is empty. `remarks` say what to mistrust. Bad input ends with one sentence
+and status 2.
 """
 
 from __future__ import annotations
@@ -149,7 +150,11 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--point", type=float, nargs=2, metavar=("U", "V"), help="on the object")
     which.add_argument(
-        "--box", type=float, nargs=4, metavar=("U0", "V0", "U1", "V1"), help="around the object"
+        "--box",
+        type=float,
+        nargs=4,
+        metavar=("U0", "V0", "U1", "V1"),
+        help="around the object, corners in any order",
     )
     which.add_argument("--mask", type=Path, metavar="FILE", help="the object's pixels, PNG or NPY")
     parser.add_argument(

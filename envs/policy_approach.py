@@ -152,7 +152,12 @@ def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
     others = [one for one in object_sets if one != trained]
     if trained is None or not others:
         return ""
-    return f"{name} was trained on {trained}, and not on {', '.join(others)}"
+    remark = f"{name} was trained on {trained}, and not on {', '.join(others)}"
+    shipped = [one for one in others if (SHIPPED.parent / f"ppo_{one}.pt").is_file()]
+    if shipped:
+        names = ", ".join(f"ppo:checkpoints/ppo_{one}.pt" for one in shipped)
+        remark += f"; {names} was" if len(shipped) == 1 else f"; {names} were"
+    return remark
 
 
 def _check_knowledge(name: str, observed: Sequence[str]) -> None:

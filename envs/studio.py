@@ -165,7 +165,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument(
             "--objects", default="primitives", help="a named set, a folder or an import path"
         )
-        parser.add_argument("--layout", default="pile", choices=LAYOUTS)
+        parser.add_argument(
+            "--layout", default="pile", choices=LAYOUTS, help="how they stand; default: pile"
+        )
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options, resumes=False)
@@ -184,6 +186,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
     imageio.imwrite(output, picture)
     print(f"wrote {output}")
+    if chosen.rgbd is not None:
+        print(f"wrote {chosen.rgbd}: color.png, depth.png, intrinsics.json, T_WC.txt")
     if command is not None:
         print(command)
 

@@ -245,6 +245,11 @@ def test_objects_that_a_policy_was_not_trained_on_are_named():
     sets = ["box", "primitives", "path/to/mine"]
     assert (
         foreign_objects("ppo", sets)
-        == "ppo was trained on box, and not on primitives, path/to/mine"
+        == "ppo was trained on box, and not on primitives, path/to/mine; "
+        "ppo:checkpoints/ppo_primitives.pt was"
     )
+    assert foreign_objects("ppo", ["primitives", "random_urdfs"]).endswith(
+        "; ppo:checkpoints/ppo_primitives.pt, ppo:checkpoints/ppo_random_urdfs.pt were"
+    )
+    assert foreign_objects("ppo", ["path/to/mine"]).endswith("not on path/to/mine")
     assert foreign_objects("ppo", ["box"]) == ""

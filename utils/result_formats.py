@@ -81,6 +81,12 @@ def format_table(rows: Sequence[Row]) -> str:
     return aligned([column.title for column in columns], lines, to_the_right)
 
 
+_WHY = (
+    "why attempts failed or rounds ended, where more is known than the table says; "
+    "numbers and scene are the first one's"
+)
+
+
 def format_stop_reasons(stops: Iterable[StopReason]) -> str:
     """One line for each under a title; an empty text if there are none."""
     lines = [
@@ -88,7 +94,7 @@ def format_stop_reasons(stops: Iterable[StopReason]) -> str:
         f"{depth_in_words(stop.depth_noise)}: {stop.sentence} ({stop.place})"
         for stop in stops
     ]
-    return "\n".join(["why attempts failed or rounds ended", *lines]) if lines else ""
+    return "\n".join([_WHY, *lines]) if lines else ""
 
 
 def depth_in_words(noise: str) -> str:
