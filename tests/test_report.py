@@ -89,6 +89,13 @@ def test_a_privileged_planner_is_a_bound_not_the_headline(tmp_path, name, contro
     assert f"succeed with <strong>{name}" in report(tmp_path, rounds), "unless it is fair"
 
 
+def test_planners_that_are_as_good_as_the_best_are_named_beside_it(tmp_path):
+    rounds = [one for one in ROUNDS if one.policy == "heuristic"]
+    others = [replace(one, policy="twin") for one in rounds]
+    assert "the same share with" not in report(tmp_path, rounds)
+    assert "<br>the same share with twin<" in report(tmp_path, [*rounds, *others])
+
+
 def test_where_one_object_is_wanted_the_headline_is_the_share_of_targets(tmp_path):
     """All seven grasps succeed; two of three targets are retrieved, Wilson's interval [21, 94]."""
     page = report(tmp_path, RETRIEVED)

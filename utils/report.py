@@ -131,12 +131,16 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
     groups = []
     for (scenario, objects, noise), cell in cells.items():
         bounds = [row for row in cell if _sees_truth(row, privileged)]
-        best = _best([row for row in cell if row not in bounds] or cell)
+        ranked = [row for row in cell if row not in bounds] or cell
+        best = _best(ranked)
+        rate = _headline(best).rate
+        even = [row.policy for row in ranked if row != best and _headline(row).rate == rate]
         groups.append(
             {
                 "scenario": scenario,
                 "objects": objects_in_words(objects, noise),
                 "best": (best, _headline(best)),
+                "even": even if rate is not None else [],
                 "bounds": [(row, _headline(row)) for row in bounds if row != best],
                 "measures": list(zip(*([(row, m) for m in _measures(row)] for row in cell))),
                 "outcomes": [(row, _outcomes(row)) for row in cell],
