@@ -144,7 +144,7 @@ def check_learned(
 
 def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
     """A sentence about the object sets that a policy of train_rl.py was not trained on; empty where
-    there are none, or where its file does not tell."""
+    there are none, or where its file does not tell. It names the shipped policies that were."""
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         return ""
@@ -156,7 +156,7 @@ def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
     shipped = [one for one in others if (SHIPPED.parent / f"ppo_{one}.pt").is_file()]
     if shipped:
         names = ", ".join(f"ppo:checkpoints/ppo_{one}.pt" for one in shipped)
-        remark += f"; {names} was" if len(shipped) == 1 else f"; {names} were"
+        remark += f"; {names} {'was' if len(shipped) == 1 else 'were'}"
     return remark
 
 
