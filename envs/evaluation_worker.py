@@ -39,7 +39,7 @@ from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
 from utils.geometry import Workspace
-from utils.report import objects_in_words, picture
+from utils.report import picture, set_in_words
 from utils.result_formats import depth_in_words
 from utils.result_records import CLEAN, OPEN_LOOP, policy_name
 from utils.runs import portable_name
@@ -131,7 +131,7 @@ def work(config: Config, task: Task) -> TaskResult:
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
     several = len(config.evaluate.object_sets) > 1
-    named = f", {objects_in_words(task.objects, CLEAN)}" if several else ""
+    named = f", {set_in_words(task.objects)}" if several else ""
     for name, controller, noise in task.policies:
         noisy = with_depth_noise(config, noise)
         cell = cell_of(noisy)

@@ -131,7 +131,7 @@ def test_a_new_column_is_an_entry_of_the_list(monkeypatch, tmp_path):
 
 def test_reasons_of_failures_are_lines_with_their_scene():
     text = format_stop_reasons(stop_reasons([*ROUNDS, *STOPS]))
-    assert f"   2 x heuristic+ibvs, pile, box: {OLD.format(104)} (scene 7)" in text
+    assert f"   2 x heuristic+ibvs, pile, box, clean depth: {OLD.format(104)} (scene 7)" in text
     carried = replace(stopped("stopped", "stopped: the workspace ends here"), held="mug_0012")
     text = format_stop_reasons(stop_reasons([a_round("heuristic", 4, 1, 0, [carried])]))
     assert "(scene 4, mug_0012 in the hand)" in text

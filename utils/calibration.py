@@ -263,14 +263,15 @@ def draw_reliability(grasps: dict[str, tuple[Sequence[float], Sequence[bool]]]) 
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     diagram, risks = figure.subplots(1, 2)
     diagram.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-    for name, (chances, successes) in grasps.items():
+    # A later line is thinner, so that one which it runs along can be seen.
+    for (name, (chances, successes)), width in zip(grasps.items(), _widths(len(grasps))):
         bins = reliability(chances, successes)
         error = calibration_error(chances, successes)
         chance, success = [one.chance for one in bins], [one.success for one in bins]
-        (line,) = diagram.plot(chance, success, linewidth=1, label=f"{name}: error {error:.3f}")
+        (line,) = diagram.plot(chance, success, linewidth=width, label=f"{name}: error {error:.3f}")
         area = [20 + 300 * one.count / len(chances) for one in bins]  # bins of few grasps are small
-        diagram.scatter(chance, success, s=area, color=line.get_color(), alpha=0.7)
-        risks.plot(*risk_coverage(chances, successes), label=name)
+        diagram.scatter(chance, success, s=area, color=line.get_color(), alpha=0.7, clip_on=False)
+        risks.plot(*risk_coverage(chances, successes), linewidth=width, label=name)
     diagram.set(
         xlim=(0, 1), ylim=(0, 1.02), xlabel="quality: chance that the planner states",
         ylabel="share of grasps that succeeded",
@@ -281,3 +282,8 @@ def draw_reliability(grasps: dict[str, tuple[Sequence[float], Sequence[bool]]]) 
     diagram.legend(fontsize=8)
     risks.legend(fontsize=8)
     return figure
+
+
+def _widths(count: int) -> np.ndarray:
+    """Widths of so many lines, in points, from thick to thin."""
+    return np.linspace(1.0 + min(2.0 * (count - 1), 6.0), 1.0, count)

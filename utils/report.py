@@ -150,8 +150,13 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
 
 
 def objects_in_words(objects: str, noise: str) -> str:
-    """An object set, a folder by its last part, and a depth noise where there is one."""
-    return (Path(objects).name or objects) + depth_in_words(noise)
+    """An object set and a depth noise."""
+    return set_in_words(objects) + depth_in_words(noise)
+
+
+def set_in_words(objects: str) -> str:
+    """An object set, a folder by its last part."""
+    return Path(objects).name or objects
 
 
 def _sees_truth(row: Row, privileged: Collection[str]) -> bool:

@@ -98,8 +98,8 @@ def format_stop_reasons(stops: Iterable[StopReason]) -> str:
 
 
 def depth_in_words(noise: str) -> str:
-    """', realsense depth'; nothing for a camera without noise."""
-    return "" if noise == CLEAN else f", {noise} depth"
+    """', realsense depth', or ', clean depth' of a camera without noise."""
+    return f", {'clean' if noise == CLEAN else noise} depth"
 
 
 def aligned(
