@@ -14,6 +14,7 @@ from utils.image_overlay import (
     FAILURE_COLOR,
     MARGIN,
     SUCCESS_COLOR,
+    TARGET_COLOR,
     TILE,
     TITLE_HEIGHT,
     close_up,
@@ -202,3 +203,16 @@ def test_grasps_that_rather_fail_are_drawn_faintly_and_the_legend_says_so(figure
     full, faint = draw_grasp(image, grasp, K), draw_grasp(image, grasp, K, faint=True)
     assert (faint == 255).all(axis=2).sum() < 0.6 * (full == 255).all(axis=2).sum()
     assert full[50, 32:69].min() > 200 > 50 > faint[50, 32:69].min(), "dashed"
+
+
+def test_what_is_around_a_small_target_is_enlarged(figures):
+    target = np.zeros((224, 224), bool)
+    target[30:50, 100:120] = True
+    grasp_picture(replace(overhead(np.zeros((224, 224), bool)), target=target), [], [])
+    picture = figures[0].axes[0].images[0].get_array()
+    outline = (picture == TARGET_COLOR).all(axis=2)
+    # Half of the image's side, 112 pixels, is shown around it, and above it the 40 that there are.
+    assert np.ptp(np.nonzero(outline.any(axis=0))[0]) / picture.shape[1] == pytest.approx(
+        20 / 112, rel=0.1
+    )
+    assert picture.shape[0] / picture.shape[1] == pytest.approx((40 + 56) / 112, rel=0.02)

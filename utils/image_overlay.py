@@ -176,11 +176,14 @@ def grasp_picture(frame: RGBDFrame, grasps: Sequence[Grasp], clearing: Sequence[
     """The image with ranked grasps, as bytes of a PNG.
 
     The best grasp is green, those of a quality under LEAST_CHANCE are faint, and all are numbered
-    whose number has room. The frame's target is outlined; of the grasps that move aside what is in
-    its way, of which one is enough, the first is blue.
+    whose number has room. The frame's target is outlined, and the part of the image around it is
+    enlarged; of the grasps that move aside what is in its way, of which one is enough, the first is
+    blue.
     """
     from matplotlib.figure import Figure  # slow to import, and few callers need it
 
+    if frame.target is not None:
+        frame = _around_target(frame, (*grasps, *clearing[:1]))
     scaling = _to_picture(frame.K, frame.depth.shape)
     picture, K = scaling.image(frame.rgb), scaling.intrinsics(frame.K)
     if frame.target is not None:
@@ -227,6 +230,24 @@ def grasp_picture(frame: RGBDFrame, grasps: Sequence[Grasp], clearing: Sequence[
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI, metadata=dict([MARK]))
     return file.getvalue()
+
+
+def _around_target(frame: RGBDFrame, grasps: Sequence[Grasp]) -> RGBDFrame:
+    """The part of a frame that shows its target, the grasps and as much again around them, with the
+    target."""
+    v, u = np.nonzero(frame.target)
+    shown = [np.column_stack([u, v])]
+    for grasp in grasps:
+        half = grasp.closing_direction * grasp.width / 2
+        ends = grasp.position - half, grasp.position + half
+        shown.append(project(ends, frame.K, frame.T_WC)[0])
+    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
+    half = max((high - low).max(), min(frame.depth.shape) / 4)
+    shape, middle = np.array(frame.depth.shape), (low + high)[::-1] / 2
+    first = np.clip(middle - half, 0, shape - 1).astype(int)
+    last = np.clip(middle + half, 1, shape).astype(int)
+    rows, columns = map(slice, first, last)
+    return replace(frame.part(rows, columns), target=frame.target[rows, columns])
 
 
 def _title(count: int, numbered: int) -> str:
