@@ -46,6 +46,7 @@ from utils.result_records import loose
 from utils.transforms import Grasp
 
 _CHECK_SECONDS = 0.05  # between two checks of the fingers or of the object in them
+_FELT_SECONDS = 1 / 60  # in which the arm feels what its hand holds before the fingers press anew
 _CLOSE_SECONDS = 0.4  # longest wait for the fingers to close, beside the time that their way takes
 _LEAST_FRICTION = 0.4  # that a grip counts on
 # Times robot.grip_force, with which a hand lifts what gives way in it, and after an attempt that
@@ -57,7 +58,7 @@ _HOLD_MARGIN = 3.0  # times the force that this friction needs, for what hangs b
 # Times the closing force, along the closing line, that the arm feels when one finger presses alone
 # (it feels 2, and of a grip of both a few tenths); steps in which it feels; m and number of shifts.
 _ONE_SIDED, _FEELING_STEPS, _SHIFT, _MOST_SHIFTS = 0.8, 4, 0.002, 12
-_RELEASE_SECONDS = 0.2  # in which the fingers open and an object falls out of them
+_RELEASE_SECONDS = 0.12  # in which the fingers open and an object falls out of them
 _HIGH = 0.2  # m over the table, from which the arm may go home on any way
 _CORNER = 0.04  # m of the upper end of a straight way down that may be cut off
 _LIFT_CORNER = 0.12  # and of a straight way up
@@ -101,20 +102,19 @@ class WeighingGrip:
     def __init__(self, robot: Robot, firmly: bool = False):
         self._robot, self._force, self._gripped = robot, robot.grip_force, robot.opening
         self._firm = FIRM * robot.grip_force
-        self._felt: list[float] = []  # N, since the last look
+        self._steps = max(1, round(_FELT_SECONDS / robot.dt))
+        self._felt: list[float] = []  # N, since the fingers were told last
         if firmly:
             self._press_with(self._firm)
 
     def feel(self) -> None:
-        """Ask once after every physics step."""
+        """Ask once after every physics step: press as hard as what was felt lately needs."""
         self._felt.append(self._robot.external_force())
+        if len(self._felt) == self._steps:
+            pull, self._felt = float(np.median(self._felt)), []
+            self._press_with(holding_force(pull))
         if self._gripped - self._robot.opening > _GIVES:
             self._press_with(self._firm)
-
-    def press(self) -> None:
-        """Press as hard as what was felt since the last time needs, or harder."""
-        pull, self._felt = float(np.median(self._felt or [0.0])), []
-        self._press_with(holding_force(pull))
 
     def _press_with(self, force: float) -> None:
         if (force := min(force, FINGER_FORCE)) > self._force:
@@ -339,7 +339,6 @@ def _carry_to_bin(
     for first in range(0, len(lift), every):
         robot.renew_contacts()
         follow(cell, way[first : min(first + every, len(lift))], grip.feel)
-        grip.press()
     if index is None or motion is None:
         raise GraspFailure("missed")
     if not cell.is_lifted(index, settings.lift_height):
@@ -348,7 +347,6 @@ def _carry_to_bin(
     for first in range(len(lift), len(way), every):
         robot.renew_contacts()
         follow(cell, way[first : first + every], grip.feel)
-        grip.press()
         _still_lifted(cell, index, motion)
     while cell.seconds < end:
         cell.step(every)

@@ -164,7 +164,7 @@ def test_a_frictionless_object_slips(cell, box_set):
 class _FeltRobot:
     """Fingers that close as a test says; what they were told is noted, newtons a finger."""
 
-    grip_force, opening = 10.0, 0.050
+    grip_force, opening, dt = 10.0, 0.050, 1 / 240
 
     def __init__(self, pull: float):
         self._pull, self.told = pull, [self.grip_force]
@@ -177,6 +177,11 @@ class _FeltRobot:
         self.told.append(force)
 
 
+def feel_for_a_sixtieth_of_a_second(grip: WeighingGrip) -> None:
+    for _ in range(4):
+        grip.feel()
+
+
 @pytest.mark.parametrize(
     ("closed_by", "firmly", "force"),
     [(0.0, False, 10.0), (0.0049, False, 10.0), (0.0051, False, 40.0), (0.0, True, 40.0)],
@@ -185,21 +190,21 @@ def test_what_gives_way_between_the_fingers_is_gripped_firmly(closed_by, firmly,
     robot = _FeltRobot(pull=1.0)  # 3 x 1 N / (2 x 0.4) = 3.75 N a finger would do
     grip = WeighingGrip(robot, firmly)
     robot.opening -= closed_by
-    grip.feel()
-    grip.press()
+    feel_for_a_sixtieth_of_a_second(grip)
     assert robot.told[-1] == force
 
 
 def test_a_grip_that_gave_way_stays_as_hard_as_the_weight_needs():
     robot = _FeltRobot(pull=14.4)
     grip = WeighingGrip(robot)
+    for _ in range(3):
+        grip.feel()
+    assert robot.told == [10.0], "it has not felt for long enough"
     grip.feel()
-    grip.press()
     assert robot.told[-1] == pytest.approx(54.0)  # 3 x 14.4 N / (2 x 0.4)
     robot.opening -= 0.01
     grip.feel()
     assert robot.told[-1] == pytest.approx(54.0)  # no softer
     robot.opening += 0.01  # turned back
-    grip.feel()
-    grip.press()
+    feel_for_a_sixtieth_of_a_second(grip)
     assert robot.told[-1] == pytest.approx(54.0)
