@@ -139,9 +139,9 @@ def _descent(cell: Cell, q: np.ndarray, target: np.ndarray) -> Trajectory:
 
 
 def way_up(cell: Cell, q: np.ndarray, T_WE: np.ndarray, height: float) -> Trajectory:
-    """From joint positions q (7,) the way on which an object is lifted that the hand gripped at
-    T_WE (4, 4), `height` m over the table: straight up, slowly at first, or where something hangs
-    over it, level out from under it before. Raises UnreachableError."""
+    """From joint positions q (7,) and pose T_WE (4, 4) the way on which an object is lifted that
+    the hand gripped `height` m over the table: straight up, slowly at first, or where something
+    hangs over it, level out from under it before. Raises UnreachableError."""
     before = withdrawn(cell, T_WE)
     if before is T_WE:
         off = T_WE.copy()
@@ -173,10 +173,11 @@ def withdrawn(cell: Cell, T_WE: np.ndarray) -> np.ndarray:
 
 
 def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
-    """The pose (4, 4) at which an object is lifted high enough that the hand gripped at T_WE."""
+    """The pose (4, 4) at which an object is lifted high enough that a hand, now at T_WE, gripped
+    `height` m over the table; never below T_WE."""
     lifted = T_WE.copy()
     high = max(height, 0.0) + cell.config.execution.lift_height + LIFT_MARGIN
-    lifted[2, 3] = max(high, height_over(cell, height))
+    lifted[2, 3] = max(high, height_over(cell, height), T_WE[2, 3] + 2 * _SLOW_LIFT)
     return lifted
 
 

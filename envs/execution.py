@@ -164,11 +164,13 @@ class ApproachResult(NamedTuple):
     """What an approach leaves behind: the open gripper around the object, ready to close.
 
     wait: lets a number of physics steps pass while the fingers close. pose: (4, 4) T_WE from which
-    the arm lifts; None stands for its pose at that time.
+    the arm lifts; None stands for its pose at that time. closed_at: metres in W, the height of E at
+    which the fingers closed, where the hand may have risen since; None: it has not.
     """
 
     wait: Callable[[int], None]
     pose: np.ndarray | None
+    closed_at: float | None = None
 
 
 def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
@@ -234,11 +236,11 @@ def execute_grasp(
     cell.check_physics()
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
-        closed = _grip(cell, grasp, approach)
+        closed, height = _grip(cell, grasp, approach)
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         grip = WeighingGrip(cell.robot, firmly)
-        _carry_to_bin(cell, held, closed, max(grasp.position[2], closed[2, 3]), motion, grip)
+        _carry_to_bin(cell, held, closed, height, motion, grip)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -256,9 +258,9 @@ def execute_grasp(
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
 
 
-def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
-    """Approach and close: (4, 4) T_WE from which the arm lifts what it feels between the fingers.
-    Raises GraspFailure."""
+def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> tuple[np.ndarray, float]:
+    """Approach and close: (4, 4) T_WE from which the arm lifts what it feels between the fingers,
+    and the height in W at which they closed. Raises GraspFailure."""
     result = approach(cell, grasp)
     close_fingers(cell, result.wait)
     cell.robot.hold()  # a closed loop sends nothing from here on
@@ -266,7 +268,10 @@ def _grip(cell: Cell, grasp: Grasp, approach: Approach) -> np.ndarray:
     if not feels_it(cell):
         raise GraspFailure("missed")
     stays = result.pose is not None and not shifted
-    return result.pose if stays else forward_kinematics(cell.robot.q)
+    T_WE = result.pose if stays else forward_kinematics(cell.robot.q)
+    if result.closed_at is not None:
+        return T_WE, result.closed_at
+    return T_WE, max(grasp.position[2], T_WE[2, 3])
 
 
 def feels_it(cell: Cell) -> bool:
@@ -329,7 +334,6 @@ def _carry_to_bin(
     the bin. Raises GraspFailure; with execution.strict also where the object has moved in the hand.
     index: None where the hand only believes that it holds one."""
     settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
-    # A learned policy plans no grasp: the height at which its hand has closed counts.
     top = raised(cell, closed, height)[2, 3]
     lift = way_up(cell, start, closed, height)
     carry = way_to_bin(cell, lift.positions[-1], top)

@@ -83,7 +83,7 @@ class PolicyApproach:
         if not gripped:
             self.closed_at = None
             raise GraspFailure("stopped", detail=f"gripped nothing ({info['reason']})")
-        return ApproachResult(cell.step, None)
+        return ApproachResult(cell.step, None, float(self.closed_at.position[2]))
 
 
 def placeholder(frame: RGBDFrame) -> list[Grasp]:

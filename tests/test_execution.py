@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
-from envs.execution import WeighingGrip, execute_grasp, reaches
+from envs.arm_paths import line
+from envs.execution import (
+    ApproachResult,
+    WeighingGrip,
+    close_fingers,
+    execute_grasp,
+    follow,
+    open_loop,
+    reaches,
+)
 from envs.object_bodies import native_object
 from envs.object_primitives import NativeShape
 from envs.robot_kinematics import forward_kinematics
@@ -145,6 +154,23 @@ def test_what_turns_until_it_hangs_is_lifted_off_the_table(cell):
     outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.08, 0.02]), 0.0, 0.05, 1.0))
     assert outcome.success, outcome.detail
     assert outcome.motion.turned > np.deg2rad(45)
+
+
+@pytest.mark.parametrize(("closed_at", "reason"), [(0.03, "success"), (None, "ik")])
+def test_a_hand_that_has_risen_lifts_by_what_is_left(cell, box_set, closed_at, reason):
+    """A learned policy may hand the arm over when it has lifted: here by 24 cm, at 0.69 m from the
+    arm, where 30 cm more are out of its reach."""
+
+    def risen(cell, grasp):
+        close_fingers(cell, open_loop(cell, grasp).wait)
+        T_WE = forward_kinematics(cell.robot.q)
+        T_WE[2, 3] += 0.24
+        follow(cell, line(cell, cell.robot.q, T_WE, 0.2))
+        return ApproachResult(cell.step, None, closed_at)
+
+    cell.load(cube_scene(box_set, (0.69, 0.0, 0.03)))
+    outcome = execute_grasp(cell, cube_grasp(offset=(0.19, 0.0, 0.0)), risen)
+    assert outcome.reason == reason
 
 
 @needs_pybullet
