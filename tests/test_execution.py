@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
 from envs.arm_paths import line
+from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
 from envs.execution import (
     ApproachResult,
     WeighingGrip,
