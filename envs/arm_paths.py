@@ -32,8 +32,8 @@ _OVER_BIN = BIN_HEIGHT + 0.17  # m over the table, where E releases an object, o
 # gripped beside its middle may turn until it hangs, far below the hand.
 LIFT_MARGIN = 0.15
 # m by which an object is lifted slowly, m/s, and the share of it after which the hand may hurry:
-# fingers that close at 5 cm/s keep in touch with walls that lean by up to 27 degrees, as much as
-# a friction of 0.5 holds, while they slip and the grip is made harder.
+# fingers that close at 5 cm/s keep in touch with slipping walls that lean by up to 35 degrees, as
+# long as it takes to press harder.
 _SLOW_LIFT, _SLOW_LIFT_SPEED, _SLOW_LIFT_SHARE = 0.015, 0.07, 0.5
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
 LOOK_EVERY = 12  # references between two at which arm and hand are looked at

@@ -241,7 +241,8 @@ def _around_target(frame: RGBDFrame, grasps: Sequence[Grasp]) -> RGBDFrame:
         half = grasp.closing_direction * grasp.width / 2
         ends = grasp.position - half, grasp.position + half
         shown.append(project(ends, frame.K, frame.T_WC)[0])
-    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
+    pixels = np.concatenate(shown)  # NaN behind the camera
+    low, high = np.nanmin(pixels, axis=0), np.nanmax(pixels, axis=0)
     half = max((high - low).max(), min(frame.depth.shape) / 4)
     shape, middle = np.array(frame.depth.shape), (low + high)[::-1] / 2
     first = np.clip(middle - half, 0, shape - 1).astype(int)
