@@ -48,5 +48,5 @@ def test_a_picture_knows_its_scene_and_names_the_object_set_where_there_are_seve
         assert first.kind == ("isolated", "box", "none")
         return first.caption.removesuffix(f": {first.reason}")
 
-    assert caption(("box",)) == "random, isolated"
-    assert caption(("box", "primitives")) == "random, isolated, box"
+    assert caption(("box",)) == "random, isolated, clean depth"
+    assert caption(("box", "primitives")) == "random, isolated, box, clean depth"
