@@ -34,7 +34,7 @@ LIFT_MARGIN = 0.15
 # m by which an object is lifted slowly, m/s, and the share of it after which the hand may hurry:
 # fingers that close at 5 cm/s keep in touch with slipping walls that lean by up to 35 degrees, as
 # long as it takes to press harder.
-SLOW_LIFT, SLOW_LIFT_SPEED, _SLOW_LIFT_SHARE = 0.015, 0.07, 0.5
+_SLOW_LIFT, _SLOW_LIFT_SPEED, _SLOW_LIFT_SHARE = 0.015, 0.07, 0.5
 _SLOW_HEIGHT = 0.04  # m above a grasp, below which the hand comes down at execution.approach_speed
 LOOK_EVERY = 12  # references between two at which arm and hand are looked at
 _OFF_TABLE = 0.015  # m by which an object is lifted before it leaves a place below something
@@ -145,10 +145,10 @@ def way_up(cell: Cell, q: np.ndarray, T_WE: np.ndarray, height: float) -> Trajec
     before = withdrawn(cell, T_WE)
     if before is T_WE:
         off = T_WE.copy()
-        off[2, 3] += SLOW_LIFT
-        slow = line(cell, q, off, SLOW_LIFT_SPEED)
+        off[2, 3] += _SLOW_LIFT
+        slow = line(cell, q, off, _SLOW_LIFT_SPEED)
         lift = line(cell, slow.positions[-1], raised(cell, T_WE, height))
-        end = higher_than(T_WE[2, 3] + _SLOW_LIFT_SHARE * SLOW_LIFT, slow)
+        end = higher_than(T_WE[2, 3] + _SLOW_LIFT_SHARE * _SLOW_LIFT, slow)
         return cell.robot.blended_moves(q, slow, lift, end, **scales(cell))
     off = T_WE.copy()
     off[2, 3] = before[2, 3]
@@ -177,7 +177,7 @@ def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
     `height` m over the table; never below T_WE."""
     lifted = T_WE.copy()
     high = max(height, 0.0) + cell.config.execution.lift_height + LIFT_MARGIN
-    lifted[2, 3] = max(high, height_over(cell, height), T_WE[2, 3] + 2 * SLOW_LIFT)
+    lifted[2, 3] = max(high, height_over(cell, height), T_WE[2, 3] + 2 * _SLOW_LIFT)
     return lifted
 
 

@@ -36,7 +36,7 @@ from envs.arm_paths import (
 )
 from envs.cell import Cell, require_arm
 from envs.panda_model import FINGER_FORCE
-from envs.robot import FINGER_SPEED, Hand
+from envs.robot import FINGER_SPEED, Robot
 from envs.robot_kinematics import UnreachableError, forward_kinematics
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError, reaching_down
@@ -95,33 +95,31 @@ class WeighingGrip:
     """Presses as hard as the weight needs that the arm feels, and never less than
     robot.grip_force: light objects creep out of a hard grip, heavy ones slip out of a soft one.
 
-    pull: newtons with which what is held pulls at the hand. firmly: press with `FIRM` times that
-    force at least, as it does from the moment in which the fingers have closed by more than
-    `_GIVES` since the grip was made.
+    firmly: press with `FIRM` times that force at least, as it does from the moment in which the
+    fingers have closed by more than `_GIVES` since the grip was made.
     """
 
-    def __init__(self, hand: Hand, pull: Callable[[], float], firmly: bool = False):
-        self._hand, self._pull = hand, pull
-        self._force, self._gripped = hand.grip_force, hand.opening
-        self._firm = FIRM * hand.grip_force
-        self._steps = max(1, round(_FELT_SECONDS / hand.dt))
+    def __init__(self, robot: Robot, firmly: bool = False):
+        self._robot, self._force, self._gripped = robot, robot.grip_force, robot.opening
+        self._firm = FIRM * robot.grip_force
+        self._steps = max(1, round(_FELT_SECONDS / robot.dt))
         self._felt: list[float] = []  # N, since the fingers were told last
         if firmly:
             self._press_with(self._firm)
 
     def feel(self) -> None:
         """Ask once after every physics step: press as hard as what was felt lately needs."""
-        self._felt.append(self._pull())
+        self._felt.append(self._robot.external_force())
         if len(self._felt) == self._steps:
             pull, self._felt = float(np.median(self._felt)), []
             self._press_with(holding_force(pull))
-        if self._gripped - self._hand.opening > _GIVES:
+        if self._gripped - self._robot.opening > _GIVES:
             self._press_with(self._firm)
 
     def _press_with(self, force: float) -> None:
         if (force := min(force, FINGER_FORCE)) > self._force:
             self._force = force
-            self._hand.command_gripper(0.0, force)
+            self._robot.command_gripper(0.0, force)
 
 
 @dataclass(frozen=True)
@@ -241,7 +239,7 @@ def execute_grasp(
         closed, height = _grip(cell, grasp, approach)
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
-        grip = WeighingGrip(cell.robot, cell.robot.external_force, firmly)
+        grip = WeighingGrip(cell.robot, firmly)
         _carry_to_bin(cell, held, closed, height, motion, grip)
     except UnreachableError:
         reason = "ik"

@@ -8,15 +8,14 @@ module does not know how grasps are planned.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import cast
 
 import numpy as np
 
-from envs.arm_paths import LIFT_MARGIN, SLOW_LIFT, SLOW_LIFT_SPEED
+from envs.arm_paths import LIFT_MARGIN
 from envs.cell import Cell
 from envs.cell_layout import GRAVITY, REST_SPEED, rest_check_steps, table_box
-from envs.execution import GraspFailure, GraspOutcome, InHandMotion, WeighingGrip, close_fingers
+from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers, holding_force
 from envs.floating_hand import FloatingHand, meets_box, park
 from utils.result_records import loose
 from utils.transforms import Grasp
@@ -24,8 +23,6 @@ from utils.transforms import Grasp
 PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
 RETREAT = 0.10  # m, VGN's
 SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
-UP = np.array([0.0, 0.0, 1.0])
-ARM_ACCELERATION = 6.5  # m/s^2, about the most with which an arm lifts
 CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's bin
 _HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
 
@@ -66,9 +63,8 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
     hand is where it is, with what it holds, and the detail of a success tells what it met.
 
     carry: ask for what an arm has to do (`envs.execution.execute_grasp`) as far as a hand can show
-    it. The fingers press as hard as its weight needs; unless something hangs over it, the object is
-    lifted straight up, slowly at first. Afterwards it is carried CARRY away; at the end it has to
-    be off the table and, unless something hangs over it, lifted.
+    it. The fingers press as hard as its weight needs, and after the retreat the object is carried
+    CARRY away; at the end it has to be off the table and, unless something hangs over it, lifted.
     """
     cell.check_physics()
     hand = floating_hand(cell)
@@ -83,13 +79,11 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         if carry and held is not None:
-            grip = WeighingGrip(hand, partial(_weight, cell, held))
-            _lift_off(cell, hand, grasp, grip)
-            _judge(cell, held, motion)
-            _carry(cell, hand, held, max(grasp.position[2], closed), grip)
-        else:
-            _retreat(cell, hand, grasp)
-            _judge(cell, held, motion)
+            hand.command_gripper(0.0, max(holding_force(_weight(cell, held)), hand.grip_force))
+        _retreat(cell, hand, grasp)
+        _judge(cell, held, motion)
+        if carry and held is not None:
+            _carry(cell, hand, held, max(grasp.position[2], closed))
         detail = met
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))
@@ -130,19 +124,8 @@ def _approach(cell: Cell, hand: FloatingHand, grasp: Grasp) -> str:
 
 def _retreat(cell: Cell, hand: FloatingHand, grasp: Grasp) -> None:
     up = grasp.tilt > SIDEWAYS + 1e-6 and not cell.hanging
-    away = UP if up else -grasp.approach
+    away = np.array([0.0, 0.0, 1.0]) if up else -grasp.approach
     _move(cell, hand, hand.tip_pose()[:3, 3] + RETREAT * away, cell.config.execution.approach_speed)
-
-
-def _lift_off(cell: Cell, hand: FloatingHand, grasp: Grasp, grip: WeighingGrip) -> None:
-    """Leave the table with what is held as an arm does (`envs.arm_paths.way_up`)."""
-    speed = cell.config.execution.approach_speed
-    if cell.hanging:
-        _move_held(cell, hand, hand.tip_pose()[:3, 3] - RETREAT * grasp.approach, speed, grip)
-        return
-    start = hand.tip_pose()[:3, 3]
-    _move_held(cell, hand, start + SLOW_LIFT * UP, SLOW_LIFT_SPEED, grip)
-    _move_held(cell, hand, start + RETREAT * UP, speed, grip)
 
 
 def _move(cell: Cell, hand: FloatingHand, goal: np.ndarray, speed: float) -> None:
@@ -152,23 +135,13 @@ def _move(cell: Cell, hand: FloatingHand, goal: np.ndarray, speed: float) -> Non
         cell.step()
 
 
-def _move_held(
-    cell: Cell, hand: FloatingHand, goal: np.ndarray, speed: float, grip: WeighingGrip
-) -> None:
-    """As `_move`, with what an arm's joints accelerate and a grip that follows the weight."""
-    for q, velocity in zip(*hand.line(goal, speed, ARM_ACCELERATION)):
-        hand.command(q, velocity)
-        cell.step()
-        grip.feel()
-
-
 def _weight(cell: Cell, index: int) -> float:
     """Newtons."""
     assert cell.scene is not None  # something is held
     return cell.scene.placements[index].model.mass * GRAVITY
 
 
-def _carry(cell: Cell, hand: FloatingHand, held: int, height: float, grip: WeighingGrip) -> None:
+def _carry(cell: Cell, hand: FloatingHand, held: int, height: float) -> None:
     """Lift what was gripped `height` m over the table as high as an arm has to, and carry it aside;
     below something that hangs, it stays where it is. Raises GraspFailure."""
     least = 0.0
@@ -176,8 +149,8 @@ def _carry(cell: Cell, hand: FloatingHand, held: int, height: float, grip: Weigh
         least = cell.config.execution.lift_height
         top = hand.tip_pose()[:3, 3]
         top[2] = max(top[2], max(height, 0.0) + least + LIFT_MARGIN)
-        _move_held(cell, hand, top, cell.config.execution.approach_speed, grip)
-        _move_held(cell, hand, top + CARRY, CARRY_SPEED, grip)
+        _move(cell, hand, top, cell.config.execution.approach_speed)
+        _move(cell, hand, top + CARRY, CARRY_SPEED)
     if not cell.is_lifted(held, least):
         raise GraspFailure("dropped")
 

@@ -26,6 +26,7 @@ from utils.transforms import inverse_pose, top_down_pose, transform_points
 
 PARKED_HEIGHT = 1.2  # m over the workspace: above every camera that looks down at it
 YIELDING_FORCE = 2.0  # N, about the friction of a light object on the table
+_FASTEST = HAND_ACCELERATION[0], HAND_JERK[0]  # m/s^2, m/s^3
 
 
 class FloatingHand(Hand):
@@ -55,18 +56,15 @@ class FloatingHand(Hand):
         self.command_gripper(opening)
         self.latency = latency
 
-    def line(
-        self, goal: np.ndarray, speed: float, acceleration: float = HAND_ACCELERATION[0]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """A straight motion from rest to rest, at up to `speed` m/s, `acceleration` m/s^2 and the
-        hand's own limit of jerk, from where E is to `goal` (3,) m in W: the carriage's references
-        of each control period, (N, 3) m and (N, 3) m/s."""
+    def line(self, goal: np.ndarray, speed: float) -> tuple[np.ndarray, np.ndarray]:
+        """A straight motion from rest to rest, at up to `speed` m/s and the hand's own limits of
+        acceleration and jerk, from where E is to `goal` (3,) m in W: the carriage's references of
+        each control period, (N, 3) m and (N, 3) m/s."""
         start, end = self.q, transform_points(inverse_pose(self._placed), goal)
         distance = float(np.linalg.norm(end - start))
         if distance < 1e-6:
             return start[None], np.zeros((1, 3))
-        limits = speed, acceleration, HAND_JERK[0]
-        curve = SCurve(*(limit / distance for limit in limits))
+        curve = SCurve(speed / distance, *(limit / distance for limit in _FASTEST))
         periods = int(np.ceil(curve.duration / self.dt))
         shares = curve(np.arange(periods + 2) * self.dt)
         velocities = (shares[2:] - shares[:-2]) / (2 * self.dt)

@@ -214,7 +214,7 @@ def feel_for_a_sixtieth_of_a_second(grip: WeighingGrip) -> None:
 )
 def test_what_gives_way_between_the_fingers_is_gripped_firmly(closed_by, firmly, force):
     robot = _FeltRobot(pull=1.0)  # 3 x 1 N / (2 x 0.4) = 3.75 N a finger would do
-    grip = WeighingGrip(robot, robot.external_force, firmly)
+    grip = WeighingGrip(robot, firmly)
     robot.opening -= closed_by
     feel_for_a_sixtieth_of_a_second(grip)
     assert robot.told[-1] == force
@@ -222,7 +222,7 @@ def test_what_gives_way_between_the_fingers_is_gripped_firmly(closed_by, firmly,
 
 def test_a_grip_that_gave_way_stays_as_hard_as_the_weight_needs():
     robot = _FeltRobot(pull=14.4)
-    grip = WeighingGrip(robot, robot.external_force)
+    grip = WeighingGrip(robot)
     for _ in range(3):
         grip.feel()
     assert robot.told == [10.0], "it has not felt for long enough"

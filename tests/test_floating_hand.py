@@ -23,7 +23,6 @@ from models.planner_fan import HeuristicFanPlanner
 from models.planners import HeuristicPlanner
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.cubes import cube_grasp, cube_scene
-from tests.helpers.shapes import wedge
 from tests.helpers.simulators import INSTALLED
 from utils.config import load_config
 from utils.errors import UserError
@@ -205,14 +204,6 @@ def test_what_is_carried_has_to_leave_the_table(cell):
         assert attempt(cell, grasp).success
         cell.load(Scene("isolated", 0, (at,)))
         assert attempt(cell, grasp, carry=True).reason == carried
-
-
-@pytest.mark.parametrize(("lean", "mass"), [(15, 0.5), (20, 0.35)])
-def test_leaning_walls_are_carried_as_by_an_arm(cell, tmp_path, lean, mass):
-    """The wedges of tests/test_grip.py, of which 10 N a finger hold less than the weight."""
-    cell.load(wedge(lean, mass, 0.5, tmp_path))
-    grasp = Grasp(np.array([0.5, 0.0, 0.025]), np.pi / 2, 0.078, 1.0)
-    assert attempt(cell, grasp, carry=True).reason == "success"
 
 
 def test_a_round_ends_after_two_failures_in_a_row(cell, box_set):

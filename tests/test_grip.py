@@ -3,16 +3,17 @@ in every simulator that is installed."""
 
 import numpy as np
 import pytest
+from trimesh.convex import convex_hull
 
 from benchmarks.show_bar import bar, grip, solid, tilt
 from envs.cell import Cell
 from envs.cell_layout import Placement, Scene
 from envs.execution import close_fingers, execute_grasp, give_way, open_loop
-from envs.object_primitives import NativeShape
+from envs.object_bodies import compound_object
+from envs.object_primitives import NativeShape, Primitive
 from envs.objects import load_object_set
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
-from tests.helpers.shapes import wedge
 from tests.helpers.simulators import INSTALLED, needs_pybullet
 from utils.transforms import Grasp
 
@@ -115,7 +116,17 @@ def test_leaning_walls_that_begin_to_slip_are_caught(cell, tmp_path, lean, mass)
     slope, friction = np.tan(np.radians(lean)), 0.5
     holds = 2 * 10.0 * (friction - slope) / (1 + friction * slope)
     assert holds < mass * G
-    cell.load(wedge(lean, mass, friction, tmp_path))
+    foot, height = 0.035, 0.06
+    top = foot - height * slope
+    corners = np.array([
+        [x, y, z] for x in (-0.03, 0.03)
+        for y, z in ((-foot, 0.0), (foot, 0.0), (-top, height), (top, height))
+    ])  # fmt: skip
+    density = mass / convex_hull(corners).volume
+    shape = Primitive("wedge", None, (corners,), density, friction, (0.5, 0.5, 0.5, 1.0))
+    model = compound_object(shape, tmp_path)
+    place = np.array([0.5, 0.0, -model.parts[0][:, 2].min()])
+    cell.load(Scene("isolated", 0, (Placement(model, place, np.eye(4)[3]),)))
     outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.025]), np.pi / 2, 0.078, 1.0))
     assert outcome.reason == "success" and outcome.motion.slid < 0.012
 
