@@ -124,12 +124,12 @@ def check_place(folder: Path) -> None:
 
 
 def make_data(config: Config, processes: Team) -> TrainingData:
-    """Make the simulated images that are still missing, and open them. Raises UserError if the
-    validation images show nothing graspable."""
+    """Make the simulated images that are still missing, and open them. Raises UserError if they
+    make no batch, or if the validation images show nothing graspable."""
+    steps_per_epoch(config, config.data.frames)
     folder = generate(config, processes.rank, processes.ranks)
     processes.wait()
-    truth = label_truth(read_trials(folder))
-    if processes.is_main and truth.positives:
+    if (truth := label_truth(read_trials(folder))).positives and processes.is_main:
         print(truth.describe())
     data = simulated_data(config, folder, float(camera_intrinsics(config.camera).K[0, 0]))
     check_graspable(data.validation)
@@ -140,7 +140,7 @@ def make_trainer(config: Config, data: TrainingData, processes: Team) -> Trainer
     """Make a network with seeded weights, or those of train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
     model = make_network(config, config.train.max_width or data.max_width)
-    total_steps = steps_per_epoch(config, data) * config.train.epochs
+    total_steps = steps_per_epoch(config, len(data.train)) * config.train.epochs
     if config.adaptation.target is not None:
         return AdaptingTrainer(model, config.train, total_steps, processes, config.adaptation)
     return Trainer(model, config.train, total_steps, processes)
@@ -152,7 +152,7 @@ def train(
     """Train from the folder's last.pt, if it is there, to the end of the schedule or to Ctrl-C.
     Returns the history, with a row of mean losses and scores for every epoch, and whether the end
     was reached."""
-    processes, steps = trainer.team, steps_per_epoch(config, data)
+    processes, steps = trainer.team, steps_per_epoch(config, len(data.train))
     history, losses = trainer.resume(run / "last.pt")  # losses: of steps after history's last row
     save = partial(
         trainer.save, config=config, metres_per_pixel=data.metres_per_pixel, history=history

@@ -37,6 +37,7 @@ from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
 from utils.result_records import (
+    FELL_OFF,
     NO_PLAN,
     OPEN_LOOP,
     PLANNER_ERROR,
@@ -183,7 +184,7 @@ def run_round(
                 on_attempt(frame, grasp, outcome)
             if wanted is not None:
                 if wanted not in cell.remaining:
-                    ended = "target" if outcome.success and held == wanted else "lost"
+                    ended = "target" if outcome.success and held == wanted else FELL_OFF
                     break
                 if len(attempts) == len(scene.placements):
                     ended = "picks"
@@ -199,7 +200,7 @@ def run_round(
         ended = "failures"
     cleared = sum(attempt.success for attempt in attempts)
     if ended == "cleared" and cleared < len(scene.placements):
-        ended = "lost"
+        ended = FELL_OFF
     return RoundRecord(
         policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
         cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),

@@ -149,12 +149,15 @@ class EpochBatches(Sampler):
         return iter(self._batches)
 
 
-def steps_per_epoch(config: Config, data: TrainingData) -> int:
+def steps_per_epoch(config: Config, images: int) -> int:
     """Return how many whole batches an epoch has; raises UserError if there is none."""
     batch = config.train.batch_size
-    if len(data.train) < batch:
-        raise UserError(f"train.batch_size is {batch}, but there are only {len(data.train)} images")
-    return len(data.train) // batch
+    if images < batch:
+        raise UserError(
+            f"train.batch_size is {batch}, but there are only {images} images; raise data.frames "
+            "or lower train.batch_size"
+        )
+    return images // batch
 
 
 def epoch_loader(

@@ -124,6 +124,12 @@ def test_failures_of_one_kind_are_counted_together():
     ]
 
 
+def test_rounds_whose_last_objects_fell_off_are_told():
+    fell = [a_round("heuristic", seed, 2, 1, [attempt("success")], "lost") for seed in (3, 4)]
+    (stop,) = stop_reasons(fell)
+    assert (stop.count, stop.reason, stop.seed) == (2, None, 3) and "fell off" in stop.sentence
+
+
 # --- Two runs -----------------------------------------------------------------------------------
 
 

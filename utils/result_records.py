@@ -28,6 +28,7 @@ OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way
 CLEAN = "none"  # the depth noise of a camera without noise
 NO_PLAN = "no_plan"
 PLANNER_ERROR = "planner_error"
+FELL_OFF = "lost"  # how a round ends whose last objects left the table without a pick
 FAILURES = {  # reason: its name in tables, in the order in which a grasp can fail
     NO_PLAN: "no plan",
     PLANNER_ERROR: "planner failed",
@@ -47,7 +48,7 @@ ENDINGS = {  # why a round ended
     NO_PLAN: "the planner found no grasp that is likely enough and within reach",
     PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
-    "lost": "the objects that were left fell off the table",
+    FELL_OFF: "the objects that were left fell off the table",
     "target": "the target is in the bin",
     "picks": "as many grasps as objects, and the target is still there",
     "physics": "the simulation blew up",

@@ -19,7 +19,16 @@ from typing import Any
 from utils.calibration import calibration_error
 from utils.config import read_config
 from utils.errors import UserError
-from utils.result_records import CLEAN, FAILURES, OPEN_LOOP, RoundRecord, loose, read_rounds
+from utils.result_records import (
+    CLEAN,
+    ENDINGS,
+    FAILURES,
+    FELL_OFF,
+    OPEN_LOOP,
+    RoundRecord,
+    loose,
+    read_rounds,
+)
 from utils.runs import begun_with
 from utils.statistics import (
     Difference,
@@ -170,10 +179,11 @@ _NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
 @dataclass(frozen=True)
 class StopReason:
     """Failures of one policy on a scenario and object set, with one depth noise, for the same
-    reason.
+    reason, or rounds that ended because objects were lost.
 
-    count: of attempts. reason: a key of `utils.result_records.FAILURES`. sentence: of the first
-    attempt; those of the others differ in their numbers only. seed: of the first attempt's scene.
+    count: of attempts, or of rounds. reason: a key of `utils.result_records.FAILURES`; None for
+    rounds. sentence: of the first one; those of the others differ in their numbers only. seed: of
+    the first one's scene.
     held: the object that was in the hand at the first, if any.
     """
 
@@ -181,7 +191,7 @@ class StopReason:
     scenario: str
     objects: str
     depth_noise: str
-    reason: str
+    reason: str | None
     count: int
     sentence: str
     seed: int
@@ -194,15 +204,18 @@ class StopReason:
 
 
 def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
-    """The failures that have a sentence, in the order of the rounds; the most frequent first within
-    one policy, scenario, object set and depth noise."""
-    kinds: dict[_Key, dict[tuple[str, str], list[tuple[str, int, str | None]]]] = {}
+    """The failures that have a sentence, and the rounds whose last objects fell off the table, in
+    the order of the rounds; the most frequent first within one policy, scenario, object set and
+    depth noise."""
+    kinds: dict[_Key, dict[tuple[str | None, str], list[tuple[str, int, str | None]]]] = {}
     for record in rounds:
         cell = kinds.setdefault((record.policy, *record.kind), {})
         for attempt in record.attempts:
             if attempt.detail and not attempt.success:
                 kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
                 cell.setdefault(kind, []).append((attempt.detail, record.seed, attempt.held))
+        if record.ended == FELL_OFF:
+            cell.setdefault((None, FELL_OFF), []).append((ENDINGS[FELL_OFF], record.seed, None))
     return [
         StopReason(*where, reason, len(found), *found[0])
         for where, cell in kinds.items()

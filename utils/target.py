@@ -163,9 +163,13 @@ def target_at(labels: np.ndarray, frame: RGBDFrame, point: Sequence[float]) -> n
             )
         label = np.bincount(near).argmax()
     if label < 0:
+        rows, columns = np.nonzero(labels >= 0)
+        if len(rows) == 0:
+            raise UserError(f"{name}: no object is seen in the workspace")
+        nearest = np.argmin(np.hypot(columns - u, rows - v))
         raise UserError(
-            f"{name}: on the table, or outside the workspace, and not on an object; choose a pixel "
-            "of the object"
+            f"{name}: not on an object, but on the table or outside the workspace; the nearest "
+            f"pixel of an object is {columns[nearest]} {rows[nearest]}"
         )
     return labels == label
 
