@@ -535,7 +535,10 @@ def only_a_count_beside_export(files):
         ),
         (options(planner="heuristic"), "heuristic has no network"),
         (options(planner="graspnet6d"), "graspnet6d ranks by a critic"),
-        (options(point=[3, 3]), "--point 3 3: not on an object, but on the table or outside the workspace; the nearest"),
+        (
+            options(point=[3, 3]),
+            "--point 3 3: not on an object, but on the table or outside the workspace; the nearest",
+        ),
         (options(point=[320, 3]), "outside the image"),
         (options(point=["nan", 3]), "--point nan 3.0: expected pixels"),
         (options(box=[0, 0, "inf", 20]), "--box 0.0 0.0 inf 20.0: expected pixels"),

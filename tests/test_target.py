@@ -259,6 +259,15 @@ def test_a_point_on_no_object_is_one_sentence(frame, labels, point, message) -> 
         target_at(labels, frame, point)
 
 
+def test_the_nearest_pixel_of_an_object_is_named_beside_a_point_on_none(frame) -> None:
+    alone = np.full(frame.depth.shape, -1)
+    with pytest.raises(UserError, match="no object is seen"):
+        target_at(alone, frame, (2, 2))
+    alone[5:9, 10:20] = 0
+    with pytest.raises(UserError, match="nearest pixel of an object is 10 5"):
+        target_at(alone, frame, (2, 2))
+
+
 def test_a_point_without_depth_is_one_sentence(frame, labels) -> None:
     nothing = replace(frame, depth=np.zeros_like(frame.depth))
     with pytest.raises(UserError, match="the depth is unknown there"):
