@@ -239,7 +239,7 @@ def make_planner(
                 "utils.calibration.Calibration or None"
             )
         return planner
-    others = ["a GraspNet checkpoint FILE.pt", "module:name"]
+    others = ["FILE.pt of GraspNet", "module:name"]
     if key == "evaluate.policies":
         others += ["ppo", "ppo:FILE.pt", "sb3:FILE.zip"]
     raise unknown_choice(key, name, [*PLANNERS, *others])
