@@ -48,7 +48,7 @@ ENDINGS = {  # why a round ended
     NO_PLAN: "the planner found no grasp that is likely enough and within reach",
     PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
-    FELL_OFF: "the objects that were left fell off the table",
+    FELL_OFF: "the objects that were left, or the target, fell off the table",
     "target": "the target is in the bin",
     "picks": "as many grasps as objects, and the target is still there",
     "physics": "the simulation blew up",
