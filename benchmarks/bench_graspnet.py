@@ -28,6 +28,7 @@ from models.graspnet_decoding import PeakSettings, decode_grasps, find_peaks
 from models.graspnet_io import (
     SHIPPED,
     SavedGraspNet,
+    fastest_dtype,
     for_inference,
     load_graspnet,
     metres_per_pixel,
@@ -100,7 +101,7 @@ def bench_backbone(
     name: str, model: GraspNet, frame: RGBDFrame, repeats: int, is_default: bool
 ) -> list[Metric]:
     """Size and speed of one network; of the default one also of each part."""
-    fast = for_inference(model)
+    fast = for_inference(model, fastest_dtype())  # as the planners have it
     image = prepare(frame)
     maps = maps_with_peaks(fast(image), frame)
 
@@ -121,6 +122,10 @@ def bench_backbone(
     faster = median_ratio(
         lambda: seconds(lambda: model(image)), lambda: seconds(lambda: fast(image)), repeats
     )
+    exact = for_inference(model)
+    over_float32 = median_ratio(
+        lambda: seconds(lambda: exact(image)), lambda: seconds(lambda: fast(image)), repeats
+    )
     over_network = median_ratio(
         lambda: seconds(whole), lambda: seconds(lambda: fast(image)), repeats
     )
@@ -136,6 +141,7 @@ def bench_backbone(
         Metric("frame_to_grasps_ms", whole_ms, "ms", at_most=25),
         Metric("frame_to_grasps_vs_network", over_network, "x"),
         Metric("for_inference_speedup", faster, "x"),
+        Metric("fastest_dtype_speedup", over_float32, "x"),  # 1 where it is float32
         # As evaluate.py plans: grasps made exact on the depth image as well.
         Metric("planner_ms", planned, "ms", at_most=25),
         Metric("planner_post_processing_ms", planned - prepared - network_ms, "ms", at_most=4),

@@ -144,7 +144,8 @@ class GraspNet(nn.Module):
         below, right = -height % self.backbone.stride, -width % self.backbone.stride
         if below or right:
             x = F.pad(x, (0, right, 0, below), mode="replicate")
-        return self.backbone(x)[..., :height, :width]
+        weight = next(self.backbone.parameters())  # of another dtype than x after `for_inference`
+        return self.backbone(x.to(weight.dtype))[..., :height, :width].to(x.dtype)
 
     def heads(
         self, features: torch.Tensor, logits: bool = False, centres: bool = False

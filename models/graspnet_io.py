@@ -131,11 +131,12 @@ def load_initial(model: GraspNet, path: Path | str) -> None:
     load_weights(model, {"model": weights}, path)
 
 
-def for_inference(model: GraspNet) -> GraspNet:
+def for_inference(model: GraspNet, dtype: torch.dtype = torch.float32) -> GraspNet:
     """Return a faster copy with the same maps up to rounding; it cannot be trained or saved.
 
     Every batch normalisation is folded into the convolution before it, and the weights are stored
-    channels last, the order in which CPU convolutions are fastest.
+    channels last, the order in which CPU convolutions are fastest. dtype: of the backbone; the
+    heads stay float32, for a map rounded to bfloat16 has plateaus where it should have peaks.
     """
     fast = copy.deepcopy(model).eval().requires_grad_(False)
     for sequence in [module for module in fast.modules() if isinstance(module, nn.Sequential)]:
@@ -145,7 +146,18 @@ def for_inference(model: GraspNet) -> GraspNet:
                 transposed = isinstance(layer, nn.ConvTranspose2d)
                 sequence[i] = fuse_conv_bn_eval(layer, norm, transpose=transposed)
                 sequence[i + 1] = nn.Identity()
+    fast.backbone.to(dtype)
     return fast.to(memory_format=torch.channels_last)
+
+
+def fastest_dtype() -> torch.dtype:
+    """The number format in which this CPU's convolutions are fastest: bfloat16 where its matrix
+    unit takes it (Intel's AMX), else float32.
+
+    Without the unit bfloat16 is slower than float32, even on CPUs with instructions for it.
+    """
+    matrix_unit = torch.cpu.get_capabilities().get("amx_bf16", False)
+    return torch.bfloat16 if matrix_unit else torch.float32
 
 
 def export_onnx(saved: SavedGraspNet, path: Path) -> None:

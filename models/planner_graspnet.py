@@ -23,7 +23,7 @@ from models import fan_search
 from models.fan_views import fan_views
 from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shipped_critic
 from models.graspnet_decoding import PeakSettings
-from models.graspnet_io import SHIPPED, SavedGraspNet, for_inference, load_graspnet
+from models.graspnet_io import SHIPPED, SavedGraspNet, fastest_dtype, for_inference, load_graspnet
 from models.graspnet_view import NetworkView
 from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
 from models.planner_candidates import Candidates, SearchSettings, with_chances
@@ -58,7 +58,7 @@ def loaded(checkpoint: Path) -> SavedGraspNet:
 @functools.cache
 def _loaded(path: Path, changed: float) -> SavedGraspNet:
     saved = load_graspnet(path)
-    return saved._replace(model=for_inference(saved.model))
+    return saved._replace(model=for_inference(saved.model, fastest_dtype()))
 
 
 def chances_by(critic: GraspCritic) -> Judge:

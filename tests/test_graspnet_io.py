@@ -15,8 +15,10 @@ from models.graspnet_backbones import BACKBONES
 from models.graspnet_io import (
     KIND,
     OUTPUTS,
+    SHIPPED,
     SavedGraspNet,
     export_onnx,
+    fastest_dtype,
     for_inference,
     load_graspnet,
     load_initial,
@@ -97,6 +99,33 @@ def test_a_folded_network_says_the_same_of_centres():
     with torch.no_grad():
         for ours, theirs in zip(for_inference(model)(x, centres=True), model(x, centres=True)):
             torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_a_backbone_of_bfloat16_says_nearly_the_same():
+    """bfloat16 has 8 bits: a layer rounds by 0.2 % at most. The heads' maps stay float32, in which
+    neighbours differ."""
+    model = load_graspnet(SHIPPED).model
+    x = torch.rand(1, 4, 96, 112, generator=torch.Generator().manual_seed(0)) * 0.2
+    with torch.no_grad():
+        exact = model(x, logits=True, centres=True)
+        ours = for_inference(model, torch.bfloat16)(x, logits=True, centres=True)
+    for a, b in zip(ours, exact):
+        assert a.dtype == torch.float32
+        assert 0 < (a - b).abs().max() < 0.1 * b.std()
+    assert len(ours[0].unique()) > 0.9 * ours[0].numel()
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "dtype"),
+    [
+        ({"amx_bf16": True, "avx512_bf16": True}, torch.bfloat16),
+        ({"amx_bf16": False, "avx512_bf16": True}, torch.float32),  # slower there, as measured
+        ({"architecture": "arm64", "bf16": True}, torch.float32),
+    ],
+)
+def test_bfloat16_is_for_matrix_units_alone(monkeypatch, capabilities, dtype):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    assert fastest_dtype() == dtype
 
 
 def spoil_backbone(content):
