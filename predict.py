@@ -23,17 +23,17 @@ is), which alone part two objects that touch where the planner sees one. Then al
 object, and `clearing` holds grasps that first move aside what is in its way.
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose the
-table's normal is up. The program prints JSON, and writes it to OUT/grasps.json with a picture in
-OUT/grasps.png; OUT is runs/predict/<time>-<name of the image>, or the folder of --out, where they
-replace an earlier run's. Each grasp has `pixel` (u, v) and `image_angle` (from right towards down),
-where its position and closing line lie on the image, `width` between the finger pads, `tilt` of the
-approach from the table's normal, and in `camera` and `world` the pose of the middle between the
-pads, 7.2 mm above the lowest point of the fingertips: z along the approach, y along the closing
-line. `quality` is the chance of success where `calibrated`, beside `grasps`, is true, and else the
-planner's score. A robot here tries none under 0.5; planners from any side prefer steep approaches
-to slightly likelier ones. Units are metres and radians; quaternions are x, y, z, w. If there is
-nothing to grasp the list is empty. `remarks` say what to mistrust. Bad input ends with one sentence
-and status 2.
+table's normal is up. The program prints JSON, on a terminal a table, and writes the JSON to
+OUT/grasps.json with a picture in OUT/grasps.png; OUT is runs/predict/<time>-<name of the image>, or
+the folder of --out, where they replace an earlier run's. Each grasp has `pixel` (u, v) and
+`image_angle` (from right towards down), where its position and closing line lie on the image,
+`width` between the finger pads, `tilt` of the approach from the table's normal, and in `camera` and
+`world` the pose of the middle between the pads, 7.2 mm above the lowest point of the fingertips: z
+along the approach, y along the closing line. `quality` is the chance of success where `calibrated`,
+beside `grasps`, is true, and else the planner's score. A robot here tries none under 0.5; planners
+from any side prefer steep approaches to slightly likelier ones. Units are metres and radians;
+quaternions are x, y, z, w. If there is nothing to grasp the list is empty. `remarks` say what to
+mistrust. Bad input ends with one sentence and status 2.
 """
 
 from __future__ import annotations
@@ -61,7 +61,14 @@ from utils.atomic_files import write_atomic
 from utils.calibration import unlikely_ones
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_files import FORMAT, VERSION, check_output, grasps_as_plain, scene_as_plain
+from utils.grasp_files import (
+    FORMAT,
+    VERSION,
+    check_output,
+    format_grasps,
+    grasps_as_plain,
+    scene_as_plain,
+)
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
 from utils.runs import run_script, timed_folder
@@ -122,7 +129,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb = "replaced" if (out / "grasps.json").exists() else "wrote"
     write_atomic(out / "grasps.png", grasp_picture(frame, grasps, clearing or []))
     write_atomic(out / "grasps.json", text + "\n")
-    print(text)
+    print(format_grasps(content) if sys.stdout.isatty() else text)
     for remark in remarks:
         print(f"remark: {remark}", file=sys.stderr)
     print(f"{verb} {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)

@@ -105,6 +105,22 @@ class UserFiles:
         return printed
 
 
+def test_a_terminal_gets_a_table(files, capsys, monkeypatch):
+    plain = files.run(capsys)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    assert predict.main(files.command()) == 0
+    header, rule, *rows = capsys.readouterr().out.splitlines()
+    assert header.split() == "list rank quality pixel u v width image angle tilt".split()
+    assert set(rule) == {"-", " "}
+    assert len(rows) == len(plain["grasps"])
+    for rank, (row, grasp) in enumerate(zip(rows, plain["grasps"]), start=1):
+        name, place, quality, u, v, width, mm, *_ = row.split()
+        assert (name, int(place), mm) == ("grasps", rank, "mm")
+        assert abs(float(quality) - grasp["quality"]) <= 0.005 + 1e-9
+        assert np.abs(np.array([u, v], float) - grasp["pixel"]).max() <= 0.5
+        assert abs(float(width) / 1000 - grasp["width"]) <= 0.0005 + 1e-9
+
+
 def best_of_each(grasps: list[dict]) -> list[dict]:
     """The best grasp of each cube, in the order of CUBES."""
     places = [in_world(grasp) for grasp in grasps]

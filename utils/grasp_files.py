@@ -15,6 +15,7 @@ import numpy as np
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.image_overlay import is_grasp_picture
+from utils.result_formats import aligned
 from utils.table_plane import Table
 from utils.transforms import (
     Grasp,
@@ -50,6 +51,21 @@ def own_json(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return None
     return content if content.get("format") == FORMAT else None
+
+
+def format_grasps(content: dict[str, Any]) -> str:
+    """The grasps of a grasps.json as a table for people, best first, then those that clear."""
+    lines = [
+        [
+            kind, str(rank), f"{grasp['quality']:.2f}",
+            " ".join(f"{x:.0f}" for x in grasp["pixel"]), f"{1000 * grasp['width']:.0f} mm",
+            f"{np.rad2deg(grasp['image_angle']):.0f} deg", f"{np.rad2deg(grasp['tilt']):.0f} deg",
+        ]
+        for kind in ("grasps", "clearing")
+        for rank, grasp in enumerate(content[kind] or [], start=1)
+    ]  # fmt: skip
+    header = ("list", "rank", "quality", "pixel u v", "width", "image angle", "tilt")
+    return aligned(header, lines, to_the_right=range(1, len(header)))
 
 
 # --- The content ----------------------------------------------------------------------------
