@@ -47,7 +47,7 @@ def points(difference: Figures | None) -> str:
     if value == low == high == 0:
         return "0 (in every resample)"
     if difference["rounds"] < FEW_ROUNDS:
-        return f"{value:+.1f} (few rounds)"
+        return f"{value:+.1f} (under {FEW_ROUNDS} rounds)"
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 

@@ -142,7 +142,7 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     pairs = compare(ROUNDS, seed=0)
     text = format_comparisons(pairs).splitlines()
     assert text[2].startswith("random - heuristic  pile      box")
-    assert text[2].endswith("-30.0 (few rounds)  2")
+    assert text[2].endswith("-30.0 (under 20 rounds)  2")
     many = [replace(one, cleared=replace(one.cleared, rounds=20)) for one in pairs]
     assert format_comparisons(many).splitlines()[2].endswith("-30.0 [-40.0, -20.0]  2")
     assert format_comparisons([]) == ""
@@ -167,6 +167,6 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
     write_comparisons_latex(tmp_path / "pairs.tex", renamed)
     lines = (tmp_path / "pairs.tex").read_text().splitlines()
     assert lines[4].startswith(
-        r"random $-$ heuristic & pile & random\_urdfs & -50.0 (few rounds) & "
+        r"random $-$ heuristic & pile & random\_urdfs & -50.0 (under 20 rounds) & "
     )
-    assert lines[4].endswith(r"& -30.0 (few rounds) & 2 \\") and lines[-1] == r"\end{tabular}"
+    assert lines[4].endswith(r"& -30.0 (under 20 rounds) & 2 \\") and lines[-1] == r"\end{tabular}"

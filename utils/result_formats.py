@@ -271,7 +271,7 @@ def _points(difference: Difference | None) -> str:
         return "-"
     value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
     if not has_interval(difference):
-        return f"{value:+.1f} (few rounds)"
+        return f"{value:+.1f} (under {FEW_ROUNDS} rounds)"
     return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
