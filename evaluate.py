@@ -156,12 +156,12 @@ def check_options(options: argparse.Namespace) -> None:
 
 def announce(config: Config, run: Path) -> None:
     plan, split = config.evaluate, config.objects.split
-    rounds = "round" if plan.rounds == 1 else "rounds"
+    rounds = "1 round" if plan.rounds == 1 else f"{plan.rounds} rounds"
     sets = [f"{name} ({split})" if name in OBJECT_SETS else name for name in plan.object_sets]
     print(
         f"{', '.join(policy_name(*pair) for pair in policies_of(config))} on "
         f"{', '.join(plan.scenarios)} scenes of {', '.join(sets)} with depth noise "
-        f"{', '.join(depth_noises_of(config))}, {plan.rounds} {rounds} each, seed {config.seed}, in "
+        f"{', '.join(depth_noises_of(config))}, {rounds} each, seed {config.seed}, in "
         f"{config.simulator}, on {describe_workers(config)}; results in {run}",
         flush=True,
     )
