@@ -110,7 +110,7 @@ def test_a_terminal_gets_a_table(files, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     assert predict.main(files.command()) == 0
     header, rule, *rows = capsys.readouterr().out.splitlines()
-    assert header.split() == "list rank quality pixel u v width image angle tilt".split()
+    assert header.split() == ["list", "rank", "quality", "pixel", "u", "v", "width", "image", "angle", "tilt"]
     assert set(rule) == {"-", " "}
     assert len(rows) == len(plain["grasps"])
     for rank, (row, grasp) in enumerate(zip(rows, plain["grasps"]), start=1):
