@@ -10,6 +10,7 @@ the image nor the solids behind them.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -95,12 +96,13 @@ def search(
     """Feasible candidates on a height map, measured and scored, best first; may be empty.
 
     value: returns a factor (N,) on the candidates' scores, such as a network's prediction. Where
-    nothing meets the margins, a second search has relaxed ones: a poor attempt may clear an object,
-    no attempt ends the round.
+    nothing meets the margins, a second search has relaxed ones, and a third a hand that stands off
+    the centre: a poor attempt may clear an object, no attempt ends the round.
     """
     found = search_once(heights, gripper, workspace, settings, value)
-    if len(found) == 0:
-        found = search_once(heights, gripper, workspace, settings.relaxed(), value)
+    for easier in (settings.relaxed(), settings.off_centre()):
+        if len(found) == 0:
+            found = search_once(heights, gripper, workspace, easier, value)
     return found
 
 
@@ -175,19 +177,23 @@ def dense_candidates(
         )
         tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
         under_finger, under_palm = cv2.dilate(turned, finger), cv2.dilate(turned, palm)
-        free = under_palm[row, centre] < tip - settings.clearance + gripper.palm_height
+        away = np.rint(np.divide(settings.offsets, cell)).astype(int)[:, None]
+        under_hand = under_palm[row, np.clip(centre + away, 0, size - 1)].min(axis=0)
+        free = under_hand < tip - settings.clearance + gripper.palm_height
         row, first, last, tip = row[free], first[free], last[free], tip[free]
         limit, free = tip - settings.clearance, np.zeros(len(tip), bool)
         rooms = settings.rooms  # a sloping flank needs more room
         if gripper.opens_fully:
             rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
-        for room in rooms:
-            offset = (room + thickness / 2) / cell  # from the contact to the finger's middle
+        for room, away in itertools.product(rooms, settings.offsets):
+            beside = room + thickness / 2  # from the contact to the finger's middle
             # Beside a wall it may be outside.
-            left = np.maximum(np.rint(first - offset).astype(int), 0)
-            right = np.minimum(np.rint(last + offset).astype(int), size - 1)
+            left = np.rint(first - (beside + max(-2 * away, 0)) / cell).astype(int)
+            right = np.rint(last + (beside + max(2 * away, 0)) / cell).astype(int)
+            left, right = np.maximum(left, 0), np.minimum(right, size - 1)
             fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
-            free |= fits & ((last - first + 1) * cell + 2 * room < gripper.max_opening + 2 * cell)
+            opening = (last - first + 1) * cell + 2 * (room + abs(away))
+            free |= fits & (opening < gripper.max_opening + 2 * cell)
         row, first, last, tip = row[free], first[free], last[free], tip[free]
 
         base = middle + cell * (row - half)[:, None] * across
@@ -367,25 +373,33 @@ def measure(
         mixed = other.take(where[left_over]) & (height[left_over] > tip[left_over, None, None])
         mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (len(v) * between.sum(axis=1))
         left_over = left_over[mixed <= settings.most_other]
-    near, opening, covered = np.abs(u - shift[:, None]), np.zeros(N), np.zeros(N)
-    opening[left_over] = _widest_opening(
-        heights.highest_around("height", 1, cv2.MORPH_RECT).take(where[left_over]).max(axis=1),
-        near[left_over], tip[left_over], width[left_over], gripper, settings,
-    )  # fmt: skip
+    offset, opening, covered = np.zeros(N), np.zeros(N), np.zeros(N)
+    obstacles = heights.highest_around("height", 1, cv2.MORPH_RECT)
+    for away in settings.offsets:
+        waiting = left_over[opening[left_over] == 0]
+        room = _widest_opening(
+            obstacles.take(where[waiting]).max(axis=1), u - shift[waiting, None], away,
+            tip[waiting], width[waiting], gripper, settings,
+        )  # fmt: skip
+        waiting, room = waiting[room > 0], room[room > 0]
+        middle = xy[waiting] + away * along[waiting]
+        gap = _palm_gap(middle, along[waiting], across[waiting], heights, gripper)
+        fits = gap >= settings.clearance - tip[waiting]
+        opening[waiting[fits]], offset[waiting[fits]] = room[fits], away
     left_over = left_over[opening[left_over] > 0]
-    gap = _palm_gap(xy[left_over], along[left_over], across[left_over], heights, gripper)
-    left_over = left_over[gap >= settings.clearance - tip[left_over]]
     beside = opening[left_over]
     if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
         beside = np.minimum(beside, width[left_over] + 2 * settings.rooms[-1])
-    under = gripper.finger_underside(near[left_over] - beside[:, None] / 2)
+    near = np.abs(u - (shift + offset)[left_over, None])
+    under = gripper.finger_underside(near - beside[:, None] / 2)
     over = heights.ceiling.take(where[left_over]) - under[:, None]
     covered[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
 
+    room_beside = (opening - width) / 2 - np.abs(offset)  # on the side of the nearer finger
     score = grip_score(
         np, settings, wedge=wedge, turn=turn, tilt=tilt, arms=(arm_across, arm_along, arm_up),
         cover=cover, engagement=engagement,
-        roomy=np.interp((opening - width) / 2, (0.003, 0.008), (0.4, 1.0)),
+        roomy=np.interp(room_beside, (0.003, 0.008), (0.4, 1.0)),
         covered=covered, together=ends[0] == ends[1],
         over_table=heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)])),
     )  # fmt: skip
@@ -394,11 +408,11 @@ def measure(
     turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
     facts = np.column_stack([
         wedge, tilt_left, tilt_right, cover, arm_across, arm_along, arm_up, engagement, covered,
-        (opening - width) / 2, ends[0] == ends[1],
+        room_beside, ends[0] == ends[1],
     ])  # fmt: skip
     facts = np.nan_to_num(facts, posinf=np.pi, neginf=-np.pi)  # of what touches nothing
     score *= feasible
-    return Candidates(xy, candidates.angle, tip, width, opening, turn, label, score, facts)
+    return Candidates(xy, candidates.angle, tip, width, opening, offset, turn, label, score, facts)
 
 
 def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
@@ -440,7 +454,8 @@ def _thickness(left: np.ndarray, right: np.ndarray, along: np.ndarray, cell: flo
 
 def _widest_opening(
     obstacles: np.ndarray,
-    near: np.ndarray,
+    beside: np.ndarray,
+    offset: float,
     tip: np.ndarray,
     width: np.ndarray,
     gripper: GripperGeometry,
@@ -449,20 +464,22 @@ def _widest_opening(
     """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is. Of a
     gripper that opens fully only the widest of all counts.
 
-    obstacles, near: (N, U) heights along the closing line and their distances from the middle.
+    obstacles, beside: (N, U) heights along the closing line and where they are, from the middle of
+    the contacts. offset: of the hand's middle from there.
     """
     # Between contact and finger only the closing pads pass, over all that is below the tips.
     sill = np.where(
-        near > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
+        np.abs(beside) > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
     )
+    near, half_width = np.abs(beside - offset), width / 2 + abs(offset)
     opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
     for room in (np.inf,) if gripper.opens_fully else reversed(settings.rooms):
-        half = np.minimum(width[open_yet] / 2 + room, gripper.max_opening / 2)
+        half = np.minimum(half_width[open_yet] + room, gripper.max_opening / 2)
         outward = near[open_yet] - half[:, None]
         below_finger = gripper.finger_underside(np.maximum(outward, 0))
         under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
         fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
-        fits &= half >= width[open_yet] / 2 + settings.rooms[0] - 1e-9
+        fits &= half >= half_width[open_yet] + settings.rooms[0] - 1e-9
         opening[open_yet[fits]] = 2 * half[fits]
         open_yet = open_yet[~fits]
     return opening

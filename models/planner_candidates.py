@@ -26,15 +26,20 @@ FACTS = (
 )  # fmt: skip
 
 
+# m, of a hand whose one finger pushes what it grips until the other one touches it, too.
+OFF_CENTRE = (0.0, 0.01, -0.01, 0.02, -0.02)
+
+
 @dataclass
 class Candidates:
     """N candidate grasps, one column for each quantity; metres and radians.
 
-    xy: (N, 2) middle between the fingertips in W. angle: (N,) of the closing line. tip: (N,) height
+    xy: (N, 2) middle between the contacts in W. angle: (N,) of the closing line. tip: (N,) height
     of the fingertips' lowest point in W. width: (N,) of the matter between the fingers. opening:
-    (N,) of the hand before closing. turn: (N,) rotation that would bring the pads flat onto the
-    faces. label: (N,) the object in the height map. score: (N,), 0 for an infeasible grasp. facts:
-    (N, len(FACTS)) what was measured, 0 before.
+    (N,) of the hand before closing. offset: (N,) of the hand's middle from xy along the closing
+    line; the finger that touches first pushes what it meets. turn: (N,) rotation that would bring
+    the pads flat onto the faces. label: (N,) the object in the height map. score: (N,), 0 for an
+    infeasible grasp. facts: (N, len(FACTS)) what was measured, 0 before.
     """
 
     xy: np.ndarray
@@ -42,6 +47,7 @@ class Candidates:
     tip: np.ndarray
     width: np.ndarray
     opening: np.ndarray
+    offset: np.ndarray
     turn: np.ndarray
     label: np.ndarray
     score: np.ndarray
@@ -50,12 +56,13 @@ class Candidates:
     @staticmethod
     def rough(xy, angle, tip, width, score) -> Candidates:
         """Candidates of the dense stage, which are not measured yet."""
-        turn, label, facts = (
+        offset, turn, label, facts = (
+            np.zeros(len(tip)),
             np.zeros(len(tip)),
             np.full(len(tip), -1),
             np.zeros((len(tip), len(FACTS))),
         )
-        return Candidates(xy, angle, tip, width, width.copy(), turn, label, score, facts)
+        return Candidates(xy, angle, tip, width, width.copy(), offset, turn, label, score, facts)
 
     @staticmethod
     def joined(parts: Sequence[Candidates]) -> Candidates:
@@ -104,10 +111,11 @@ class Candidates:
     def grasps(self, gripper: GripperGeometry) -> list[Grasp]:
         """The candidates as grasps, in the same order."""
         height = self.tip + gripper.tip_below_centre
+        middle = self.xy + self.offset[:, None] * self.axes()[0]
         return [
             Grasp(np.array([x, y, z]), angle, opening, score)
             for (x, y), z, angle, opening, score in zip(
-                self.xy, height, self.angle, self.opening.tolist(), self.score.tolist()
+                middle, height, self.angle, self.opening.tolist(), self.score.tolist()
             )
         ]
 
@@ -142,6 +150,7 @@ class SearchSettings:
     shortlist: int = 1000  # survivors of the dense stage that are measured
     finalists: int = 250  # of these, turned onto the faces and measured again
     split_factor: float = 0.5  # on the score of a grasp whose ends lie on different objects
+    offsets: tuple[float, ...] = (0.0,)  # of the hand along its closing line, the first that fits
     most_other: float = 0.1  # share of other objects between the fingers that close on a target
     returned: int = 20  # grasps at most
     distinct_distance: float = 0.01  # no two returned grasps are both closer than this
@@ -159,6 +168,11 @@ class SearchSettings:
             max_wedge=max(self.max_wedge, RELAXED.max_wedge),
             min_facing=min(self.min_facing, 0.6),
         )
+
+    def off_centre(self) -> SearchSettings:
+        """Relaxed settings whose hand may also stand beside the middle of what it grips, where a
+        wall or a neighbour leaves the palm no room over it. Few of the shortlist fit there."""
+        return replace(self.relaxed(), offsets=OFF_CENTRE, shortlist=4 * self.shortlist)
 
 
 def grip_score(

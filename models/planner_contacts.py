@@ -85,7 +85,7 @@ def exact_contacts(
     along, across = cos * along + sin * across, cos * across - sin * along
     value, slips = _pad_contacts(
         centre.reshape(-1, 3), along.reshape(-1, 3), across.reshape(-1, 3),
-        np.repeat(candidates.opening / 2, P), scene, gripper,
+        np.repeat(candidates.opening / 2 - np.abs(candidates.offset), P), scene, gripper,
     )  # fmt: skip
     value, slips = value.reshape(N, P), slips.reshape(N, P)[:, 0]
     quality = 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)

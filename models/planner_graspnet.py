@@ -149,7 +149,8 @@ class GraspNetDirectPlanner(GraspNetPlanner):
         value = partial(seen.value, heights)
         rough = self._at_peaks(seen.peaks(PEAKS), heights)
         rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
-        for settings in (self.settings, self.settings.relaxed()):
+        strict = self.settings
+        for settings in (strict, strict.relaxed(), strict.off_centre()):
             found = measure(
                 self._at_depths(rough, settings), heights, self.gripper, settings, len(DEPTH_STEPS)
             )

@@ -155,6 +155,20 @@ def test_no_finger_goes_into_a_narrow_gap_at_a_wall_and_none_grasps_the_wall(
         assert gap > 0.02 or abs(grasp.closing_direction[1]) > 0.9
 
 
+@pytest.mark.parametrize("name", DELIBERATE)
+def test_beside_a_wall_the_hand_stands_off_the_centre(name: str) -> None:
+    """The palm reaches 104 mm along the closing line, 46 mm over the tips: too far over the middle
+    of a bar that lies 92 mm from a wall of 100 mm. Each finger opens by 40 mm."""
+    bar = ((0.02, 0.12, 0.04), 0.0, (0.5 + 0.15 - 0.092, 0.0))
+    grasps = planner(name)(boxes_frame([bar, *bin_walls()], walls=4))
+    assert grasps
+    for grasp in grasps:
+        reach = abs(grasp.closing_direction[0])
+        assert reach > 0.8 and grasp.position[0] + 0.104 * reach < 0.65
+        beside = abs(bar[2][0] - grasp.position[0])
+        assert 0.005 < beside < grasp.width / 2 - 0.01  # the bar is between the pads
+
+
 @pytest.mark.parametrize("degrees", [0, 35, 90])
 def test_a_flat_stick_is_held_below_its_top_and_above_the_table(degrees: int) -> None:
     """7 mm high: the usual margins leave no room for fingers, so relaxed ones serve."""
