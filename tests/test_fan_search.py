@@ -64,9 +64,13 @@ def both(frame: RGBDFrame, others: bool = False) -> tuple[list[HeightMap], FanVi
     return single, fan_views(overhead, *holeless, frames, CPU)
 
 
+# What both kinds of candidates have.
+COLUMNS = [field.name for field in fields(Candidates) if field.name != "offset"]
+
+
 def tensors(found: Candidates, view: int) -> FanCandidates:
-    """Candidates of one map as those of a view."""
-    columns = (torch.from_numpy(np.array(getattr(found, field.name))) for field in fields(found))
+    """Candidates of one map as those of a view, whose hands all stand over the middle."""
+    columns = (torch.from_numpy(np.array(getattr(found, name))) for name in COLUMNS)
     return FanCandidates(torch.full((len(found),), view), *columns, torch.ones(len(found)).double())
 
 
@@ -186,9 +190,10 @@ def assert_same(found: FanCandidates, expected: Candidates) -> None:
     """All columns of the candidates; of infeasible ones the score alone."""
     np.testing.assert_allclose(found.score, expected.score, atol=1e-6)
     some = expected.score > 0
-    for field in fields(expected):
-        ours, theirs = getattr(found, field.name).numpy(), getattr(expected, field.name)
-        np.testing.assert_allclose(ours[some], theirs[some], atol=1e-6, err_msg=field.name)
+    assert not expected.offset.any()
+    for name in COLUMNS:
+        ours, theirs = getattr(found, name).numpy(), getattr(expected, name)
+        np.testing.assert_allclose(ours[some], theirs[some], atol=1e-6, err_msg=name)
 
 
 # --- Planner ----------------------------------------------------------------------------------
