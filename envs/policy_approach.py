@@ -28,7 +28,9 @@ from utils.result_records import OPEN_LOOP
 from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
-KNOWN_TO_A_ROBOT = ("rgb", "depth", "state", "end_effector_position", "gripper", "opening_error")
+KNOWN_TO_A_ROBOT = (
+    "rgb", "depth", "state", "end_effector_position", "gripper", "opening_error", "reachable",
+)  # fmt: skip
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
 _STILL = 0.001  # m between two observations: fingers that move may push without holding
 LEARNED_SCENARIOS = ("isolated", "static")  # one object, which stays where it is
