@@ -61,14 +61,7 @@ from utils.atomic_files import write_atomic
 from utils.calibration import unlikely_ones
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
-from utils.grasp_files import (
-    FORMAT,
-    VERSION,
-    check_output,
-    format_grasps,
-    grasps_as_plain,
-    scene_as_plain,
-)
+from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain, scene_as_plain
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
 from utils.runs import run_script, timed_folder
@@ -83,16 +76,18 @@ PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = parse_options(argv)
-    saved = load_graspnet(options.checkpoint or SHIPPED)
     if options.export is not None:
-        export_onnx(saved, options.export)
+        export_onnx(load_graspnet(options.checkpoint or SHIPPED), options.export)
         print(f"wrote {options.export}", file=sys.stderr)
         return 0
     if options.out is not None:
         check_output(options.out)
     image = read_image(options)
     options.mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
-    training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
+    network = options.planner in NETWORK_PLANNERS
+    saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
+    if saved is not None:
+        training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
@@ -102,18 +97,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     planner = new_planner(options, saved, workspace)
     frame = replace(frame, target=find_target(planner, frame, options))
 
-    grasps, clearing = planner(frame)[: options.count], None
+    found, clearing = planner(frame), None
+    grasps = found[: options.count]
     if frame.target is not None:
-        clearing = TargetPlanner(planner).clearing(frame, grasps)[: options.count]
+        clearing = TargetPlanner(planner).clearing(frame, found)[: options.count]
         remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
     else:
         remarks += check_found(len(grasps), frame, workspace)
     if planner.calibration is not None:
         remarks += unlikely_ones([one.quality for one in (*grasps, *(clearing or []))])
-    posed, network = options.camera_pose is not None, options.planner in NETWORK_PLANNERS
+    posed = options.camera_pose is not None
     content = {
-        "format": FORMAT,
-        "version": VERSION,
+        **MARK,
         "rgb": str(options.rgb),
         "depth": str(options.depth),
         "planner": options.planner,
@@ -220,10 +215,10 @@ def locate_table(image: RGBDFrame, options: argparse.Namespace) -> Table:
 
 
 def new_planner(
-    options: argparse.Namespace, saved: SavedGraspNet, workspace: Workspace
+    options: argparse.Namespace, saved: SavedGraspNet | None, workspace: Workspace
 ) -> SearchPlanner:
     """The planner, which gives as many grasps as were asked for, or as usual."""
-    if options.checkpoint is None:
+    if saved is None or options.checkpoint is None:
         planner = make_planner(options.planner, GripperGeometry(), workspace, 0, "--planner")
     else:
         make = ALL_PLANNERS[options.planner]

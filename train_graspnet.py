@@ -54,7 +54,7 @@ from models.graspnet_scores import (
     row_in_words,
     write_curves,
 )
-from models.graspnet_training import Trainer, make_network, mean_of
+from models.graspnet_training import Trainer, check_network, make_network, mean_of
 from models.rectangle_examples import JudgedRectangle
 from models.rectangle_folds import (
     Fold,
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
     check_place(options.resume or Path("runs/train_graspnet"))
-    make_network(config, config.gripper.max_opening)  # an impossible one fails here, before data
+    check_network(config)  # before there is data
     photographs = open_target(config)
     with team(config.train.device, os.environ) as processes:
         if config.data.kind != "simulated":

@@ -144,7 +144,7 @@ class ClosedLoop:
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """See `envs.execution.open_loop`. Raises GraspFailure with what stopped the arm."""
         robot, settings = cell.robot, cell.config.closed_loop
-        robot.command_gripper(grasp.width)
+        robot.command_gripper(cell.gripper.opening_before(grasp.width))
         arm = ServoArm(cell, safety=reaching_down(cell.config.safety, settings.floor))
         with _servo_errors_as_failures(arm):
             guided = GuidedApproach(self, arm, grasp)

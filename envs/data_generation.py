@@ -24,7 +24,7 @@ from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_bin, execute_grasp
-from envs.objects import ObjectPart, ObjectSet, load_object_set
+from envs.objects import OBJECT_SETS, ObjectPart, ObjectSet, load_object_set
 from envs.simulators import cell_class
 from utils.atomic_files import write_atomic
 from utils.config import Config, dump_config, load_config, with_settings
@@ -34,6 +34,7 @@ from utils.executor import LostWorkerError, completed, open_executor
 from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
+from utils.runs import named_files
 from utils.worker_process import kept
 
 SPLITS = ("train", "validation")
@@ -47,7 +48,7 @@ _PHYSICS = ("object_friction", "object_mass")  # on which labels and their trial
 _FIRST_SEED = {
     "train": 1_000_000_000,
     "validation": 2_000_000_000,
-}  # no evaluation uses these seeds
+}  # of scenes; those of an evaluation with a seed below 10,000 are smaller
 
 
 # `generate` refuses other views than the fixed one, and a hand without an arm.
@@ -96,12 +97,29 @@ def _content(config: Config) -> str:
         "most_packed": _MOST_PACKED,
         "first_seed": _FIRST_SEED,
     }
+    files = named_files(config)
+    own = {
+        name: files.get(name) or _digest(Path(name).expanduser())
+        for name in config.data.object_sets
+        if name not in OBJECT_SETS
+    }
+    if own:
+        chosen["files"] = own
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
     chosen["gripper"] = json.loads(json.dumps(asdict(config.gripper.geometry)))
     for name in ("opens_fully", "least_held"):
         if not chosen["gripper"][name]:  # valid as above
             chosen["gripper"].pop(name)
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
+
+
+def _digest(folder: Path) -> str:
+    """SHA-256 of the names and contents of all files below a folder."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return digest.hexdigest()
 
 
 def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:

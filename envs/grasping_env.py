@@ -129,7 +129,7 @@ class RobotGraspingEnv(gymnasium.Env):
     in this cell, which its owner loads scenes into and closes; `take_over` replaces `reset`.
 
     **Options of reset**: `scene_seed` asks for one scene. `start` says where the hand begins:
-    "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it, which is easier; or
+    "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it in x and in y, easier; or
     "pretraining", in any state that an episode may lead to, to train a state estimator: without a
     seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share`
     of the episodes begins near. The attribute `start` is the option that begins there again.

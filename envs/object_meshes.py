@@ -9,9 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +21,7 @@ import trimesh
 from envs import object_parts
 from envs.object_parts import MassProperties, convex_parts, solid_of
 from utils.atomic_files import write_atomic
-from utils.errors import UserError
+from utils.errors import UNREADABLE_NPZ, UserError
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".dae")
 MOST_FACES, MOST_PIECES = 2_000_000, 2_000
@@ -254,13 +251,6 @@ def _content_hash(mesh: trimesh.Trimesh) -> str:
     return digest.hexdigest()[:20]
 
 
-# What numpy and zipfile raise on a damaged file, depending on where the damage is.
-_UNREADABLE = (
-    OSError, EOFError, KeyError, ValueError, TypeError, IndexError, MemoryError, OverflowError,
-    NotImplementedError, SyntaxError, struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-
-
 def _read_parts(path: Path) -> Decomposition:
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -273,7 +263,7 @@ def _read_parts(path: Path) -> Decomposition:
             raise ValueError("its shapes contradict each other")
         if not all(np.isfinite(one).all() for one in (vertices, volume, centre, inertia)):
             raise ValueError("its numbers contradict each other")
-    except _UNREADABLE as error:
+    except UNREADABLE_NPZ as error:
         raise _corrupt(path, str(error)) from error
     parts = np.split(vertices, np.cumsum(counts)[:-1])
     return Decomposition(parts, MassProperties(float(volume), centre, inertia), remark)

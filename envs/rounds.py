@@ -119,7 +119,8 @@ def run_round(
         plan = TargetPlanner(plan)
     attempts: list[AttemptRecord] = []
     failures = Failures()
-    plan_seconds, ended, table_height = 0.0, "cleared", Workspace().table_height
+    plan_seconds, began, ended = 0.0, cell.seconds, "cleared"
+    table_height = Workspace().table_height
 
     def see() -> RGBDFrame:
         mount = cell.config.camera.mount
@@ -129,6 +130,7 @@ def run_round(
         with planner_errors(policy):
             reset_planner(plan, scene.seed)
         while cell.remaining and len(failures.in_a_row) < max_failures:
+            plan_seconds, began = 0.0, cell.seconds
             frame = look_again(see)
             if wanted is not None:
                 assert frame.segmentation is not None  # a cell's frames have it
@@ -194,7 +196,7 @@ def run_round(
         attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, spent, detail=detail))
         ended = PLANNER_ERROR
     except PhysicsError:
-        attempts.append(AttemptRecord(False, "physics", plan_seconds, 0.0))
+        attempts.append(AttemptRecord(False, "physics", plan_seconds, cell.seconds - began))
         ended = "physics"
     if ended == "cleared" and cell.remaining:
         ended = "failures"

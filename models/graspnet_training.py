@@ -17,7 +17,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from models.graspnet import GraspLoss, GraspNet, create_model
 from models.graspnet_data import Example
-from models.graspnet_io import KIND, PIXEL_SIZE, load_initial
+from models.graspnet_io import KIND, PIXEL_SIZE, load_graspnet, load_initial
 from utils.checkpoint import (
     load_checkpoint,
     load_weights,
@@ -64,6 +64,12 @@ def make_network(config: Config, max_width: float) -> GraspNet:
     if config.train.initial is not None:
         load_initial(model, config.train.initial)
     return model
+
+
+def check_network(config: Config) -> None:
+    """Raise UserError if the network that the config describes cannot be made."""
+    initial, width = config.train.initial, config.gripper.max_opening
+    make_network(config, width if initial is None else load_graspnet(initial).model.max_width)
 
 
 class Trainer:

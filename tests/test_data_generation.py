@@ -64,6 +64,18 @@ def test_where_no_grasp_is_executed_the_robot_does_not_matter():
     assert folder_of(seen_only, "robot.grip_force=2") == folder_of(seen_only)
 
 
+def test_the_files_of_an_own_set_matter_wherever_its_folder_is_named(tmp_path):
+    one, other = tmp_path / "meshes" / "cube.obj", tmp_path / "meshes" / "part" / "cube.mtl"
+    other.parent.mkdir(parents=True)
+    seen = set()
+    for path, text in ((one, "v 0 0 0"), (one, "v 0 0 1"), (other, "Kd 1 0 0"), (one, "v 0 0 0")):
+        path.write_text(text)
+        seen.add(folder_of(f"data.object_sets={tmp_path / 'meshes'}"))
+    assert len(seen) == 4
+    other.unlink()
+    assert folder_of(f"data.object_sets={tmp_path / 'meshes'}") in seen
+
+
 @pytest.mark.parametrize(
     "override",
     [

@@ -22,6 +22,20 @@ def test_a_film_has_a_name_that_every_system_allows(policy, objects, noise, name
     assert film_name(task, policy, noise, "mp4") == name
 
 
+def test_a_film_of_long_paths_has_a_name_of_its_own():
+    """Systems allow 255 bytes, and a file that is being written has an ending more."""
+    names = set()
+    for policy in (
+        "/home/me/" + 200 * "a" + ".pt",
+        "/home/me/" + 200 * "a" + "b.pt",
+        90 * "\u7269",
+    ):
+        task = Task(150 * "m", "pile", 7, ((policy, "open_loop", "none"),))
+        names.add(film_name(task, policy, "none", "mp4"))
+    assert len(names) == 3 and max(len(name.encode()) for name in names) < 200
+    assert all(name.startswith("pile-mmm") and name.endswith(".mp4") for name in names)
+
+
 def test_a_planner_that_cannot_tell_objects_apart_does_not_retrieve(config):
     def asked(policy: str) -> Config:
         changes = {"policies": (policy,), "scenarios": ("retrieve",), "object_sets": ("box",)}

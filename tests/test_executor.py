@@ -70,6 +70,18 @@ def test_an_error_of_a_call_is_raised():
         list(completed(workers, lambda x: 1 / x, [0]))
 
 
+def nap_or_fail(seconds):
+    return nap(seconds) if seconds else 1 / seconds
+
+
+def test_what_is_under_way_when_a_call_fails_is_not_lost():
+    results = []
+    with Threads(3) as workers, pytest.raises(ZeroDivisionError):
+        for result in completed(workers, nap_or_fail, [0.2, 0.0, 0.3, 0.1, 0.1]):
+            results.append(result)
+    assert results == [0.2, 0.3]  # the first three were under way; no more are submitted
+
+
 # --- In processes -------------------------------------------------------------------------------
 
 

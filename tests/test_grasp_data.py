@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.box_frames import boxes_frame
+from utils import grasp_data
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, SceneGeometry, SolidObject, Workspace
 from utils.grasp_data import LabelledFrame, SimulatedDataset, read_trials, shard_path, write_shard
@@ -113,6 +114,15 @@ def test_frames_limits_how_many_are_used(stored):
     with pytest.raises(IndexError):
         images[3]
     assert len(SimulatedDataset(folder, "train", 10)) == 4
+
+
+def test_few_files_are_open_at_a_time(stored, monkeypatch):
+    monkeypatch.setattr(grasp_data, "_MOST_OPEN", 1)
+    images = SimulatedDataset(stored[0], "train")
+    assert len(images.paths) > 1
+    once = [images[i].rgb for i in range(len(images))]
+    assert all(np.array_equal(images[i].rgb, once[i]) for i in reversed(range(len(images))))
+    assert len(images._files) == 1
 
 
 def test_a_data_set_that_was_read_goes_to_another_process(stored):

@@ -223,6 +223,12 @@ def test_grasp_that_one(how, number, files, capsys):
         assert np.hypot(*(in_world(grasp)[:2] - xy)) < 0.03
 
 
+def test_a_planner_without_a_network_reads_none(files, capsys, monkeypatch):
+    monkeypatch.delattr(predict, "load_graspnet")
+    found = files.run(capsys, planner="heuristic", checkpoint=None)
+    assert found["grasps"] and found["checkpoint"] is None
+
+
 def test_a_mask_that_may_be_inverted_is_asked_about(files, capsys):
     pixels = marked(files, list(CUBES)[0])
     np.save(files.folder / "mask.npy", ~pixels)

@@ -208,3 +208,18 @@ def test_the_pictures_that_a_report_may_show_are_kept_for_a_resumed_run(tmp_path
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(UserError, match="gallery.npz: cannot be read as pictures"):
         read_gallery(path)
+
+
+def test_flipped_bytes_of_kept_pictures_are_one_sentence(tmp_path):
+    path, rng = tmp_path / "gallery.npz", np.random.default_rng(0)
+    image = rng.integers(0, 255, (4, 6, 3), np.uint8)
+    write_gallery(path, [GalleryItem(image, "a", False, "b", ("pile", "box", "none"), "missed")], 3)
+    whole, refused = path.read_bytes(), 0
+    for place in rng.integers(0, len(whole), 150):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :])
+        try:
+            read_gallery(path)
+        except UserError as error:
+            assert "cannot be read as pictures" in str(error)
+            refused += 1
+    assert refused > 75

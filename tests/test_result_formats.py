@@ -170,3 +170,7 @@ def test_comparisons_as_text_csv_and_latex(tmp_path):
         r"random $-$ heuristic & pile & random\_urdfs & -50.0 (under 20 rounds) & "
     )
     assert lines[4].endswith(r"& -30.0 (under 20 rounds) & 2 \\") and lines[-1] == r"\end{tabular}"
+    paths = [replace(pairs[0], objects=r"~\{m}^")]
+    write_comparisons_latex(tmp_path / "pairs.tex", paths)
+    escaped = r"\textasciitilde{}\textbackslash{}\{m\}\textasciicircum{}"
+    assert f"& {escaped} &" in (tmp_path / "pairs.tex").read_text()

@@ -7,7 +7,16 @@ returns a velocity for a faulty input: a zero velocity would be taken for succes
 from __future__ import annotations
 
 import difflib
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterable
+
+# What numpy and zipfile raise on a damaged .npz, depending on where the damage is.
+UNREADABLE_NPZ = (
+    OSError, EOFError, KeyError, ValueError, TypeError, IndexError, AttributeError, MemoryError,
+    OverflowError, NotImplementedError, SyntaxError, struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 class UserError(ValueError):

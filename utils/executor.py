@@ -114,9 +114,11 @@ def completed(
 
     No more items are submitted at a time than there are workers, and `items` is read only as far as
     that. stop: once it is set, no more items are submitted, and the calls under way are finished
-    unless there is no worker for them. Raises what a call has raised.
+    unless there is no worker for them. Raises what a call has raised, the first one of several,
+    once the calls under way are finished and what they return has been yielded.
     """
     waiting, pending = iter(items), set()
+    failed: Exception | None = None
     while True:
         if stop is not None and stop.is_set():
             waiting = iter(())
@@ -125,11 +127,18 @@ def completed(
         more = islice(waiting, max(0, workers.size() - len(pending)))
         pending |= {workers.submit(function, item) for item in more}
         if not pending:
-            return
+            break
         # Not for ever: workers may have joined or left, or `stop` may have been set.
         finished, pending = wait(pending, COUNT_SECONDS, FIRST_COMPLETED)
         while finished:  # forgotten at once, or a cluster would compute lost results again
-            yield finished.pop().result()
+            try:
+                result = finished.pop().result()
+            except Exception as error:  # whatever it is, it is raised in the end
+                failed, waiting = failed or error, iter(())
+                continue
+            yield result
+    if failed is not None:
+        raise failed
 
 
 def _lost(job: Job) -> LostWorkerError:

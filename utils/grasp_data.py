@@ -30,6 +30,7 @@ from utils.transforms import RGBDFrame, project
 FORMAT_VERSION = 2
 _DEPTH_UNIT = 5e-5  # metres; 16 bits reach 3.2 m
 _QUALITY_UNIT = 1 / 255
+_MOST_OPEN = 64  # shards of a reading process; systems allow some hundreds of files
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ def write_shard(
     stored as whole numbers of their attribute `unit`, the width in 255 steps; `instance` is the
     number of the object at each pixel, -1 for none, and `centres` holds the objects' centres of
     mass in W. The frames must carry segmentation and truth, of scenes from which no object was
-    retired: only then do both number the objects in the same way.
+    retired: only then do both number the objects in the same way. Depths
+    that 16 bits do not hold, over 3.2 m, are cut off there.
     """
     units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": max_width / 255}
     stacked = {
@@ -173,6 +175,8 @@ class SimulatedDataset(Dataset):
     def _at(self, index: int) -> tuple[h5py.File, int]:
         shard, i = self._place[index]
         if shard not in self._files:  # opened by the process that reads, never inherited
+            if len(self._files) == _MOST_OPEN:
+                self._files.pop(next(iter(self._files))).close()
             self._files[shard] = _open(self.paths[shard])
         return self._files[shard], i
 

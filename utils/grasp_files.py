@@ -26,8 +26,9 @@ from utils.transforms import (
     transform_points,
 )
 
-FORMAT = "robot-grasping grasps"  # marks a grasps.json of predict.py
-VERSION = 2  # 1 had no planner, tilt, workspace, target, clearing and remarks
+# Marks a grasps.json of predict.py. Version 1 had no planner, tilt, workspace, target, clearing and
+# remarks.
+MARK = {"format": "robot-grasping grasps", "version": 2}
 
 
 def check_output(folder: Path) -> None:
@@ -36,21 +37,20 @@ def check_output(folder: Path) -> None:
         raise UserError(f"--out {folder}: exists and is no folder")
     text, drawing = folder / "grasps.json", folder / "grasps.png"
     for path, own in (
-        (text, own_json(text) is not None),
+        (text, is_own_json(text)),
         (drawing, is_grasp_picture(drawing)),
     ):
         if path.exists() and not own:
             raise UserError(f"{path}: exists and was not written by predict.py; give another --out")
 
 
-def own_json(path: Path) -> dict[str, Any] | None:
-    """The content of a grasps.json of this program; None if the file is something else."""
+def is_own_json(path: Path) -> bool:
+    """Whether a file is a grasps.json of this program."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        Path(content["rgb"]).resolve()
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return content if content.get("format") == FORMAT else None
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("format") == MARK["format"]
 
 
 def format_grasps(content: dict[str, Any]) -> str:

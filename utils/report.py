@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import imageio.v3 as iio
 import numpy as np
@@ -25,7 +24,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from utils.atomic_files import figure_bytes, write_atomic
 from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
-from utils.errors import UserError
+from utils.errors import UNREADABLE_NPZ, UserError
 from utils.image_overlay import NEAR, close_up, contact_sheet, write_picture
 from utils.result_formats import (
     columns_of,
@@ -357,7 +356,7 @@ def read_gallery(path: Path) -> list[GalleryItem]:
             if "image" in file and "kind" not in file:
                 return []
             columns = [file[name] for name in _GALLERY]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except UNREADABLE_NPZ as error:
         raise UserError(
             f"{path}: cannot be read as pictures of an evaluation ({error}); delete it, the report "
             "then shows those of later rounds alone"

@@ -318,7 +318,11 @@ def write_comparisons_latex(path: Path, comparisons: Sequence[Comparison]) -> No
     write_atomic(path, "\n".join(text) + "\n")
 
 
+_LATEX = str.maketrans(
+    {special: "\\" + special for special in "&%#_${}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+)
+
+
 def _latex(cell: str) -> str:
-    for special in "&%#_$":
-        cell = cell.replace(special, "\\" + special)
-    return cell.replace(" - ", " $-$ ")
+    return cell.translate(_LATEX).replace(" - ", " $-$ ")

@@ -56,9 +56,17 @@ class GitState(NamedTuple):
     dirty: bool | None
 
 
+_LONGEST_NAME = 150  # bytes; systems allow 255, and names get endings
+
+
 def portable_name(text: str) -> str:
-    """A name of a file or folder on every system, of text that may hold paths or MODULE:NAME."""
-    return re.sub(r"[^\w.+-]", "_", text)
+    """A name of a file or folder on every system, of text that may hold paths or MODULE:NAME. A
+    long one ends in a hash."""
+    name = re.sub(r"[^\w.+-]", "_", text)
+    if len(name.encode()) <= _LONGEST_NAME:
+        return name
+    ending = "-" + hashlib.sha256(text.encode()).hexdigest()[:8]
+    return name.encode()[: _LONGEST_NAME - len(ending)].decode(errors="ignore") + ending
 
 
 # --- Command line and exit status -------------------------------------------------------------
