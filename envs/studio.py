@@ -29,6 +29,7 @@ from envs.objects import load_object_set
 from envs.simulators import make_cell
 from utils.atomic_files import check_writable
 from utils.errors import UserError
+from utils.image_overlay import write_picture
 from utils.runs import parse_args, run_script, this_python
 from utils.transforms import RGBDFrame, look_at
 
@@ -171,7 +172,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options, resumes=False)
-    check_files(chosen.output, chosen.rgbd)
+    output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
+    check_files(output if chosen.rgbd is None else chosen.output, chosen.rgbd)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
@@ -183,9 +185,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         if chosen.rgbd is not None:
             arguments = write_rgbd(cell.frame(), chosen.rgbd)
             command = f"{this_python()} {shlex.join(['predict.py', *arguments])}"
-    output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
-    imageio.imwrite(output, picture)
-    print(f"wrote {output}")
+    verb = "replaced" if output.exists() else "wrote"
+    write_picture(output, picture)
+    print(f"{verb} {output}")
     if chosen.rgbd is not None:
         print(f"wrote {chosen.rgbd}: color.png, depth.png, intrinsics.json, T_WC.txt")
     if command is not None:
