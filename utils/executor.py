@@ -123,7 +123,7 @@ def completed(
         if stop is not None and stop.is_set():
             waiting = iter(())
             if workers.waits():
-                return
+                break
         more = islice(waiting, max(0, workers.size() - len(pending)))
         pending |= {workers.submit(function, item) for item in more}
         if not pending:

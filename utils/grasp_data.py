@@ -55,8 +55,8 @@ def write_shard(
     stored as whole numbers of their attribute `unit`, the width in 255 steps; `instance` is the
     number of the object at each pixel, -1 for none, and `centres` holds the objects' centres of
     mass in W. The frames must carry segmentation and truth, of scenes from which no object was
-    retired: only then do both number the objects in the same way. Depths
-    that 16 bits do not hold, over 3.2 m, are cut off there.
+    retired: only then do both number the objects in the same way. Depths that 16 bits do not hold,
+    over 3.2 m, are cut off there.
     """
     units = {"depth": _DEPTH_UNIT, "quality": _QUALITY_UNIT, "width": max_width / 255}
     stacked = {
