@@ -148,7 +148,7 @@ def test_frames_of_the_output_agree(files, capsys, monkeypatch, panel):
     monkeypatch.setattr(predict, "grasp_picture", PICTURE)
     found = files.run(capsys)
     assert (files.folder / "out" / "grasps.png").read_bytes() != panel
-    assert (found["format"], found["version"]) == (predict.FORMAT, 2)
+    assert (found["format"], found["version"]) == ("robot-grasping grasps", 2)
     assert len(best_of_each(found["grasps"])) == len(CUBES)
     assert found["table"]["estimated"] and abs(found["table"]["height_world"]) < 0.002
     qualities = [grasp["quality"] for grasp in found["grasps"]]
