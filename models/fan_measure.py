@@ -1,6 +1,6 @@
 """Candidates of all views of a fan, posed on their maps, measured and scored, as tensors.
 
-`measure` is that of `models.planner_antipodal` with PyTorch: names and order are the same, what a
+`measure` is that of `models.planner_measure` with PyTorch: names and order are the same, what a
 step is for is told there, and a test holds both to the same numbers. On a GPU it is recorded as a
 CUDA graph.
 """
@@ -17,8 +17,8 @@ import torch
 
 from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews
-from models.planner_antipodal import LINES, PALM_STEP, REACH, UNSURE
 from models.planner_candidates import SearchSettings, grip_score
+from models.planner_measure import LINES, PALM_STEP, REACH, UNSURE
 from utils.geometry import GripperGeometry
 from utils.grasp_quality import NEAR_FACE, TOUCH, contact_levels
 from utils.height_map import OTHER_LABEL, WALL_LABEL

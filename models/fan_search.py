@@ -20,8 +20,8 @@ from models.fan_candidates import FanCandidates
 from models.fan_measure import cells_around, measure, turn_onto_faces
 from models.fan_views import FanViews, highest_within
 from models.grasp_critic import ACROSS, ALONG, LEAST_LOGGED, MOST, STEP, UNIT, GraspCritic
-from models.planner_antipodal import EDGE_BLUR, NOWHERE
 from models.planner_candidates import FACTS, SearchSettings
+from models.planner_runs import EDGE_BLUR, NOWHERE
 from utils.geometry import GripperGeometry, Workspace
 
 Value = Callable[[FanViews, FanCandidates], torch.Tensor]

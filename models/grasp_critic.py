@@ -4,7 +4,7 @@ From one side the far contact of a grasp is a guess, and the search picks the gr
 look best. The critic has seen on training scenes which of them held. It looks at the heights around
 the hand, seen and possible, drawn in the frame of the closing line, as GQ-CNN looks at a depth
 image (Mahler et al., Dex-Net 2.0, RSS 2017), and at what the search measured
-(`models.planner_antipodal.measure`), how the closing line lies to the vertical and to the camera,
+(`models.planner_measure.measure`), how the closing line lies to the vertical and to the camera,
 how large the object looks, which tells of a light and of a heavy one, how narrow a hand counts as
 empty, and the grasp network's value. `benchmarks.train_critic` trains it on executed grasps. This
 module knows neither images nor scenes.
@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from models.planner_antipodal import cells_around
 from models.planner_candidates import FACTS, Candidates
+from models.planner_measure import cells_around
 from utils.checkpoint import build_model, load_checkpoint
 from utils.height_map import HeightMap
 

@@ -25,9 +25,10 @@ from models.grasp_critic import CriticInputs, GraspCritic, critic_inputs, shippe
 from models.graspnet_decoding import PeakSettings
 from models.graspnet_io import SHIPPED, SavedGraspNet, fastest_dtype, for_inference, load_graspnet
 from models.graspnet_view import NetworkView
-from models.planner_antipodal import SearchPlanner, measure, turn_onto_faces
+from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_fan import SEARCH, FanPlanner, FanSettings, distinct
+from models.planner_measure import measure, turn_onto_faces
 from utils.depth_correction import corrected
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace

@@ -16,10 +16,11 @@ from models import fan_measure, fan_search
 from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews, fan_views, highest_within
 from models.grasp_critic import critic_inputs, shipped_critic
-from models.planner_antipodal import dense_candidates, measure, turn_onto_faces
 from models.planner_candidates import Candidates
 from models.planner_fan import SEARCH, turns_between
 from models.planner_graspnet import GraspNetFanPlanner
+from models.planner_measure import measure, turn_onto_faces
+from models.planner_runs import dense_candidates
 from tests.helpers.box_frames import boxes_frame, shelf_frame
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import OTHER_LABEL, HeightMap, tilted_height_map, tilted_view

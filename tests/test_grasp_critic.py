@@ -19,7 +19,6 @@ from models.grasp_critic import (
     shipped_critic,
 )
 from models.graspnet_io import SHIPPED as NETWORK
-from models.planner_antipodal import measure
 from models.planner_candidates import FACTS, Candidates, SearchSettings
 from models.planner_graspnet import (
     GraspNetDirectPlanner,
@@ -27,6 +26,7 @@ from models.planner_graspnet import (
     GraspNetPlanner,
     loaded,
 )
+from models.planner_measure import measure
 from tests.helpers.box_frames import boxes_frame
 from tests.helpers.executed_grasps import column, made_up
 from utils.checkpoint import save_checkpoint

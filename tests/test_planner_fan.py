@@ -15,9 +15,10 @@ from envs.object_primitives import FAMILIES, make_primitive
 from envs.objects import load_object_set
 from envs.rounds import NoGraspsError, checked_grasps
 from models.grasp_critic import INPUTS
-from models.planner_antipodal import measure, search
+from models.planner_antipodal import search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_fan import FanSettings, HeuristicFanPlanner, OracleFanPlanner, turns_between
+from models.planner_measure import measure
 from models.planners import PLANNERS, make_planner
 from tests.helpers.box_frames import CORNERS, bin_walls, boxes_frame, shelf_frame
 from utils.config import DEFAULTS, load_config

@@ -5,7 +5,7 @@ obstacles under fingers and palm, rows of heights give the contacts of the pads.
 overhang counts as matter for the descent, and for the contacts down to the lowest point of the
 object. `grasp_quality` multiplies Gaussian factors of angles and lever arms into one number; dense
 labels (`utils.grasp_labels`) and the environment's goals are made of it. The antipodal search
-(`models.planner_antipodal`) shares `contact_levels`, `fit_faces` and the relaxed margins, but has
+(`models.planner_measure`) shares `contact_levels`, `fit_faces` and the relaxed margins, but has
 a score of its own. This module knows no camera, no simulator and no network.
 """
 
