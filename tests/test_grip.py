@@ -7,7 +7,7 @@ from trimesh.convex import convex_hull
 
 from benchmarks.show_bar import bar, grip, solid, tilt
 from envs.cell import Cell
-from envs.cell_layout import Placement, Scene
+from envs.cell_layout import Placement, Scene, square_walls
 from envs.execution import close_fingers, execute_grasp, give_way, open_loop
 from envs.object_bodies import compound_object
 from envs.object_primitives import NativeShape, Primitive
@@ -166,6 +166,18 @@ def test_a_hand_that_one_finger_jams_gives_way(box_set, mass, jams, latency, cel
     moved = before - cell.robot.tip_pose()[1, 3]
     assert cell.held_object() == 0
     assert moved == pytest.approx(off, abs=0.003) if jams else abs(moved) < 1e-3
+
+
+@pytest.mark.parametrize(("off", "reason"), [(0.0, "collision"), (-0.015, "success")])
+def test_a_hand_off_the_centre_grips_beside_a_wall(box_set, off, reason, cell):
+    """A bar of 20 mm lies 92 mm from a wall of 100 mm, across which the palm reaches 104 mm over
+    its middle and 89 mm from 15 mm beside it. One finger pushes the bar to the other."""
+    x = 0.5 + 0.15 - 0.092
+    model = solid(box_set[0], NativeShape("box", (0.02, 0.12, 0.04)), 0.07, 0.5)
+    placed = Placement(model, np.array([x, 0.0, 0.02]), np.eye(4)[3])
+    cell.load(Scene("bin", 0, (placed,), tuple(square_walls((0.5, 0.0), 0.15, 0.1, 0.01))))
+    outcome = execute_grasp(cell, Grasp(np.array([x + off, 0.0, 0.02]), 0.0, 0.08, 1.0))
+    assert outcome.reason == reason
 
 
 @pytest.mark.parametrize("latency", [0, 12, 14])
