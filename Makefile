@@ -83,7 +83,7 @@ bench: $(VENV)/.installed-dev
 # Every table of README and docs/results.md: make results PARTS=scoreboard,servo. With SCALE below 1 other
 # scenes are played and no docs written, but with WRITE=1: make results PARTS=clutter15 SCALE=0.5 WRITE=1
 results: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell $(CORNELL)) $(if $(YCB),--ycb $(YCB)) $(if $(CLUTTER),--clutter $(CLUTTER)) $(ARGS)
+	$(BIN)/python -m benchmarks.results $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(if $(WRITE),--write-docs) $(if $(CORNELL),--cornell "$(CORNELL)") $(if $(YCB),--ycb "$(YCB)") $(if $(CLUTTER),--clutter "$(CLUTTER)") $(ARGS)
 
 # Faults by the thousand: make soak PARTS=files,disk SCALE=0.1; writes docs/reliability.md.
 soak: $(VENV)/.installed-dev

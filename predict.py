@@ -54,7 +54,7 @@ from models.graspnet import check_rgbd
 from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
-from models.planner_target import TargetPlanner, check_reached
+from models.planner_target import TargetPlanner, check_reached, least_width
 from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.atomic_files import write_atomic
@@ -101,11 +101,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     grasps = found[: options.count]
     if frame.target is not None:
         clearing = TargetPlanner(planner).clearing(frame, found)[: options.count]
-        remarks += [*check_mask(options.mask), *check_reached(grasps, clearing)]
+        width, opening = least_width(frame, table.height), planner.gripper.max_opening
+        remarks += [*check_mask(options.mask), *check_reached(grasps, clearing, width, opening)]
     else:
         remarks += check_found(len(grasps), frame, workspace)
     if planner.calibration is not None:
-        remarks += unlikely_ones([one.quality for one in (*grasps, *(clearing or []))])
+        remarks += unlikely_ones(grasps) + unlikely_ones(clearing or [], "grasps of `clearing`")
     posed = options.camera_pose is not None
     content = {
         **MARK,

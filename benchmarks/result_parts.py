@@ -7,6 +7,7 @@ the tables. Seed and objects are those of configs/sealed.yaml, on which no choic
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,7 +63,9 @@ class Command:
         parts += [self.arguments] if self.arguments else []
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")
-        places = {name.upper(): str(folders.get(name, f"path/to/{name}")) for name in SOURCES}
+        places = {
+            name.upper(): shlex.quote(str(folders.get(name, f"path/to/{name}"))) for name in SOURCES
+        }
         return re.sub("|".join(places), lambda found: places[found[0]], " ".join(parts))
 
 

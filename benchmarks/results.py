@@ -182,14 +182,39 @@ def measure(part: Part, commit: str, scale: float, folders: Folders = NOWHERE) -
         run = latest_run(Path(command.program).stem, file.stem)
         if run is not None:
             check_folders(command, run, file, folders)
-        if not file.exists():
-            figures = run_command(part, command, scale, commit, folders)
+        used = folders_of(command, folders)
+        if file.exists():
+            before = json.loads(file.read_text()).get("folders", used)
+            if before != used:
+                raise UserError(
+                    f"results: {file} holds figures with {', '.join(before.values())}, not with "
+                    f"{', '.join(used.values())}; give the folder of before, or delete the file"
+                )
+        else:
+            figures = run_command(part, command, scale, commit, folders) | {"folders": used}
             if (now := code_commit()) != commit:
+                set_aside(command, file.stem)
                 raise UserError(
                     f"results: the code went from commit {commit[:10]} to {now[:10]} while "
                     f"{part.name} was measured, so that its figures are of neither; start again"
                 )
             write_json_atomic(file, figures)
+
+
+def folders_of(command: Command, folders: Folders) -> dict[str, str]:
+    """The folders of SOURCES that a command reads, as absolute paths."""
+    return {
+        name: str(folder.resolve())
+        for name, folder in folders.items()
+        if name.upper() in command.arguments
+    }
+
+
+def set_aside(command: Command, name: str) -> None:
+    """Rename a run of two commits, so that no later call goes on with it."""
+    run = latest_run(Path(command.program).stem, name)
+    if run is not None:
+        run.rename(run.with_name(f"{run.name}-of-two-commits"))
 
 
 def publish(part: Part, commit: str, scale: float) -> None:
@@ -198,6 +223,7 @@ def publish(part: Part, commit: str, scale: float) -> None:
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
         figures = json.loads(file.read_text())
+        figures.pop("folders", None)
         # Files of older versions hold no date: the day on which they were written.
         figures.setdefault("date", str(date.fromtimestamp(file.stat().st_mtime)))
         if "run" in figures:

@@ -353,7 +353,10 @@ def _carry_to_bin(
         follow(cell, way[first : first + every], grip.feel)
         _still_lifted(cell, index, motion)
     while cell.seconds < end:
-        cell.step(every)
+        robot.renew_contacts()
+        for _ in range(every):
+            cell.step()
+            grip.feel()
         _still_lifted(cell, index, motion)
     moved = loose(motion.turned, motion.slid)
     if moved and settings.strict:

@@ -125,9 +125,14 @@ def read_object(path: Path, density: float = DEFAULT_DENSITY) -> ObjectSource:
     density: kg/m3 of the geoms of an MJCF that state neither mass nor density where others do.
     Raises ObjectError, which names the file.
     """
-    if path.suffix.lower() == ".xml":
-        return _mjcf().read_mjcf(path, density)
-    return _read_urdf(path) if path.suffix.lower() == ".urdf" else ObjectSource(load_mesh(path))
+    try:
+        if path.suffix.lower() == ".xml":
+            return _mjcf().read_mjcf(path, density)
+        return _read_urdf(path) if path.suffix.lower() == ".urdf" else ObjectSource(load_mesh(path))
+    except ObjectError as error:
+        if str(path) in str(error):
+            raise
+        raise ObjectError(f"{path}: {error}") from error  # of a mesh that the file names
 
 
 def _mjcf() -> ModuleType:

@@ -171,8 +171,7 @@ class SearchSettings:
 
     def off_centre(self) -> SearchSettings:
         """Relaxed settings whose hand may also stand beside the middle of what it grips, where a
-        wall or a neighbour leaves the palm no room over it. Few of the shortlist fit there. A hand
-        that opens fully has no opening to spare, and stays over the middle."""
+        wall or a neighbour leaves the palm no room over it. Few of the shortlist fit there."""
         return replace(self.relaxed(), offsets=OFF_CENTRE, shortlist=4 * self.shortlist)
 
 

@@ -85,7 +85,7 @@ def exact_contacts(
     along, across = cos * along + sin * across, cos * across - sin * along
     value, slips = _pad_contacts(
         centre.reshape(-1, 3), along.reshape(-1, 3), across.reshape(-1, 3),
-        np.repeat(candidates.opening / 2 - np.abs(candidates.offset), P), scene, gripper,
+        np.repeat(candidates.opening / 2, P), np.repeat(candidates.offset, P), scene, gripper,
     )  # fmt: skip
     value, slips = value.reshape(N, P), slips.reshape(N, P)[:, 0]
     quality = 0.4 * value[:, 0] + 0.4 * value[:, 1:].mean(axis=1) + 0.2 * value.min(axis=1)
@@ -93,11 +93,12 @@ def exact_contacts(
 
 
 def _pad_contacts(
-    centre, along, across, half, scene: SceneGeometry, gripper: GripperGeometry
+    centre, along, across, half, away, scene: SceneGeometry, gripper: GripperGeometry
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) quality in [0, 1] of the contacts of two closing pads, and (N,) whether they slip off.
 
-    centre: (N, 3) between the fingertips' lowest points; along, across: (N, 3); half: (N,).
+    centre: (N, 3) at the fingertips' lowest points; along, across: (N, 3); half: (N,) of the
+    opening; away: (N,) of the hand's middle from the centre along the closing line.
     """
     offset, height = (
         axis.ravel()
@@ -113,7 +114,7 @@ def _pad_contacts(
         + height[:, None] * np.array((0, 0, 1.0))
     )
     flat, directions = origins.reshape(-1, 3), np.repeat(along, L, axis=0)
-    limit = np.repeat(half, L)
+    limits = np.repeat([half - away, half + away], L, axis=1)  # from the centre to the pads
     # Travel of each pad from its open position to the first matter on each line, left then right.
     travel = np.full((2, N * L), np.inf)
     owner = np.full((2, N * L), -1)
@@ -127,16 +128,16 @@ def _pad_contacts(
             offset_ = middle - flat
             t = (offset_ * directions).sum(axis=1)
             close = np.linalg.norm(offset_ - t[:, None] * directions, axis=1) < radius
-            lines = np.nonzero(close & (np.abs(t) < limit + radius))[0]
+            lines = np.nonzero(close & (-limits[0] - radius < t) & (t < limits[1] + radius))[0]
             if len(lines) == 0:
                 continue
             hits = intersect_lines(solid, flat[lines], directions[lines])
             # A solid that lies wholly behind a pad, outside, is not between the fingers.
-            between = hits.hit & (hits.leave > -limit[lines]) & (hits.enter < limit[lines])
+            between = hits.hit & (hits.leave > -limits[0, lines]) & (hits.enter < limits[1, lines])
             for side, (distance, normal, sign) in enumerate(
                 ((hits.enter, hits.enter_normal, -1), (-hits.leave, hits.leave_normal, 1))
             ):
-                distance = distance + limit[lines]
+                distance = distance + limits[side, lines]
                 better = between & (distance < travel[side, lines])
                 chosen = lines[better]
                 travel[side, chosen] = distance[better]

@@ -59,6 +59,7 @@ def measure(
     N, tip = len(candidates), candidates.tip
     along, across = candidates.axes()
     reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
+    reach += np.abs(settings.offsets).max()
     most = np.ceil(reach / heights.cell)
     u = np.arange(-most, most + 1) * heights.cell
     v = np.linspace(-1, 1, LINES) * gripper.finger_half_width

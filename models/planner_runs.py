@@ -20,6 +20,7 @@ from utils.transforms import transform_points
 
 NOWHERE = -1e3  # m, under everything
 EDGE_BLUR = 0.002  # m, standard deviation over the heights whose gradients are edges
+MOST_AT_ONCE = 2**19  # cells of turned maps
 
 
 def dense_candidates(
@@ -36,6 +37,7 @@ def dense_candidates(
     first, last = matter.min(axis=0), matter.max(axis=0)
     centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
     beside = (gripper.max_opening if gripper.opens_fully else max(settings.rooms)) + 2 * thickness
+    beside += 2 * np.abs(settings.offsets).max()
     if (heights.label == OTHER_LABEL).any():  # what is not to be grasped may be under the palm
         beside += gripper.palm_half_length
     half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
@@ -52,75 +54,83 @@ def dense_candidates(
     # Only what stands on the table is gripped; the table itself is in the way of a tilted hand.
     standing = np.where(heights.label == -1, NOWHERE, heights.height).astype(np.float32)
     ground = float(heights.height.min())
-    angles = np.arange(settings.angles) * np.pi / settings.angles
-    along = np.column_stack([np.cos(angles), np.sin(angles)])
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    turned, objects, under_finger, under_palm = np.empty((4, len(angles), size, size), np.float32)
-    for n in range(len(angles)):
-        axes = np.column_stack([along[n], across[n]])
-        warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
-        for image, outside, out in (
-            (heights.height, ground, turned[n]), (standing, NOWHERE, objects[n]),
-        ):  # fmt: skip
-            cv2.warpAffine(
-                image, warp, (size, size), out, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-                borderValue=outside,
-            )  # fmt: skip
-        cv2.dilate(turned[n], finger, under_finger[n])
-        cv2.dilate(turned[n], palm, under_palm[n])
+    every_angle = np.arange(settings.angles) * np.pi / settings.angles
+    # As many at once as make few array operations, but no large arrays.
+    count = max(1, MOST_AT_ONCE // size**2)
+    parts = []
+    for one in range(0, len(every_angle), count):
+        angles = every_angle[one : one + count]
+        along = np.column_stack([np.cos(angles), np.sin(angles)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        turned, objects, under_finger, under_palm = np.empty(
+            (4, len(angles), size, size), np.float32
+        )
+        for n in range(len(angles)):
+            axes = np.column_stack([along[n], across[n]])
+            warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
+            for image, outside, out in (
+                (heights.height, ground, turned[n]), (standing, NOWHERE, objects[n]),
+            ):  # fmt: skip
+                cv2.warpAffine(
+                    image, warp, (size, size), out, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+                    borderValue=outside,
+                )  # fmt: skip
+            cv2.dilate(turned[n], finger, under_finger[n])
+            cv2.dilate(turned[n], palm, under_palm[n])
 
-    # Of all angles at once: rows of the turned maps, one map under the other.
-    turned, under_finger, under_palm = (
-        maps.reshape(-1, size) for maps in (turned, under_finger, under_palm)
-    )
-    level, row, first, last = _runs(
-        objects, levels, gripper.max_opening - 2 * settings.rooms[0], cell
-    )
-    tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
-    away = np.rint(np.divide(settings.offsets, cell)).astype(int)[:, None]
-    under_hand = under_palm[row, np.clip(centre + away, 0, size - 1)].min(axis=0)
-    free = under_hand < tip - settings.clearance + gripper.palm_height
-    row, first, last, tip = row[free], first[free], last[free], tip[free]
-    limit, free = tip - settings.clearance, np.zeros(len(tip), bool)
-    rooms = settings.rooms  # a sloping flank needs more room
-    if gripper.opens_fully:
-        rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
-    for room, away in itertools.product(rooms, settings.offsets):
-        beside = room + thickness / 2  # from the contact to the finger's middle
-        # Beside a wall it may be outside.
-        left = np.rint(first - (beside + max(-2 * away, 0)) / cell).astype(int)
-        right = np.rint(last + (beside + max(2 * away, 0)) / cell).astype(int)
-        left, right = np.maximum(left, 0), np.minimum(right, size - 1)
-        fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
-        opening = (last - first + 1) * cell + 2 * (room + abs(away))
-        free |= fits & (opening < gripper.max_opening + 2 * cell)
-    row, first, last, tip = row[free], first[free], last[free], tip[free]
+        # Of these angles at once: rows of the turned maps, one map under the other.
+        turned, under_finger, under_palm = (
+            maps.reshape(-1, size) for maps in (turned, under_finger, under_palm)
+        )
+        level, row, first, last = _runs(
+            objects, levels, gripper.max_opening - 2 * settings.rooms[0], cell
+        )
+        tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
+        away = np.rint(np.divide(settings.offsets, cell)).astype(int)[:, None]
+        under_hand = under_palm[row, np.clip(centre + away, 0, size - 1)].min(axis=0)
+        free = under_hand < tip - settings.clearance + gripper.palm_height
+        row, first, last, tip = row[free], first[free], last[free], tip[free]
+        limit, free = tip - settings.clearance, np.zeros(len(tip), bool)
+        rooms = settings.rooms  # a sloping flank needs more room
+        if gripper.opens_fully:
+            rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
+        for room, away in itertools.product(rooms, settings.offsets):
+            beside = room + thickness / 2  # from the contact to the finger's middle
+            # Beside a wall it may be outside.
+            left = np.rint(first - (beside + max(-2 * away, 0)) / cell).astype(int)
+            right = np.rint(last + (beside + max(2 * away, 0)) / cell).astype(int)
+            left, right = np.maximum(left, 0), np.minimum(right, size - 1)
+            fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
+            opening = (last - first + 1) * cell + 2 * (room + abs(away))
+            free |= fits & (opening < gripper.max_opening + 2 * cell)
+        row, first, last, tip = row[free], first[free], last[free], tip[free]
 
-    rise = turned[row, first] - tip
-    angle, row = np.divmod(row, size)
-    along, across, angle = along[angle], across[angle], angles[angle]
-    base = middle + cell * (row - half)[:, None] * across
-    at_first, at_inside, xy, at_last = (
-        base + cell * (column - half)[:, None] * along
-        for column in (first, first + 1.5, (first + last) / 2, last)
-    )
-    place = transform_points(heights.T_WV, np.column_stack([xy, tip]))[:, :2]
-    reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
-    # Outward normals are minus the gradient: cosines against the closing line on both sides.
-    facing = np.minimum(
-        (_unit(slope[heights.index(at_first)]) * along).sum(axis=1),
-        -(_unit(slope[heights.index(at_last)]) * along).sum(axis=1),
-    )
-    inside = heights.label[heights.index(at_inside)]
-    arm = np.abs(((heights.centres[np.maximum(inside, -1), :2] - xy) * across).sum(axis=1))
-    score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
-    score *= (
-        reach
-        * (inside >= 0)
-        * (facing > settings.min_facing)
-        * np.clip(rise / settings.good_engagement, 0.2, 1)
-    )
-    return Candidates.rough(xy, angle, tip, (last - first + 1) * cell, score)
+        rise = turned[row, first] - tip
+        angle, row = np.divmod(row, size)
+        along, across, angle = along[angle], across[angle], angles[angle]
+        base = middle + cell * (row - half)[:, None] * across
+        at_first, at_inside, xy, at_last = (
+            base + cell * (column - half)[:, None] * along
+            for column in (first, first + 1.5, (first + last) / 2, last)
+        )
+        place = transform_points(heights.T_WV, np.column_stack([xy, tip]))[:, :2]
+        reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
+        # Outward normals are minus the gradient: cosines against the closing line on both sides.
+        facing = np.minimum(
+            (_unit(slope[heights.index(at_first)]) * along).sum(axis=1),
+            -(_unit(slope[heights.index(at_last)]) * along).sum(axis=1),
+        )
+        inside = heights.label[heights.index(at_inside)]
+        arm = np.abs(((heights.centres[np.maximum(inside, -1), :2] - xy) * across).sum(axis=1))
+        score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
+        score *= (
+            reach
+            * (inside >= 0)
+            * (facing > settings.min_facing)
+            * np.clip(rise / settings.good_engagement, 0.2, 1)
+        )
+        parts.append(Candidates.rough(xy, angle, tip, (last - first + 1) * cell, score))
+    return Candidates.joined(parts)
 
 
 def _unit(slope: np.ndarray) -> np.ndarray:

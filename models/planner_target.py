@@ -19,7 +19,7 @@ from utils.calibration import Calibration
 from utils.depth_correction import table_roughness
 from utils.errors import UserError
 from utils.target import MOSTLY
-from utils.transforms import Grasp, RGBDFrame
+from utils.transforms import Grasp, RGBDFrame, known_depth
 
 
 @dataclass(frozen=True)
@@ -228,18 +228,40 @@ def check_takes_targets(plan: Planner, name: str = "the planner", task: str = "d
         )
 
 
-def check_reached(grasps: Sequence[Grasp], clearing: Sequence[Grasp]) -> list[str]:
+def check_reached(
+    grasps: Sequence[Grasp], clearing: Sequence[Grasp], width: float, opening: float
+) -> list[str]:
     """A remark on a target that is not free yet. Raises UserError for one that no grasp reaches,
-    and in whose way nothing lies that could be moved."""
+    and that is too wide or has nothing in its way that could be moved. width: `least_width` of the
+    target; opening: of the hand, m."""
     if grasps and clearing:
         return [
             "something is in the target's way or may rest on it: `clearing` moves it aside first"
         ]
     if grasps:
         return []
+    if width > opening:
+        raise UserError(
+            f"no grasp reaches the target: what is seen of it is at least {width:.2g} m wide, and "
+            f"the hand opens {opening:g} m"
+        )
     if not clearing:
         raise UserError(
             "no grasp reaches the target, and nothing beside it can be moved aside; try another "
             "view or --planner graspnet6d, whose hand comes from any side"
         )
     return ["no grasp reaches the target yet; `clearing` moves aside what is in its way"]
+
+
+def least_width(frame: RGBDFrame, table_height: float) -> float:
+    """Metres of what is seen of the frame's target where it is narrowest: across it, as seen from
+    above, or from the table to its top; 0 where no depth is known. Of each extent, 2 % of the
+    pixels on both sides are left out, which at edges lie between the object and what is behind."""
+    points = frame.points()[frame.target & known_depth(frame.depth)]
+    if len(points) == 0:
+        return 0.0
+    angle = np.deg2rad(np.arange(0, 180, 5))
+    across = points[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])
+    low, high = np.percentile(across, (2, 98), axis=0)
+    top = float(np.percentile(points[:, 2], 98))
+    return float(min((high - low).min(), top - table_height))

@@ -451,8 +451,12 @@ def test_random_states_no_chances_whatever_a_file_says(monkeypatch) -> None:
 
 
 def test_grasps_that_rather_fail_are_told_of() -> None:
-    assert unlikely_ones([0.9, 0.5]) == unlikely_ones([]) == []
-    assert unlikely_ones([0.9, 0.4, 0.1])[0].startswith("2 of the 3 grasps have a chance under 0.5")
+    likely, as_likely, no, never = (
+        replace(cube_grasp(), quality=chance) for chance in (0.9, 0.5, 0.4, 0.1)
+    )
+    assert unlikely_ones([likely, as_likely]) == unlikely_ones([]) == []
+    (remark,) = unlikely_ones([likely, no, never])
+    assert remark.startswith("2 of the 3 grasps have a chance under 0.5")
 
 
 def test_the_diagram_has_a_line_for_each_name() -> None:

@@ -19,7 +19,7 @@ MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
     [
         ("<robot", "bad.urdf cannot be read"),
         ('<robot name="r"><link name="l"/></robot>', "bad.urdf has neither"),
-        (MISSING_MESH, "box.obj does not exist"),
+        (MISSING_MESH, r"bad\.urdf: mesh .*box.obj does not exist"),
         (f"<robot name='r'>{301 * '<geometry/>'}</robot>", "301 geometries, expected at most 300"),
     ],
 )

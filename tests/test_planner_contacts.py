@@ -70,12 +70,31 @@ def test_a_chance_counts_only_where_the_pads_do_not_slip_off(right: int, left_ov
 def grade(scene: SceneGeometry, y: float = 0.0, depth: float = 0.03) -> float:
     """Of one closing along x, this far from the middle of a prism and below its upper edge."""
     centre, along, across = np.array([[[0, y, HEIGHT - depth]], [[1, 0, 0]], [[0, 1, 0]]], float)
-    return float(_pad_contacts(centre, along, across, np.array([0.04]), scene, HAND)[0][0])
+    return float(
+        _pad_contacts(centre, along, across, np.array([0.04]), np.zeros(1), scene, HAND)[0][0]
+    )
 
 
 def box(friction: float = 1.0) -> SceneGeometry:
     """4 x 10 x 5 cm; its centre of mass is 2.5 cm high."""
     return prism(0, 0, friction, thick=0.04)
+
+
+@pytest.mark.parametrize("away", [0.02, -0.02])
+def test_each_pad_comes_from_where_an_open_hand_off_the_centre_has_it(away: float) -> None:
+    """A box of 30 mm whose middle is 5 mm beside the centre; opened by 80 mm, 20 mm off the centre,
+    the pads start at 60 mm on one side and at 20 mm on the other, where the box ends."""
+    centre, along, across = np.array([[[0, 0, HEIGHT - 0.03]], [[1, 0, 0]], [[0, 1, 0]]], float)
+    scene = prism(0, 0, 1.0, thick=0.03)
+    values = [
+        _pad_contacts(
+            centre - [[shift, 0, 0]], along, across, np.array([0.04]), np.array([away]), scene, HAND
+        )[0][0]
+        for shift in (-0.004, 0.0, 0.004, 0.006, -0.006)
+    ]
+    assert min(values[:3]) == pytest.approx(max(values[:3]), rel=1e-6) and values[0] > 0.9
+    # Six millimetres towards the nearer pad it stands on the box.
+    assert sorted(values[3:]) == [0.0, pytest.approx(values[0], rel=1e-6)]
 
 
 # Lines across a pad lie at 0.08, 0.37, 0.66 and 0.95 of its height.

@@ -169,6 +169,19 @@ def test_beside_a_wall_the_hand_stands_off_the_centre(name: str) -> None:
         assert 0.005 < beside < grasp.width / 2 - 0.01  # the bar is between the pads
 
 
+@pytest.mark.parametrize("opens_fully", [False, True])
+@pytest.mark.parametrize(("apart", "free"), [(0.071, False), (0.090, True)])
+def test_a_hand_off_the_centre_looks_where_its_far_finger_goes(opens_fully, apart, free) -> None:
+    """The bar of the test before, and on its other side a block as high, too wide to be grasped.
+    20 mm off the centre, the outer edge of the far finger is 74 mm from the bar's middle."""
+    x = 0.5 + 0.15 - 0.092
+    bar, block = (0.02, 0.12, 0.04), (0.09, 0.20, 0.043)
+    scene = [(bar, 0.0, (x, 0.0)), (block, 0.0, (x - apart - block[0] / 2, 0.0))]
+    hand = GripperGeometry(opens_fully=opens_fully)
+    plan = make_planner("heuristic", hand, Workspace(), 0)
+    assert bool(plan(boxes_frame([*scene, *bin_walls()], walls=4))) == free
+
+
 @pytest.mark.parametrize("degrees", [0, 35, 90])
 def test_a_flat_stick_is_held_below_its_top_and_above_the_table(degrees: int) -> None:
     """7 mm high: the usual margins leave no room for fingers, so relaxed ones serve."""

@@ -491,6 +491,16 @@ def target_that_is_too_wide(files):
     return {"point": [160, 120]}
 
 
+def target_wider_than_the_hand_opens(files):
+    """All of what is raised by 9 cm over 20 cm, by 8 mm a pixel at that depth and 128 pixels."""
+    target_that_is_too_wide(files)
+    depth = np.asarray(Image.open(files.folder / "depth.png")).copy()
+    depth[depth == 720] = 700
+    Image.fromarray(depth).save(files.folder / "depth.png")
+    Image.fromarray(np.uint8(255 * (depth == 700))).save(files.folder / "mask.png")
+    return {"point": None, "mask": str(files.folder / "mask.png")}
+
+
 def oblique_pose(files):
     depth = np.full((240, 320), 800, np.uint16)
     Image.fromarray(depth).save(files.folder / "depth.png")
@@ -572,6 +582,10 @@ def only_a_count_beside_export(files):
         (mask_of_everything, "the mask marks every pixel"),
         (mask_of_the_table, "shows only the table"),
         (target_that_is_too_wide, "no grasp reaches the target"),
+        (
+            target_wider_than_the_hand_opens,
+            r"is at least 0\.\d+ m wide, and the hand opens 0\.08 m",
+        ),
         (oblique_pose, "the view is too oblique: the camera looks 76 degrees off"),
         (unseen, "too much is unseen: 6[23] % of the place|too much is unseen: 6[23]%"),
         (options(camera_pose=None, workspace=[0, 0, 0.3]), "needs --camera-pose"),

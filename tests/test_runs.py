@@ -235,6 +235,15 @@ def test_what_changes_when_a_run_is_resumed_stays_changed(tmp_path):
     assert again.evaluate.rounds == 70 and again == config
 
 
+def test_a_run_of_another_script_is_left_as_it_is(tmp_path):
+    with open_run(None, "train_rl", None, load_config(), root=tmp_path) as run:
+        before = (run / "config.yaml").read_text()
+    opened = open_run(run, "evaluate", None, load_config(None, ["seed=9"]))
+    with pytest.raises(UserError, match=r"a run of train_rl\.py; go on with train_rl\.py"), opened:
+        pass
+    assert (run / "config.yaml").read_text() == before
+
+
 def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
     with another_process_within(
         "from utils.config import load_config\nfrom utils.runs import open_run",
@@ -245,7 +254,7 @@ def test_a_run_in_which_another_process_works_is_left_as_it_is(tmp_path):
         before, config = (run / "config.yaml").read_text(), load_config(None, ["seed=9"])
         alone = Team(0, 1, torch.device("cpu"))
         for opened in (
-            open_run(run, "evaluate", None, config),
+            open_run(run, "train_rl", None, config),
             run_folder("train_rl", None, config, run, alone),
         ):
             with pytest.raises(UserError, match="another process works in this run"), opened:

@@ -92,6 +92,21 @@ def test_a_target_in_pieces_is_one_object_with_one_centre() -> None:
     np.testing.assert_allclose(mine.centres[numbers[0]], (x, 0.0, z), atol=0.002)
 
 
+@pytest.mark.parametrize("name", ["heuristic", "graspnet"])
+def test_a_thin_target_is_one_all_the_same(name: str) -> None:
+    """A plate of 6 mm, all of which lies near the mask's outline, beside a box."""
+    plate = ((0.006, 0.08, 0.05), 0.0, (0.52, 0.03))
+    frame = boxes_frame([plate, (BOX, 0.0, (0.44, -0.06))])
+    plan = make_planner(name, GripperGeometry(), Workspace(), 0)
+    at_plate = np.abs(frame.points()[..., :2] - plate[2]).max(axis=-1) < 0.042
+    segments = plan.segments(frame)
+    numbers = np.unique(segments[at_plate & (segments >= 0)])
+    grasps = plan(replace(frame, target=np.isin(segments, numbers)))
+    assert grasps
+    for grasp in grasps:
+        np.testing.assert_allclose(grasp.position[:2], plate[2], atol=0.04)
+
+
 def test_without_a_target_nothing_changes_and_a_hidden_one_leaves_no_object() -> None:
     frame = two_boxes()
     heights = heights_of(frame)

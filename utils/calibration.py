@@ -31,6 +31,8 @@ from scipy.special import expit, log_expit, logit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from utils.transforms import Grasp
+
 LEAST_CHANCE = 0.5  # of success, below which a robot does not try a grasp: it rather fails
 LEAST_SCORE = 1e-6  # scores below it count as it
 MOST_SCORE = 0.999  # in log(1 - score), scores above it count as it
@@ -192,13 +194,13 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
     }
 
 
-def unlikely_ones(chances: Sequence[float]) -> list[str]:
-    """A remark on grasps that are more likely to fail than to succeed."""
-    count = sum(chance < LEAST_CHANCE for chance in chances)
+def unlikely_ones(grasps: Sequence[Grasp], named: str = "grasps") -> list[str]:
+    """A remark on grasps that are more likely to fail than to succeed. named: what they are."""
+    count = sum(grasp.quality < LEAST_CHANCE for grasp in grasps)
     if count == 0:
         return []
     return [
-        f"{count} of the {len(chances)} grasps have a chance under {LEAST_CHANCE:g}: they rather "
+        f"{count} of the {len(grasps)} {named} have a chance under {LEAST_CHANCE:g}: they rather "
         "fail than succeed"
     ]
 

@@ -75,6 +75,7 @@ class PlanarMotion:
             forget = np.diag(np.concatenate([[0.02, 0.02, 0.2], self._rates]) ** 2)
             self.covariance = self.covariance + forget
             S = self.covariance[:3, :3] + covariance
+            self._surprise = None  # the next one has to be confirmed, too
         gain = np.linalg.solve(S, self.covariance[:3]).T
         self.state = self.state + gain @ innovation
         self.covariance = self.covariance - gain @ self.covariance[:3]

@@ -224,8 +224,15 @@ def open_run(
 ) -> Iterator[Path]:
     """The folder of a run, in which no other process works within this context: a new one, or the
     one that is `resumed`, whose config.yaml gets the keys that have changed, so that it can be
-    resumed again as it is. Raises UserError where another process works there."""
+    resumed again as it is. Raises UserError where another process works there, or another script
+    made it."""
     run = new_run_folder(script, name, config, root) if resumed is None else resumed
+    made_by = begun_with(run).get("script", script)
+    if made_by != script:
+        raise UserError(
+            f"--resume {run}: it is a run of {made_by}.py; go on with {made_by}.py, or give the "
+            f"folder of a run of {script}.py"
+        )
     refusal = "another process works in this run; wait until it has ended, or start a new run"
     with locked(run / ".lock", f"{run}: {refusal}"):
         if resumed is not None:
@@ -242,7 +249,10 @@ def new_run_folder(
     """
     folder = timed_folder(root / script, name)
     write_atomic(folder / "config.yaml", dump_config(config))
-    write_json_atomic(folder / "environment.json", environment() | {"files": named_files(config)})
+    write_json_atomic(
+        folder / "environment.json",
+        environment() | {"script": script, "files": named_files(config)},
+    )
     return folder
 
 

@@ -76,8 +76,11 @@ def _target_cells(heights: HeightMap, frame: RGBDFrame) -> np.ndarray:
     row, column = np.nonzero(heights.label >= 0)
     label = heights.label[row, column]
     inside, certain = _in_mask(heights, frame, row, column)
-    certain &= heights.ceiling[row, column] <= heights.height[row, column]
+    visible = heights.ceiling[row, column] <= heights.height[row, column]
+    certain &= visible
     count = len(heights.centres)
+    # An object as thin as that has no other cells.
+    certain |= visible & (np.bincount(label[certain], minlength=count) == 0)[label]
     share = np.bincount(label[certain & inside], minlength=count) / np.maximum(
         np.bincount(label[certain], minlength=count), 1
     )
