@@ -43,6 +43,8 @@ _REST_CHECK_SECONDS = 0.05  # between two checks of whether objects rest
 # In a row, after which they certainly do: 0.2 s, in which a body that topples gets ten times as
 # fast, and one that rocks has not only turned round.
 CERTAIN_REST_CHECKS = 5
+# The same for what was stood upright, which may begin to topple from its very edge: 1 s.
+STANDING_REST_CHECKS = 20
 
 
 def rest_check_steps(frequency: float) -> int:
@@ -227,8 +229,12 @@ class LayoutTable(ABC):
         """Take an object or a wall away."""
 
     @abstractmethod
-    def settle(self, bodies: Sequence[int]) -> bool:
-        """Simulate until the bodies rest; False if they still move after scene.settle_seconds."""
+    def settle(self, bodies: Sequence[int], checks: int = 1) -> bool:
+        """Simulate until the bodies rest; False if they still move after scene.settle_seconds.
+
+        checks: how many times in a row, `rest_check_steps` apart, they must be found at rest, at
+        least.
+        """
 
     @abstractmethod
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:

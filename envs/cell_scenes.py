@@ -24,7 +24,7 @@ import itertools
 import numpy as np
 
 from envs.cell_arrangements import ARRANGEMENTS, FIXED, WALLS, leans, viewpoint_of
-from envs.cell_layout import Placement, Scene
+from envs.cell_layout import STANDING_REST_CHECKS, Placement, Scene
 from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
 from models.planner_contacts import buried_share
@@ -79,7 +79,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         models = [objects[int(i)] for i in chosen]
         with make_layout_table(config, models, walls) as table:
             bodies = arrange(table, models, rng, config)
-            if bodies is None or not table.settle(bodies):
+            checks = STANDING_REST_CHECKS if layout == "packed" else 1
+            if bodies is None or not table.settle(bodies, checks):
                 continue
             poses = [table.pose(body) for body in bodies]
         if all(_inside(position, config) for position, _ in poses):

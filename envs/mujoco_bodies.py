@@ -82,19 +82,23 @@ def wake(model: mujoco.MjModel, data: mujoco.MjData, bodies: Iterable[int]) -> N
 
 
 def settle(
-    data: mujoco.MjData, speeds: Sequence[int], config: Config, step: Callable[[int], None]
+    data: mujoco.MjData,
+    speeds: Sequence[int],
+    config: Config,
+    step: Callable[[int], None],
+    checks: int = CERTAIN_REST_CHECKS,
 ) -> bool:
     """Step until free bodies rest; False if they still move after scene.settle_seconds.
 
     speeds: where the velocity of each begins in `data.qvel`. step: takes so many of the cell's
-    steps. Rings and crosses rock for seconds on the edges of their pieces, and a single check would
-    find them at rest where they turn round.
+    steps. checks: as of `LayoutTable.settle`. Rings and crosses rock for seconds on the edges of
+    their pieces, and a single check would find them at rest where they turn round.
     """
     found, steps = 0, rest_check_steps(config.sim.frequency)
     for _ in range(int(config.scene.settle_seconds * config.sim.frequency / steps)):
         step(steps)
         found = found + 1 if all(_resting(data.qvel[at : at + 6]) for at in speeds) else 0
-        if found == CERTAIN_REST_CHECKS:
+        if found == checks:
             return True
     return False
 
@@ -275,12 +279,13 @@ class MujocoTable(LayoutTable):
             for geom in self._spec.body(_name(body)).geoms:
                 geom.contype = geom.conaffinity = 0
 
-    def settle(self, bodies: Sequence[int]) -> bool:
+    def settle(self, bodies: Sequence[int], checks: int = 1) -> bool:
         def step(count: int) -> None:
             self._mujoco.mj_step(self._model, self._data, count * SUBSTEPS)
 
         speeds = [self._joint(body).dofadr[0] for body in bodies]
-        return settle(self._data, speeds, self._config, step)
+        checks = max(checks, CERTAIN_REST_CHECKS)
+        return settle(self._data, speeds, self._config, step, checks)
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         start = self._joint(body).qposadr[0]

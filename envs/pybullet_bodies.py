@@ -343,8 +343,8 @@ class PybulletTable(LayoutTable):
     def remove(self, body: int) -> None:
         pybullet.removeBody(body, physicsClientId=self._client)
 
-    def settle(self, bodies: Sequence[int]) -> bool:
-        return settle(self._client, bodies, self._config)
+    def settle(self, bodies: Sequence[int], checks: int = 1) -> bool:
+        return settle(self._client, bodies, self._config, checks)
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         position, quaternion = pybullet.getBasePositionAndOrientation(
