@@ -19,8 +19,9 @@ heuristic6d, whose hand comes from any side, or graspnet6d, which leans it where
 all matter above it, or on --workspace X Y SIZE, its centre and side in the world. One object is
 named by a pixel on it (--point U V), by a box around it (--box U0 V0 U1 V1, the object that fills
 most of it), or by its pixels (--mask FILE, a PNG or NPY of the image's size, not 0 where the object
-is), which alone part two objects that touch where the planner sees one. Then all grasps are of that
-object, and `clearing` holds grasps that first move aside what is in its way.
+is), which alone part two objects that touch where the planner sees one, and join the pieces in
+which planners with a network see one of more than 10 cm. Then all grasps are of that object, and
+`clearing` holds grasps that first move aside what is in its way.
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose the
 table's normal is up. The program prints JSON, on a terminal a table, and writes the JSON to
@@ -33,7 +34,8 @@ along the approach, y along the closing line. `quality` is the chance of success
 beside `grasps`, is true, and else the planner's score. A robot here tries none under 0.5; planners
 from any side prefer steep approaches to slightly likelier ones. Units are metres and radians;
 quaternions are x, y, z, w. If there is nothing to grasp the list is empty. `remarks` say what to
-mistrust. Bad input ends with one sentence and status 2.
+mistrust. Bad input, and an object that was named and that no grasp reaches, end with one sentence
+and status 2.
 """
 
 from __future__ import annotations
