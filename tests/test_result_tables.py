@@ -411,9 +411,31 @@ def test_figures_of_code_that_changed_meanwhile_are_dropped(tmp_path, monkeypatc
     monkeypatch.setattr(results, "run_command", lambda *job: {"rows": []})
     monkeypatch.setattr(results, "code_commit", lambda: "dead")
     (part,) = chosen_parts("retrieve")
+    (command,) = part.commands
+    name = results.run_name(part, command, command.scaled(1.0), "c0ffee")
+    run = tmp_path / "runs" / "evaluate" / f"20260102-030405-{name}"
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(dump_config(load_config()))
     with pytest.raises(UserError, match="from commit c0ffee to dead while retrieve was measured"):
         results.measure(part, "c0ffee", 1.0)
     assert not results.is_finished(part, "c0ffee", 1.0)
+    assert results.latest_run("evaluate", name) is None, "nor does the next call go on with it"
+    assert len(list(run.parent.iterdir())) == 1, "but it is kept"
+
+
+def test_figures_of_another_folder_are_not_taken_for_this_one_s(tmp_path, monkeypatch):
+    """Where the run's folder is gone, too."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(results, "run_command", lambda *job: {"rows": [], "date": "2026-01-02"})
+    monkeypatch.setattr(results, "code_commit", lambda: "c0ffee")
+    (part,) = chosen_parts("ycb")
+    results.measure(part, "c0ffee", 0.1, {"ycb": Path("my ycb")})
+    results.measure(part, "c0ffee", 0.1, {"ycb": tmp_path / "my ycb"})
+    with pytest.raises(UserError, match=r"with .*my ycb, not with .*other; give the folder"):
+        results.measure(part, "c0ffee", 0.1, {"ycb": Path("other")})
+    (command,) = part.commands
+    words = shlex.split(command.line(3, {"ycb": Path("my ycb")}))
+    assert "evaluate.object_sets=my ycb" in words
 
 
 @pytest.fixture
