@@ -61,11 +61,18 @@ def test_one_false_match_does_not_move_the_target(false):
             np.testing.assert_allclose(motion.velocity, [0.05, 0, 0], atol=5e-3)
 
 
-def test_false_matches_here_and_there_are_no_push():
+@pytest.fixture
+def resting():
+    """The motion of what has lain at the origin for a second, and the sightings' covariance."""
     covariance = np.diag([1e-3, 1e-3, 0.02]) ** 2
     motion = PlanarMotion((0.0, 0.0, 0.0), 0.0)
     for k in range(1, 31):
         motion.see((0.0, 0.0, 0.0), covariance, k / 30)
+    return motion, covariance
+
+
+def test_false_matches_here_and_there_are_no_push(resting):
+    motion, covariance = resting
     assert not motion.see((0.2, 0.0, 0.0), covariance, 31 / 30)
     assert not motion.see((-0.2, 0.0, 0.0), covariance, 32 / 30)
     np.testing.assert_allclose(motion.state[:3], 0.0, atol=5e-4)
@@ -75,12 +82,9 @@ def test_false_matches_here_and_there_are_no_push():
     np.testing.assert_allclose(motion.state[:3], [0.2, 0.0, 0.0], atol=3e-3)
 
 
-def test_a_false_match_after_a_push_is_no_push():
+def test_a_false_match_after_a_push_is_no_push(resting):
     """What lies still is pushed by 2 cm, seen twice there, then once 24 mm beside it."""
-    covariance = np.diag([1e-3, 1e-3, 0.02]) ** 2
-    motion = PlanarMotion((0.0, 0.0, 0.0), 0.0)
-    for k in range(1, 31):
-        motion.see((0.0, 0.0, 0.0), covariance, k / 30)
+    motion, covariance = resting
     assert not motion.see((0.02, 0.0, 0.0), covariance, 31 / 30)
     assert motion.see((0.02, 0.0, 0.0), covariance, 32 / 30)
     assert not motion.see((0.02, 0.024, 0.0), covariance, 33 / 30)
