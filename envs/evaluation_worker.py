@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from envs.cell import require_arm
+from envs.cell import camera_intrinsics, require_arm
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
 from envs.execution import GraspOutcome, check_bin
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
@@ -25,6 +25,7 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
+from envs.views import check_sees_workspace
 from models.planner_target import check_takes_targets
 from models.planners import (
     Planner,
@@ -81,6 +82,7 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
             )
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")
+    check_sees_workspace(config.camera, camera_intrinsics(config.camera).K, config.workspace)
     make_cell(config).close()
     if config.robot.arm != "none":
         check_bin(config)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from utils.config import CameraConfig, WorkspaceConfig
-from utils.transforms import look_at
+from utils.errors import UserError
+from utils.transforms import look_at, project
 
 _STREAM = 11  # keeps these draws apart from others of the scene's seed
 
@@ -28,3 +29,27 @@ def side_view(camera: CameraConfig, workspace: WorkspaceConfig, seed: int) -> np
     centre = np.array([*workspace.center, 0.0])
     eye = centre + rng.uniform(*camera.side_distance) * outwards
     return look_at(eye, centre, (0.0, 0.0, 1.0))
+
+
+def check_sees_workspace(camera: CameraConfig, K: np.ndarray, workspace: WorkspaceConfig) -> None:
+    """Raise UserError where a fixed camera with intrinsics K shows no place of the workspace.
+
+    No planner would find a grasp, and every policy would be scored with 0 %. Cameras of other
+    mounts and views follow the hand or the workspace.
+    """
+    if camera.mount != "overhead" or camera.view != "fixed":
+        return
+    steps = np.linspace(-0.5, 0.5, 21) * workspace.size
+    x, y = np.meshgrid(workspace.center[0] + steps, workspace.center[1] + steps)
+    places = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    T_WC = look_at(camera.position, camera.target, camera.up)
+    pixels, depth = project(places, K, T_WC)
+    last = np.array([camera.width, camera.height]) - 0.5
+    inside = ((pixels > -0.5) & (pixels < last)).all(axis=-1)
+    if not (inside & (depth > camera.near) & (depth < camera.far)).any():
+        raise UserError(
+            "camera: sees nothing of the workspace, the square of the table with the side "
+            f"{workspace.size:g} m around ({workspace.center[0]:g}, {workspace.center[1]:g}); "
+            "point camera.target there, or change camera.position, camera.fov_deg, camera.near or "
+            "camera.far"
+        )

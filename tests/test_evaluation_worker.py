@@ -2,7 +2,9 @@
 
 import pytest
 
+from envs.cell import camera_intrinsics
 from envs.evaluation_worker import check_everything, film_name, work
+from envs.views import check_sees_workspace
 from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.evaluation import Task
@@ -52,6 +54,27 @@ def test_a_set_of_which_no_object_suits_a_layout_is_refused_before_any_round(con
     changes = {"policies": ("random",), "scenarios": ("pile", layout), "object_sets": ("box",)}
     with pytest.raises(UserError, match=f"no object of 'box' is .*{what}.* use the set {layout}"):
         check_everything(with_settings(config, "evaluate", changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sees"),
+    [
+        ({}, True),
+        ({"target": (-0.5, 0.0, 0.0)}, False),  # away from the table
+        ({"far": 0.3}, False),  # the table is farther away
+        ({"target": (0.5, 0.1, 0.0)}, True),  # the workspace's part
+        ({"target": (-0.5, 0.0, 0.0), "view": "side"}, True),  # looks at the middle in any case
+        ({"target": (-0.5, 0.0, 0.0), "mount": "wrist"}, True),
+    ],
+)
+def test_a_camera_that_sees_nothing_of_the_workspace_is_refused(config, changes, sees):
+    camera = with_settings(config, "camera", changes).camera
+    K = camera_intrinsics(camera).K
+    if sees:
+        check_sees_workspace(camera, K, config.workspace)
+        return
+    with pytest.raises(UserError, match="camera: sees nothing of the workspace.*camera.target"):
+        check_sees_workspace(camera, K, config.workspace)
 
 
 def test_a_picture_knows_its_scene_and_names_the_object_set_where_there_are_several(config):

@@ -570,7 +570,7 @@ def only_a_count_beside_export(files):
         (options(planner="graspnet6d"), "graspnet6d ranks by a critic"),
         (
             options(point=[3, 3]),
-            "--point 3 3: not on an object, but on the table or outside the workspace; the nearest",
+            "point 3 3: not on an object, but on the table or outside the workspace; the nearest",
         ),
         (options(point=[320, 3]), "outside the image"),
         (options(point=["nan", 3]), "--point nan 3.0: expected pixels"),

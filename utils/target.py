@@ -152,7 +152,7 @@ def target_at(labels: np.ndarray, frame: RGBDFrame, point: Sequence[float]) -> n
     """
     u, v = (int(round(x)) if np.isfinite(x) else -1 for x in point)
     height, width = labels.shape
-    name = f"--point {point[0]:g} {point[1]:g}"
+    name = f"point {point[0]:g} {point[1]:g}"
     if not (0 <= u < width and 0 <= v < height):
         raise UserError(f"{name}: outside the image of {width}x{height} pixels")
     label = labels[v, u]
@@ -181,7 +181,7 @@ def target_in_box(labels: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """(H, W) bool: the pixels of the object that fills most of a box (u0, v0, u1, v1), its corners
     in any order: the one with most of its pixels inside, of those that fill at least a tenth of the
     raised pixels there. Raises UserError for a box that holds no object."""
-    name = "--box " + " ".join(f"{x:g}" for x in box)
+    name = "box " + " ".join(f"{x:g}" for x in box)
     height, width = labels.shape
     if not np.isfinite(box).all():
         raise UserError(f"{name}: expected pixels U0 V0 U1 V1")
