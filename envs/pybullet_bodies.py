@@ -39,6 +39,11 @@ from utils.transforms import position_quaternion
 # (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more
 # than the root of this. PyBullet's default.
 SOLVER_RESIDUAL = 1e-7
+# Of two meshes with this flag, Bullet finds all corners of the area in which their faces touch, at
+# once; else it finds one point of contact a step, and what is gripped turns about the first ones.
+# The flag of URDF files means the same to `createCollisionShape`, which has no name for it and
+# passes it over for boxes.
+WHOLE_FACES = pybullet.URDF_INITIALIZE_SAT_FEATURES
 Quaternion = Sequence[float]  # x, y, z, w
 _HERE = (0.0, 0.0, 0.0)
 
@@ -185,7 +190,7 @@ def _collision_shape(client: int, shape: NativeShape | Path) -> int:
         kind, size = _native_arguments(shape, "height")
         return pybullet.createCollisionShape(kind, physicsClientId=client, **size)
     return pybullet.createCollisionShape(
-        pybullet.GEOM_MESH, fileName=str(shape), physicsClientId=client
+        pybullet.GEOM_MESH, fileName=str(shape), flags=WHOLE_FACES, physicsClientId=client
     )
 
 

@@ -16,6 +16,7 @@ import pybullet
 from envs.cell_layout import GRAVITY
 from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import CARRIAGE_FORCE, FINGER_DRIVE_INERTIA
+from envs.pybullet_bodies import WHOLE_FACES
 from envs.robot import DRIVE_GAIN, FINGER_SPEED, LEFT, Contact, Hand, Robot
 from envs.robot_kinematics import JOINT_TORQUE, JOINT_VELOCITY, TOOL_LENGTH
 from envs.robot_safety import ArmGate
@@ -27,7 +28,9 @@ ARM = list(range(7))
 LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
 CARRIAGE = list(range(3))  # of the hand without the arm, which is part of the last of these
 
-_URDF_FLAGS = pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_INERTIA_FROM_FILE
+_URDF_FLAGS = (
+    pybullet.URDF_ENABLE_CACHED_GRAPHICS_SHAPES | pybullet.URDF_USE_INERTIA_FROM_FILE | WHOLE_FACES
+)
 _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]

@@ -3,6 +3,7 @@ in every simulator that is installed."""
 
 import numpy as np
 import pytest
+import trimesh
 from trimesh.convex import convex_hull
 
 from benchmarks.show_bar import bar, grip, solid, tilt
@@ -106,6 +107,26 @@ def test_contacts_turn_with_the_hand(cell, config):
         cell.step()
         assert cell.robot.holds(cell.bodies[0], min_force=7)
     assert start[6] - cell.robot.q[6] > np.deg2rad(110)
+
+
+@needs_pybullet
+def test_faces_that_touch_do_so_in_all_their_corners_at_once(bullet_cell, tmp_path):
+    """A block of convex parts, gripped by its faces: Bullet forgets its contacts, and a step later
+    each finger has its four corners again. (Without `WHOLE_FACES`, it has one.)"""
+    import pybullet
+
+    block = trimesh.creation.box((0.05, 0.04, 0.06)).vertices
+    shape = Primitive("block", None, (np.array(block),), 300.0, 0.5, (0.5, 0.5, 0.5, 1.0))
+    model = compound_object(shape, tmp_path)
+    grip(bullet_cell, model, 10.0)
+    body, robot, client = bullet_cell.bodies[0], bullet_cell.robot, bullet_cell.client
+    pybullet.setCollisionFilterGroupMask(body, -1, 1, -1, physicsClientId=client)
+    bullet_cell.step()
+    for finger in robot.fingers:
+        contacts = pybullet.getContactPoints(
+            bodyA=robot.body, bodyB=body, linkIndexA=finger, physicsClientId=client
+        )
+        assert sum(contact[8] < 1e-4 for contact in contacts) == 4
 
 
 @pytest.mark.parametrize(("lean", "mass"), [(15, 0.5), (20, 0.25), (20, 0.35)])
