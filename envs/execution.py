@@ -240,7 +240,8 @@ def execute_grasp(
         held = cell.held_object()
         motion = None if held is None else InHandMotion(cell, held)
         grip = WeighingGrip(cell.robot, firmly)
-        _carry_to_bin(cell, held, closed, height, motion, grip)
+        with cell.robot.carrying():
+            _carry_to_bin(cell, held, closed, height, motion, grip)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:

@@ -80,10 +80,11 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
         motion = None if held is None else InHandMotion(cell, held)
         if carry and held is not None:
             hand.command_gripper(0.0, max(holding_force(_weight(cell, held)), hand.grip_force))
-        _retreat(cell, hand, grasp)
-        _judge(cell, held, motion)
-        if carry and held is not None:
-            _carry(cell, hand, held, max(grasp.position[2], closed))
+        with hand.carrying():
+            _retreat(cell, hand, grasp)
+            _judge(cell, held, motion)
+            if carry and held is not None:
+                _carry(cell, hand, held, max(grasp.position[2], closed))
         detail = met
     except GraspFailure as failure:
         reason, detail = failure.reason, ", and ".join(filter(None, [met, failure.detail]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ _POSITION_GAIN, _GRIPPER_GAIN = 0.3, 0.2
 _TORQUES = JOINT_TORQUE.tolist()
 _STATE_JOINTS = [*ARM, *FINGERS]
 _ANY_SPEED = 100.0  # rad/s, at which Bullet cuts every joint off unless told otherwise
+CARRYING_EFFORT = 3  # times sim.solver_iterations, while the hand carries something
 _RENEWED_COSINE = math.cos(math.radians(10) / 2)  # of half the angle by which the hand has turned
 _MOVING, _EVERYTHING = 1, -1  # Bullet's group of what moves, and the groups that this meets
 _HALF = math.sqrt(0.5)  # the hand is turned by -45 degrees about joint 7's axis
@@ -110,6 +112,22 @@ class PybulletHand(Hand):
         return -sum(state[3] for state in states) / 2
 
     # --- Contacts -----------------------------------------------------------------------------
+
+    @contextmanager
+    def carrying(self) -> Iterator[None]:
+        """With `CARRYING_EFFORT` times as many iterations of the solver, which else stops before
+        the friction in the fingers holds all: what is held creeps."""
+        iterations = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)[
+            "numSolverIterations"
+        ]
+        self._set_iterations(CARRYING_EFFORT * iterations)
+        try:
+            yield
+        finally:
+            self._set_iterations(iterations)
+
+    def _set_iterations(self, count: int) -> None:
+        pybullet.setPhysicsEngineParameter(numSolverIterations=count, physicsClientId=self.client)
 
     def renew_contacts(self) -> None:
         """Let the fingers' contacts be found again where the hand has turned by some degrees.

@@ -12,6 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -151,6 +152,11 @@ class Hand(ABC):
     def holds(self, body: int, min_force: float = 0.1) -> bool:
         """Whether both fingers grip the body with at least `min_force` newtons each."""
         return min(self.grip_forces(body)) >= min_force
+
+    def carrying(self) -> AbstractContextManager[None]:
+        """While the hand lifts and carries something: a simulator whose solver is too coarse for
+        that computes finer inside this context."""
+        return nullcontext()
 
     @abstractmethod
     def renew_contacts(self) -> None:

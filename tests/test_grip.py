@@ -110,6 +110,23 @@ def test_contacts_turn_with_the_hand(cell, config):
 
 
 @needs_pybullet
+def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set):
+    """And as before afterwards, however the carrying ends."""
+    import pybullet
+
+    def iterations() -> int:
+        found = pybullet.getPhysicsEngineParameters(physicsClientId=bullet_cell.client)
+        return found["numSolverIterations"]
+
+    before = iterations()
+    assert before == bullet_cell.config.sim.solver_iterations
+    with pytest.raises(ZeroDivisionError), bullet_cell.robot.carrying():
+        assert iterations() == 3 * before
+        1 / 0  # noqa: B018
+    assert iterations() == before
+
+
+@needs_pybullet
 def test_faces_that_touch_do_so_in_all_their_corners_at_once(bullet_cell, tmp_path):
     """A block of convex parts, gripped by its faces: Bullet forgets its contacts, and a step later
     each finger has its four corners again. (Without `WHOLE_FACES`, it has one.)"""
