@@ -118,6 +118,7 @@ def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set):
         found = pybullet.getPhysicsEngineParameters(physicsClientId=bullet_cell.client)
         return found["numSolverIterations"]
 
+    grip(bullet_cell, solid(box_set[0], NativeShape("sphere", (0.03,)), 0.1, 0.5), 10.0)
     before = iterations()
     assert before == bullet_cell.config.sim.solver_iterations
     with pytest.raises(ZeroDivisionError), bullet_cell.robot.carrying():
