@@ -15,6 +15,7 @@ from envs.object_primitives import NativeShape, Primitive
 from envs.objects import load_object_set
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
+from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import INSTALLED, needs_pybullet
 from utils.transforms import Grasp
 
@@ -110,17 +111,23 @@ def test_contacts_turn_with_the_hand(cell, config):
 
 
 @needs_pybullet
-def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set):
-    """And as before afterwards, however the carrying ends."""
+def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set, monkeypatch):
+    """Not before, and not afterwards, however the carrying ends."""
     import pybullet
+
+    from envs.pybullet_panda import PybulletHand
 
     def iterations() -> int:
         found = pybullet.getPhysicsEngineParameters(physicsClientId=bullet_cell.client)
         return found["numSolverIterations"]
 
-    grip(bullet_cell, solid(box_set[0], NativeShape("sphere", (0.03,)), 0.1, 0.5), 10.0)
+    seen = []
+    monkeypatch.setattr(PybulletHand, "renew_contacts", lambda hand: seen.append(iterations()))
+    bullet_cell.load(cube_scene(box_set))
     before = iterations()
-    assert before == bullet_cell.config.sim.solver_iterations
+    assert execute_grasp(bullet_cell, cube_grasp()).success
+    assert set(seen) == {3 * before}  # all the way to the bin
+    assert iterations() == before == bullet_cell.config.sim.solver_iterations
     with pytest.raises(ZeroDivisionError), bullet_cell.robot.carrying():
         assert iterations() == 3 * before
         1 / 0  # noqa: B018
