@@ -40,7 +40,7 @@ def bar(cube: ObjectModel) -> ObjectModel:
 
 def solid(cube: ObjectModel, shape: NativeShape, mass: float, friction: float) -> ObjectModel:
     """An object of a native shape and even density, without rolling friction."""
-    mesh = shape.mesh(fine=True)
+    mesh = shape.mesh("fine")
     return replace(
         cube, collision=shape, mass=mass, friction=friction, rolling_friction=0.0,
         inertia=mass / mesh.volume * np.diag(mesh.moment_inertia), extents=np.array(mesh.extents),

@@ -100,7 +100,7 @@ def native_object(
 ) -> ObjectModel:
     """A shape that simulators collide in closed form, of even density (kg/m3), or of a higher one
     that makes MIN_MASS."""
-    solid = shape.mesh(fine=True)
+    solid = shape.mesh("fine")
     density = max(density, MIN_MASS / float(solid.volume))
     vertices = np.asarray(shape.mesh().vertices)
     return ObjectModel(

@@ -39,6 +39,7 @@ _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _DENSITIES, _MASS_RANGE = (300, 1500), (0.03, 0.3)  # of the other families
 _HOUSEHOLD_DENSITIES = (100, 2500)  # kg/m3
+_DETAILS = {"coarse": (2, 32), "drawn": (3, 64), "fine": (5, 512)}  # of a ball, of a cylinder
 _DARK_SHARE, _DARKENED = 0.6, 0.12  # of the thin things, and their colours
 
 
@@ -53,17 +54,19 @@ class NativeShape:
     kind: str
     size: tuple[float, ...]
 
-    def mesh(self, fine: bool = False) -> trimesh.Trimesh:
-        """A tessellation: coarse as a union of few planes, fine for mass properties."""
+    def mesh(self, detail: str = "coarse") -> trimesh.Trimesh:
+        """A tessellation. detail: "coarse", a union of few planes; "drawn", within 1 % of the
+        radius, for pictures; "fine", for mass properties."""
+        subdivisions, sections = _DETAILS[detail]
         if self.kind == "box":
             return trimesh.creation.box(self.size)
         if self.kind == "sphere":
-            return trimesh.creation.icosphere(5 if fine else 2, self.size[0])
+            return trimesh.creation.icosphere(subdivisions, self.size[0])
         radius, length = self.size
         if self.kind == "cylinder":
-            return trimesh.creation.cylinder(radius, length, sections=512 if fine else 32)
+            return trimesh.creation.cylinder(radius, length, sections=sections)
         # As the hull of two balls: its centre is then ours to choose.
-        ball = trimesh.creation.icosphere(5 if fine else 2, radius).vertices
+        ball = trimesh.creation.icosphere(subdivisions, radius).vertices
         shift = np.array([0.0, 0.0, length / 2])
         return trimesh.convex.convex_hull(np.concatenate([ball + shift, ball - shift]))
 
@@ -95,7 +98,7 @@ def make_primitive(
     if isinstance(shape, NativeShape):
         native = NativeShape(shape.kind, tuple(float(scale * side) for side in shape.size))
         parts = (np.asarray(native.mesh().vertices),)
-        volume = native.mesh(fine=True).volume
+        volume = native.mesh("fine").volume
     else:
         parts = tuple(scale * part for part in shape)
         volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)

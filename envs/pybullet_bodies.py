@@ -8,6 +8,7 @@ This module knows no cell, robot or camera.
 from __future__ import annotations
 
 import atexit
+import functools
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 import pybullet
+import trimesh
 from typing_extensions import Self
 
 from envs.board import BLACK, WHITE, Board
@@ -44,6 +46,7 @@ SOLVER_RESIDUAL = 1e-7
 # The flag of URDF files means the same to `createCollisionShape`, which has no name for it and
 # passes it over for boxes.
 WHOLE_FACES = pybullet.URDF_INITIALIZE_SAT_FEATURES
+_EDGE = np.radians(20)  # a sharper one is drawn as an edge, not as a curve
 Quaternion = Sequence[float]  # x, y, z, w
 _HERE = (0.0, 0.0, 0.0)
 
@@ -187,7 +190,7 @@ def bullet_quaternion(quaternion: Quaternion, principal: Quaternion | None) -> Q
 def _collision_shape(client: int, shape: NativeShape | Path) -> int:
     """Number of a new collision shape; `shape` is native or an OBJ file of convex parts."""
     if isinstance(shape, NativeShape):
-        kind, size = _native_arguments(shape, "height")
+        kind, size = _native_arguments(shape)
         return pybullet.createCollisionShape(kind, physicsClientId=client, **size)
     return pybullet.createCollisionShape(
         pybullet.GEOM_MESH, fileName=str(shape), flags=WHOLE_FACES, physicsClientId=client
@@ -205,8 +208,15 @@ def _visual_shape(
     A native shape is drawn as it is, whatever `fine` is.
     """
     if isinstance(shape, NativeShape):
-        kind, size = _native_arguments(shape, "length")
-        return pybullet.createVisualShape(kind, rgbaColor=color, physicsClientId=client, **size)
+        vertices, triangles, normals = _drawn(shape)
+        return pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=vertices,
+            indices=triangles,
+            normals=normals,
+            rgbaColor=color,
+            physicsClientId=client,
+        )
     if fine is None:
         return pybullet.createVisualShape(
             pybullet.GEOM_MESH, fileName=str(shape), rgbaColor=color, physicsClientId=client
@@ -223,14 +233,24 @@ def _visual_shape(
     )
 
 
-def _native_arguments(shape: NativeShape, length_name: str) -> tuple[int, dict]:
-    """PyBullet calls a cylinder's length "height" when it collides and "length" when it shows."""
+def _native_arguments(shape: NativeShape) -> tuple[int, dict]:
     if shape.kind == "box":
         return pybullet.GEOM_BOX, {"halfExtents": [side / 2 for side in shape.size]}
     if shape.kind == "sphere":
         return pybullet.GEOM_SPHERE, {"radius": shape.size[0]}
     kinds = {"cylinder": pybullet.GEOM_CYLINDER, "capsule": pybullet.GEOM_CAPSULE}
-    return kinds[shape.kind], {"radius": shape.size[0], length_name: shape.size[1]}
+    return kinds[shape.kind], {"radius": shape.size[0], "height": shape.size[1]}
+
+
+@functools.lru_cache(maxsize=256)
+def _drawn(shape: NativeShape) -> tuple[list, list, list]:
+    """Vertices (V, 3), triangles (3 T,) and normals (V, 3) of what the camera sees of a shape.
+
+    PyBullet's own drawings are not what it collides: the caps of its capsule are cones, up to 4 mm
+    inside the true ones, its spheres are 1 mm too small, its cylinders 1 mm too thick.
+    """
+    mesh = trimesh.graph.smooth_shade(shape.mesh("drawn"), angle=_EDGE)
+    return mesh.vertices.tolist(), mesh.faces.ravel().tolist(), mesh.vertex_normals.tolist()
 
 
 def _has_texture(path: Path) -> bool:
