@@ -177,7 +177,7 @@ def holds_box(env: Any) -> bool:
 
 @contextmanager
 def our_client(scene: Scene, config: Config, robot: bool) -> Iterator[int]:
-    """A physics client with our table, (robot and bin,) and the scene's objects."""
+    """A physics client with our table, (robot and tray,) and the scene's objects."""
     if robot:
         with PybulletCell(config) as cell:
             cell.build(scene)

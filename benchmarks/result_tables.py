@@ -86,7 +86,7 @@ OVERVIEW_PLANNERS = "graspnet", "graspnet6d", "oracle6d"
 
 _HEADLINE = (
     "**Result** on unseen objects{}: {} of GraspNet's grasps succeed in piles of 5 objects, {} in "
-    "piles of 15; {} and {} of the objects reach the bin."
+    "piles of 15; {} and {} of the objects reach the tray."
 )
 _AHEAD = (
     "On 15 objects{} GraspNet's success minus the heuristic's is {} points (95 % bootstrap, paired "
@@ -109,7 +109,7 @@ CHINESE = {
     " with `{}` depth noise": "、深度噪声为 `{}` ",
     _HEADLINE: (
         "**结果**:没见过的物体{}时,GraspNet 的抓取在 5 个物体的堆中有 {} 成功,"
-        "在 15 个物体的堆中有 {};分别有 {} 和 {} 的物体被放进料箱。"
+        "在 15 个物体的堆中有 {};分别有 {} 和 {} 的物体被放进托盘。"
     ),
     _AHEAD: (
         "15 个物体{}时,GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"

@@ -58,7 +58,7 @@ def film(config: Config, layout: str, objects: str) -> list[np.ndarray]:
             max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
         )  # fmt: skip
         pictures = filming.stop()
-    outcome = f"{layout}: {record.objects_cleared} of {record.objects_total} in the bin"
+    outcome = f"{layout}: {record.objects_cleared} of {record.objects_total} in the tray"
     outcome += f", {len(record.attempts)} attempts"
     print(outcome)
     return [captioned(picture, outcome) for picture in pictures]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from envs.cell import Cell
-from envs.cell_layout import Box, bin_walls, distance_to_box, table_box
+from envs.cell_layout import Box, distance_to_box, table_box, tray_walls
 from envs.panda_model import ARM_DISCS, ARM_LINKS, finger_hull, hull_of_discs, palm_hull
 from envs.robot_kinematics import (
     GRASP_DEPTH,
@@ -31,12 +31,12 @@ _FIRST = 3  # of the links that are looked at: the lower ones turn over the robo
 
 
 def arm_is_clear(cell: Cell, q: np.ndarray) -> bool:
-    """Whether the arm, but for its hand, stays clear of table, bin, walls and its joints' limits at
-    joint positions q (N, 7)."""
+    """Whether the arm, but for its hand, stays clear of table, tray, walls and its joints' limits
+    at joint positions q (N, 7)."""
     margin = cell.config.safety.joint_margin
     if (q < JOINT_LOWER + margin).any() or (q > JOINT_UPPER - margin).any():
         return False  # where a curve between waypoints may leave the limits
-    boxes = [table_box(), *bin_walls(), *(cell.scene.walls if cell.scene else ())]
+    boxes = [table_box(), *tray_walls(), *(cell.scene.walls if cell.scene else ())]
     poses = link_poses(q)[:, _FIRST - 1 :]
     return all(
         _is_clear(places, points, box)

@@ -1,4 +1,4 @@
-"""Paths of the arm: to a grasp, up with what it holds, to the bin; and whether they are clear.
+"""Paths of the arm: to a grasp, up with what it holds, to the tray; and whether they are clear.
 
 All is planned before anything moves. Planners keep the hand clear on its straight way to a grasp;
 the arm's links are checked here. What hangs over the table, such as the board of a shelf, no
@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.arm_clearance import arm_is_clear, hand_is_clear, held_points
 from envs.cell import Cell
-from envs.cell_layout import BIN_CENTRE, BIN_HEIGHT
+from envs.cell_layout import TRAY_CENTRE, TRAY_HEIGHT
 from envs.robot_kinematics import (
     HALF_TURN,
     UnreachableError,
@@ -27,7 +27,7 @@ from envs.robot_kinematics import (
 from envs.robot_motion import Trajectory
 from utils.transforms import Grasp, top_down_pose
 
-_OVER_BIN = BIN_HEIGHT + 0.17  # m over the table, where E releases an object, or higher
+_OVER_TRAY = TRAY_HEIGHT + 0.17  # m over the table, where E releases an object, or higher
 # m over execution.lift_height, to which the lower end of an object is lifted: a heavy one that is
 # gripped beside its middle may turn until it hangs, far below the hand.
 LIFT_MARGIN = 0.15
@@ -104,14 +104,14 @@ def _from_above(cell: Cell, q: np.ndarray) -> Trajectory:
 def clears(cell: Cell, plan: Plan, grasp: Grasp) -> bool:
     """Whether the arm, but for its hand, stays clear of the cell on a plan and while it lifts. The
     hand is the planners' matter, unless something hangs over the table: then it is checked, too,
-    with the object on the way to the bin."""
+    with the object on the way to the tray."""
     reach, down, target = plan
     try:
         lift = way_up(cell, down.positions[-1], target, grasp.position[2])
         parts = [reach, down, lift]
         if cell.hanging:
             top = raised(cell, target, grasp.position[2])[2, 3]
-            parts.append(way_to_bin(cell, lift.positions[-1], top))
+            parts.append(way_to_tray(cell, lift.positions[-1], top))
     except UnreachableError:
         return False
     looked_at = [part.positions[::LOOK_EVERY] for part in parts]
@@ -181,17 +181,17 @@ def raised(cell: Cell, T_WE: np.ndarray, height: float) -> np.ndarray:
     return lifted
 
 
-def place_over_bin(top: float) -> np.ndarray:
+def place_over_tray(top: float) -> np.ndarray:
     """(3,) m in W, where E releases an object that has been lifted `top` m high: it may hang far
     below the hand."""
-    return np.array([*BIN_CENTRE, max(_OVER_BIN, top)])
+    return np.array([*TRAY_CENTRE, max(_OVER_TRAY, top)])
 
 
-def way_to_bin(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
-    """From joint positions q (7,), at which an object has been lifted `top` m high, to the bin; by
+def way_to_tray(cell: Cell, q: np.ndarray, top: float) -> Trajectory:
+    """From joint positions q (7,), at which an object has been lifted `top` m high, to the tray; by
     way of home, where the hand is high, if something hangs over the table. Raises
     UnreachableError."""
-    posture = choose_posture(top_down_pose(place_over_bin(top), -np.pi / 2), cell.home)
+    posture = choose_posture(top_down_pose(place_over_tray(top), -np.pi / 2), cell.home)
     if not cell.hanging:
         return cell.robot.joint_move(q, posture, **scales(cell))
     first = cell.robot.joint_move(q, cell.home, **scales(cell))

@@ -198,7 +198,7 @@ class Cell(ABC):
 
     @abstractmethod
     def _build(self, scene: Scene, board: Board | None, T_WO: np.ndarray | None) -> None:
-        """Make table, bin, robot (at home, wide open), objects and perhaps a board at T_WO (4, 4);
+        """Make table, tray, robot (at home, wide open), objects and perhaps a board at T_WO (4, 4);
         sets `robot` and `bodies`."""
 
     @abstractmethod

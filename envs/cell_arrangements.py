@@ -57,7 +57,7 @@ def _walls_around(config: Config) -> tuple[Box, ...]:
 
 
 def _wall_beside(config: Config) -> tuple[Box, ...]:
-    """One wall along the workspace's left edge, away from the bin."""
+    """One wall along the workspace's left edge, away from the tray."""
     half = np.array([config.workspace.size + 0.1, _WALL_THICKNESS, _WALL_HEIGHT]) / 2
     x, y = config.workspace.center
     return (Box(half, np.array([x, y + config.workspace.size / 2 + half[1], half[2]])),)
@@ -69,7 +69,7 @@ def _block(config: Config) -> tuple[Box, ...]:
 
 
 def _shelf(config: Config) -> tuple[Box, ...]:
-    """A board over the workspace, and the back that holds it on the side of the bin."""
+    """A board over the workspace, and the back that holds it on the side of the tray."""
     x, y = config.workspace.center
     front = y + _FRONT
     back = np.array([_BOARD[0], _BOARD[2], _BOARD_HEIGHT])

@@ -1,4 +1,4 @@
-"""What stands in a cell, as data: gravity, table, bin, walls, objects, and the scene of a round.
+"""What stands in a cell, as data: gravity, table, tray, walls, objects, and the scene of a round.
 
 Every simulator builds its cell from these constants and from a `Scene`, and implements the
 `LayoutTable` on which objects come to rest. `envs.objects` makes the objects, `envs.cell_scenes`
@@ -32,9 +32,9 @@ TABLE_COLOUR = (0.62, 0.60, 0.57, 1.0)
 _X_MIN, _Y_MIN = (TABLE_CENTRE - TABLE_SIZE / 2).tolist()
 _X_MAX, _Y_MAX = (TABLE_CENTRE + TABLE_SIZE / 2).tolist()
 
-BIN_CENTRE = np.array([0.42, -0.48])  # m in W; outside the overhead camera's view
-BIN_HALF_SIZE, BIN_HEIGHT, BIN_WALL = 0.13, 0.08, 0.005  # m
-BIN_COLOUR = (0.25, 0.35, 0.45, 1.0)
+TRAY_CENTRE = np.array([0.42, -0.48])  # m in W; outside the overhead camera's view
+TRAY_HALF_SIZE, TRAY_HEIGHT, TRAY_WALL = 0.13, 0.08, 0.005  # m
+TRAY_COLOUR = (0.25, 0.35, 0.45, 1.0)
 
 WALL_COLOUR = (0.8, 0.8, 0.8, 1.0)
 
@@ -72,9 +72,9 @@ def table_box() -> Box:
     )
 
 
-def bin_walls() -> Iterator[Box]:
-    """The four walls of the bin beside the workspace into which picked objects go."""
-    return square_walls(BIN_CENTRE, BIN_HALF_SIZE, BIN_HEIGHT, BIN_WALL)
+def tray_walls() -> Iterator[Box]:
+    """The four walls of the tray beside the workspace into which picked objects go."""
+    return square_walls(TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_HEIGHT, TRAY_WALL)
 
 
 def square_walls(

@@ -23,7 +23,7 @@ from envs.cell import Cell, PhysicsError, camera_intrinsics, require_arm
 from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
-from envs.execution import check_bin, execute_grasp
+from envs.execution import check_tray, execute_grasp
 from envs.objects import OBJECT_SETS, ObjectPart, ObjectSet, load_object_set
 from envs.simulators import cell_class
 from utils.atomic_files import write_atomic
@@ -141,7 +141,7 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     if missing:
         object_sets(config)  # an unusable set raises here, not in a worker, and leaves no folder
         if config.data.executed_share:
-            check_bin(config)
+            check_tray(config)
     _claim(folder, config)
     if not missing:
         return folder

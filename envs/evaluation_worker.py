@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 from envs.cell import camera_intrinsics, require_arm
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
-from envs.execution import GraspOutcome, check_bin
+from envs.execution import GraspOutcome, check_tray
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
 from envs.policy_approach import (
     PolicyApproach,
@@ -85,7 +85,7 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     check_sees_workspace(config.camera, camera_intrinsics(config.camera).K, config.workspace)
     make_cell(config).close()
     if config.robot.arm != "none":
-        check_bin(config)
+        check_tray(config)
     sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
     with open_executor(config.compute, config.evaluate.workers) as workers:
         for name, objects in sets.items():

@@ -26,11 +26,11 @@ from envs.arm_paths import (
     height_over,
     higher_than,
     line,
-    place_over_bin,
+    place_over_tray,
     raised,
     scales,
     standoff,
-    way_to_bin,
+    way_to_tray,
     way_up,
     withdrawn,
 )
@@ -203,17 +203,17 @@ def reaches(cell: Cell, grasp: Grasp) -> bool:
 Approach = Callable[[Cell, Grasp], ApproachResult]
 
 
-def check_bin(config: Config) -> None:
-    """Raise UserError where the gate's box ends before the lowest place over the bin: every picked
+def check_tray(config: Config) -> None:
+    """Raise UserError where the gate's box ends before the lowest place over the tray: every picked
     object would end as `stopped` on its way there, and no grasp could succeed."""
-    lowest = place_over_bin(config.execution.lift_height + LIFT_MARGIN)
+    lowest = place_over_tray(config.execution.lift_height + LIFT_MARGIN)
     safety, place = config.safety, lowest.round(3).tolist()
     box = reaching_down(safety, config.closed_loop.floor)
     if not all(low <= at <= high for low, at, high in zip(box.box_lower, place, box.box_upper)):
         raise UserError(
             f"safety: the box from box_lower {list(safety.box_lower)} to box_upper "
             f"{list(safety.box_upper)} leaves out {place} m, over which the hand releases objects "
-            "into the bin, so that every pick would be stopped on its way there; widen the box "
+            "into the tray, so that every pick would be stopped on its way there; widen the box "
             "until it holds that point"
         )
 
@@ -221,10 +221,10 @@ def check_bin(config: Config) -> None:
 def execute_grasp(
     cell: Cell, grasp: Grasp, approach: Approach = open_loop, firmly: bool = False
 ) -> GraspOutcome:
-    """Approach, close, lift, carry to the bin, release, return home.
+    """Approach, close, lift, carry to the tray, release, return home.
 
     Success: both fingers grip one object, which is off the table with its centre of mass above
-    execution.lift_height all the way to the bin and for execution.hold_seconds at least (checked
+    execution.lift_height all the way to the tray and for execution.hold_seconds at least (checked
     every 0.05 s). With execution.strict, it also must not turn or slide in the hand on the way (see
     `utils.result_records.loose`). A picked object is retired. The arm is at home at the end of
     every attempt. Raises PhysicsError when the simulation blows up.
@@ -241,7 +241,7 @@ def execute_grasp(
         motion = None if held is None else InHandMotion(cell, held)
         grip = WeighingGrip(cell.robot, firmly)
         with cell.robot.carrying():
-            _carry_to_bin(cell, held, closed, height, motion, grip)
+            _carry_to_tray(cell, held, closed, height, motion, grip)
     except UnreachableError:
         reason = "ik"
     except GraspFailure as failure:
@@ -253,7 +253,7 @@ def execute_grasp(
         stopped_at = cell.robot.tip_pose()[:3, 3].copy()
     detail = "; ".join(filter(None, [detail, go_home(cell)]))
     if reason == "success":
-        cell.retire(held)  # in the bin, into which it has fallen meanwhile
+        cell.retire(held)  # in the tray, into which it has fallen meanwhile
     cell.check_physics()
     cell.retire_lost_objects()
     return GraspOutcome(reason, cell.seconds - start, held, detail, stopped_at, motion)
@@ -323,7 +323,7 @@ def _still_lifted(cell: Cell, index: int, motion: InHandMotion) -> None:
     motion.look()
 
 
-def _carry_to_bin(
+def _carry_to_tray(
     cell: Cell,
     index: int | None,
     closed: np.ndarray,
@@ -332,12 +332,12 @@ def _carry_to_bin(
     grip: WeighingGrip,
 ) -> None:
     """Lift an object, gripped `height` m over the table at T_WE `closed` (4, 4), and carry it over
-    the bin. Raises GraspFailure; with execution.strict also where the object has moved in the hand.
+    the tray. Raises GraspFailure; with execution.strict also where the object moved in the hand.
     index: None where the hand only believes that it holds one."""
     settings, robot, start = cell.config.execution, cell.robot, cell.robot.q
     top = raised(cell, closed, height)[2, 3]
     lift = way_up(cell, start, closed, height)
-    carry = way_to_bin(cell, lift.positions[-1], top)
+    carry = way_to_tray(cell, lift.positions[-1], top)
     corner = higher_than(top - _LIFT_CORNER, lift)
     way = robot.blended_moves(start, lift, carry, corner, **scales(cell))
     every = round(_CHECK_SECONDS / cell.dt)

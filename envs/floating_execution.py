@@ -23,7 +23,7 @@ from utils.transforms import Grasp
 PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
 RETREAT = 0.10  # m, VGN's
 SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
-CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's bin
+CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's tray
 _HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
 
 

@@ -42,7 +42,7 @@ _PARKED = (0.0, 0.0, -10.0)  # m in W, where an object is that is not on the tab
 # MuJoCo takes the larger friction of two that touch, PyBullet the product, with 1 on table and
 # fingers: these have none here, and `add_pairs` states what counts.
 NO_FRICTION = 1e-5
-# Of an object's friction on bin, palm and arm: Bullet's coefficient where none is stated, which is
+# Of an object's friction on tray, palm and arm: Bullet's coefficient where none is stated, which is
 # theirs there, and by which Bullet multiplies the object's.
 OF_OTHER_BODIES = 0.5
 ROLLING = 1e-4  # m, MuJoCo's default

@@ -1,6 +1,6 @@
 """The robot cell in MuJoCo: the same scenes, cameras and robot as in PyBullet, other physics.
 
-`scene_spec` writes MuJoCo's model of table, bin, objects and Panda, placed as in PyBullet's cell;
+`scene_spec` writes MuJoCo's model of table, tray, objects and Panda, placed as in PyBullet's cell;
 `MujocoCell` runs it. Sizes, masses, inertias, and friction of objects with all else are PyBullet's;
 contacts are MuJoCo's own. Between two objects MuJoCo takes the larger coefficient of two, PyBullet
 the product: they agree where both objects have the same.
@@ -17,11 +17,11 @@ import numpy as np
 from envs.board import Board
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import (
-    BIN_COLOUR,
     TABLE_COLOUR,
+    TRAY_COLOUR,
     Scene,
-    bin_walls,
     table_box,
+    tray_walls,
 )
 from envs.floating_hand import park
 from envs.mujoco_bodies import (
@@ -62,7 +62,7 @@ _OBJECT = re.compile(r"object\d+")  # names of the objects' bodies
 
 
 def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujoco.MjSpec:
-    """A model of Panda, table, bin and the scene's objects at their resting poses, with a camera.
+    """A model of Panda, table, tray and the scene's objects at their resting poses, with a camera.
 
     arm: False for the hand alone. Bodies are called `table`, `bin0` to `bin3` and `object0` on.
     Raises UserError without MuJoCo.
@@ -72,8 +72,8 @@ def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujo
         for geom in spec.body(name).geoms:
             geom.friction = [NO_FRICTION, 0.0, ROLLING]
     add_boxes(spec, "table", [table_box(), *scene.walls], TABLE_COLOUR)
-    for i, wall in enumerate(bin_walls()):
-        add_boxes(spec, f"bin{i}", [wall], BIN_COLOUR)
+    for i, wall in enumerate(tray_walls()):
+        add_boxes(spec, f"tray{i}", [wall], TRAY_COLOUR)
     for i, placed in enumerate(scene.placements):
         add_object(spec, f"object{i}", placed.model, placed.position, placed.quaternion)
     if arm:  # whose base stands on the table

@@ -20,9 +20,9 @@ parameter changes, beside PyBullet's cell (`envs.pybullet_randomization`):
 | latency | s, in whole physics steps, until a motor command arrives |
 
 MuJoCo would take the larger friction of two shapes that touch. `envs.mujoco_cell` therefore gives
-each contact of an object with table, bin and robot parameters of its own (a contact pair), in which
-this module multiplies as Bullet does. Contacts between two objects keep MuJoCo's rule, for squares
-of the coefficients: for equal ones that is Bullet's product.
+each contact of an object with table, tray and robot parameters of its own (a contact pair), in
+which this module multiplies as Bullet does. Contacts between two objects keep MuJoCo's rule, for
+squares of the coefficients: for equal ones that is Bullet's product.
 
 Bullet's contact stiffness is in N/m. MuJoCo's is per effective mass of the contact, so that a
 factor means the same in both simulators, and a value that is added or set does not. A contact here

@@ -1,4 +1,4 @@
-"""Bodies in a PyBullet client: table, bin and walls, objects, boards, and whether they rest.
+"""Bodies in a PyBullet client: table, tray and walls, objects, boards, and whether they rest.
 
 `PybulletTable` is the empty table on which scenes are laid out before any cell is built;
 `envs.cell_scenes` decides what is put where. The functions take the number of the physics client.
@@ -21,17 +21,17 @@ from typing_extensions import Self
 
 from envs.board import BLACK, WHITE, Board
 from envs.cell_layout import (
-    BIN_COLOUR,
     GRAVITY,
     REST_SPEED,
     TABLE_COLOUR,
+    TRAY_COLOUR,
     WALL_COLOUR,
     Box,
     LayoutTable,
     ObjectModel,
-    bin_walls,
     rest_check_steps,
     table_box,
+    tray_walls,
 )
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
@@ -64,7 +64,7 @@ def set_up_physics(client: int, sim: SimConfig) -> None:
     )
 
 
-# --- Table, bin and walls -------------------------------------------------------------------
+# --- Table, tray and walls -------------------------------------------------------------------
 
 
 def static_box(client: int, half_size, position, colour) -> int:
@@ -127,9 +127,9 @@ def add_walls(client: int, walls: Iterable[Box], colour=WALL_COLOUR) -> list[int
     return [static_box(client, *wall, colour) for wall in walls]
 
 
-def add_bin(client: int) -> list[int]:
-    """The bin beside the workspace into which picked objects go. Body numbers of its walls."""
-    return add_walls(client, bin_walls(), BIN_COLOUR)
+def add_tray(client: int) -> list[int]:
+    """The tray beside the workspace into which picked objects go. Body numbers of its walls."""
+    return add_walls(client, tray_walls(), TRAY_COLOUR)
 
 
 # --- Objects --------------------------------------------------------------------------------

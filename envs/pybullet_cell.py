@@ -1,4 +1,4 @@
-"""The robot cell in PyBullet: one physics client with table, bin, Panda, objects and camera.
+"""The robot cell in PyBullet: one physics client with table, tray, Panda, objects and camera.
 
 Labelling, evaluation, demonstrations and the Gymnasium environment all run in this one cell.
 """
@@ -17,9 +17,9 @@ from envs.floating_hand import park
 from envs.panda_urdf import write_panda
 from envs.pybullet_bodies import (
     SOLVER_RESIDUAL,
-    add_bin,
     add_board,
     add_table,
+    add_tray,
     body_quaternion,
     bullet_quaternion,
     set_up_physics,
@@ -65,7 +65,7 @@ class PybulletCell(Cell):
         # takes about 8 ms and leaks nothing.
         set_up_physics(self.client, self.config.sim)
         self.table = add_table(self.client, scene.walls)
-        self.bin = add_bin(self.client)
+        self.tray = add_tray(self.client)
         self.robot = self._make_robot()
         self.bodies = [
             spawn(self.client, p.model, p.position, p.quaternion, fine=self.fine)

@@ -7,7 +7,7 @@ is tried.
 
 Where a scene has a target, the frames show its visible pixels, as a user's click or a segmenter
 would: the simulator gives them, which is a privilege. `models.planner_target` moves aside what is
-in its way, and the round ends when the target is in the bin, or after as many grasps as objects.
+in its way, and the round ends when the target is in the tray, or after as many grasps as objects.
 """
 
 from __future__ import annotations

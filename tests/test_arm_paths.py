@@ -1,11 +1,11 @@
-"""Paths of the arm below a board: in from the side, out as it came, and over it to the bin."""
+"""Paths of the arm below a board: in from the side, out as it came, and over it to the tray."""
 
 import numpy as np
 import pytest
 
 from envs import arm_paths
 from envs.arm_paths import first_plan, height_over, way_out, withdrawn
-from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Box, Placement, Scene
+from envs.cell_layout import TRAY_CENTRE, TRAY_HALF_SIZE, Box, Placement, Scene
 from envs.execution import execute_grasp, reaches
 from envs.next_grasp import within_reach
 from envs.object_bodies import native_object
@@ -79,7 +79,7 @@ def test_what_is_gripped_below_a_board_comes_out_before_it_goes_up(shelved, monk
     )
     outcome = execute_grasp(shelved, GRASP)
     assert outcome.reason == "success", outcome.detail
-    assert abs(shelved.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
+    assert abs(shelved.object_position(0)[:2] - TRAY_CENTRE).max() < TRAY_HALF_SIZE
     places = np.array(places)
     before, after = places[: closing[1]], places[closing[1] :]
     # The fingertips are low in front of the board or below it, and never in its middle or above.

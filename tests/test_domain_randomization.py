@@ -128,7 +128,7 @@ def in_pybullet(cell: Cell) -> list:
     from envs.pybullet_panda import ARM, FINGERS
 
     client, robot = cell.client, cell.robot
-    links = [(body, -1) for body in (*cell.bodies, cell.table, *cell.bin)]
+    links = [(body, -1) for body in (*cell.bodies, cell.table, *cell.tray)]
     links += [(robot.body, link) for link in (-1, *ARM, *FINGERS)]
     return [
         [pybullet.getDynamicsInfo(*link, physicsClientId=client) for link in links],

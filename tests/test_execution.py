@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs.arm_paths import line
-from envs.cell_layout import BIN_CENTRE, BIN_HALF_SIZE, Placement, Scene
+from envs.cell_layout import TRAY_CENTRE, TRAY_HALF_SIZE, Placement, Scene
 from envs.execution import (
     ApproachResult,
     WeighingGrip,
@@ -27,13 +27,13 @@ def cell(bullet_cell):
     return bullet_cell
 
 
-def test_good_grasp_succeeds_and_the_cube_ends_in_the_bin(cell, box_set):
+def test_good_grasp_succeeds_and_the_cube_ends_in_the_tray(cell, box_set):
     cell.load(cube_scene(box_set))
     outcome = execute_grasp(cell, cube_grasp())
     assert outcome.reason == "success" and outcome.success and outcome.object_index == 0
     assert 2 < outcome.sim_seconds < 5
     assert not cell.remaining
-    assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
+    assert abs(cell.object_position(0)[:2] - TRAY_CENTRE).max() < TRAY_HALF_SIZE
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
@@ -119,10 +119,10 @@ def test_a_hand_that_presses_less_for_a_moment_has_missed_nothing(cell, box_set,
     assert execute_grasp(cell, cube_grasp()).reason == "success"
 
 
-def test_the_arm_keeps_its_wrist_off_the_bin(cell, box_set):
+def test_the_arm_keeps_its_wrist_off_the_tray(cell, box_set):
     """A hand that leans by 75 degrees, low over the table: on the left side of the workspace its
     wrist is over the table, on the right side, as far from the middle, it would be in the
-    bin's wall by 6 mm."""
+    tray's wall by 6 mm."""
     cell.load(cube_scene(box_set))
     tilt, reached = np.deg2rad(75), []
     for side in (1, -1):
@@ -132,8 +132,8 @@ def test_the_arm_keeps_its_wrist_off_the_bin(cell, box_set):
     assert reached == [True, False]
 
 
-def test_a_bottle_is_carried_over_the_bin_and_not_into_its_wall(cell, config):
-    """Gripped at its neck, 18 cm over the table, it hangs lower than the bin's wall at the height
+def test_a_bottle_is_carried_over_the_tray_and_not_into_its_wall(cell, config):
+    """Gripped at its neck, 18 cm over the table, it hangs lower than the tray's wall at the height
     from which other things are released."""
     shape = NativeShape("cylinder", (0.02, 0.2))
     bottle = native_object("bottle", shape, 500.0, 0.8, (1.0, 0.0, 0.0, 1.0))
@@ -141,7 +141,7 @@ def test_a_bottle_is_carried_over_the_bin_and_not_into_its_wall(cell, config):
     cell.load(Scene("isolated", 0, (standing,)))
     outcome = execute_grasp(cell, Grasp(np.array([0.5, 0.0, 0.18]), 0.0, 0.06, 1.0))
     assert outcome.reason == "success", outcome.detail
-    assert abs(cell.object_position(0)[:2] - BIN_CENTRE).max() < BIN_HALF_SIZE
+    assert abs(cell.object_position(0)[:2] - TRAY_CENTRE).max() < TRAY_HALF_SIZE
 
 
 def test_what_turns_until_it_hangs_is_lifted_off_the_table(cell):

@@ -126,7 +126,7 @@ def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set, mo
     bullet_cell.load(cube_scene(box_set))
     before = iterations()
     assert execute_grasp(bullet_cell, cube_grasp()).success
-    assert set(seen) == {3 * before}  # all the way to the bin
+    assert set(seen) == {3 * before}  # all the way to the tray
     assert iterations() == before == bullet_cell.config.sim.solver_iterations
     with pytest.raises(ZeroDivisionError), bullet_cell.robot.carrying():
         assert iterations() == 3 * before

@@ -42,7 +42,7 @@ def test_frictions_are_pybullets(cells, pile):
     robot = bullet.robot.body
     links = pybullet.getNumJoints(robot, physicsClientId=bullet.client)
     theirs = {"panda_link0": coefficient(robot), "table": coefficient(bullet.table)}
-    theirs |= {f"bin{i}": coefficient(wall) for i, wall in enumerate(bullet.bin)}
+    theirs |= {f"tray{i}": coefficient(wall) for i, wall in enumerate(bullet.tray)}
     for link in range(links):
         name = pybullet.getJointInfo(robot, link, physicsClientId=bullet.client)[12].decode()
         theirs[name] = coefficient(robot, link)

@@ -215,7 +215,7 @@ def test_differences_name_the_noise_of_the_first_pair(tmp_path):
 
 
 def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
-    """450 of 500 and 300 of 400 grasps; of 500 objects as many reach the bin."""
+    """450 of 500 and 300 of 400 grasps; of 500 objects as many reach the tray."""
     for part, others in (("scoreboard", (450, 500)), ("clutter15", (300, 400))):
         rows = [row("graspnet", 490, 500), row("heuristic", 1, 500), row("graspnet", *others)]
         figures(tmp_path, part, [*rows[:2], noisy(rows[2])])
@@ -224,7 +224,7 @@ def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
     assert written == (
         "**Result** on unseen objects with `realsense` depth noise: 90 % of GraspNet's grasps "
         "succeed in piles of 5 objects, 75 % in piles of 15; 90 % and 60 % of the objects reach "
-        "the bin."
+        "the tray."
     )
     chinese = with_tables(page, tmp_path, chinese=True)
     assert re.findall(r"\d+ %", chinese) == ["90 %", "75 %", "90 %", "60 %"]

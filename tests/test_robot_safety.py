@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from envs.cell_scenes import make_scene
-from envs.execution import check_bin, execute_grasp
+from envs.execution import check_tray, execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import (
     JOINT_LOWER,
@@ -36,7 +36,7 @@ def arm_gate(*overrides: str, floor: float = 0.009) -> ArmGate:
 
 @pytest.fixture(scope="module")
 def narrow():
-    """A cell whose workspace ends before the bin, which is 48 cm to the right."""
+    """A cell whose workspace ends before the tray, which is 48 cm to the right."""
     config = load_config(None, ["sim.renderer=tiny", "safety.box_lower=[0.15,-0.3,0.02]"])
     with make_cell(config) as cell:
         yield cell
@@ -169,15 +169,15 @@ def test_the_open_loop_does_not_leave_the_workspace(narrow, box_set):
     np.testing.assert_allclose(narrow.robot.q, narrow.home, atol=5e-3)
 
 
-def test_a_box_without_the_bin_is_refused(narrow, config):
-    check_bin(config)
+def test_a_box_without_the_tray_is_refused(narrow, config):
+    check_tray(config)
     with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.3\] m.*widen the box"):
-        check_bin(narrow.config)
+        check_tray(narrow.config)
     high = ["execution.lift_height=0.3", "safety.box_upper=[0.8,0.55,0.44]"]
     with pytest.raises(UserError, match=r"leaves out \[0.42, -0.48, 0.45\] m"):
-        check_bin(load_config(None, high))  # to which what may hang is lifted
+        check_tray(load_config(None, high))  # to which what may hang is lifted
     low = ["safety.box_lower=[0.15,-0.55,0.3]", "closed_loop.floor=0.009"]
-    check_bin(load_config(None, low))  # planned motions reach down to the floor of grasps
+    check_tray(load_config(None, low))  # planned motions reach down to the floor of grasps
 
 
 def test_an_arm_stretched_at_the_edge_is_put_home(narrow, box_set):

@@ -83,7 +83,7 @@ class Targeted:
         return list(self.grasps)
 
 
-def test_a_round_with_a_target_ends_when_it_is_in_the_bin(cell, box_set):
+def test_a_round_with_a_target_ends_when_it_is_in_the_tray(cell, box_set):
     """Two cubes 12 cm apart, of which the second is wanted."""
     level = np.array([0.0, 0.0, 0.0, 1.0])
     places = np.array([(0.5, 0.06, 0.03), (0.5, -0.06, 0.03)])
@@ -121,7 +121,7 @@ def test_a_target_that_falls_off_while_another_thing_is_picked_is_lost(
     placements = tuple(Placement(box_set[0], place, level) for place in places)
 
     def execute(cell, grasp, approach, **how):
-        cell.remaining.clear()  # the first in the bin, the second beside the table
+        cell.remaining.clear()  # the first in the tray, the second beside the table
         return GraspOutcome("success", 5.0, object_index=0)
 
     monkeypatch.setattr("envs.rounds.execute_grasp", execute)

@@ -49,7 +49,7 @@ ENDINGS = {  # why a round ended
     PLANNER_ERROR: "the planner raised an exception",
     "failures": "too many failures in a row",
     FELL_OFF: "the objects that were left, or the target, fell off the table",
-    "target": "the target is in the bin",
+    "target": "the target is in the tray",
     "picks": "as many grasps as objects, and the target is still there",
     "physics": "the simulation blew up",
 }
@@ -131,7 +131,7 @@ class RoundRecord:
     depth_noise: of the cell's cameras, as `camera.depth_noise` names it.
     calibration: slope, offset, penalty, doubt and upper slope by which the grasps' qualities are
         chances of success (`utils.calibration`); None where they are scores.
-    target_in_hand: whether the one object that was wanted ended in the bin; None where all were.
+    target_in_hand: whether the one object that was wanted ended in the tray; None where all were.
     """
 
     policy: str

@@ -57,7 +57,7 @@ class Row:
     calibration_error: expected calibration error of the grasps' qualities (`utils.calibration`);
         None where they are no chances.
     targets, targets_in_hand: rounds in which one object was wanted, and those in which it ended in
-        the bin. picks_to_target: mean number of executed grasps of the latter.
+        the tray. picks_to_target: mean number of executed grasps of the latter.
     turn_ms_mean, turn_ms_p95: mean and 95th percentile of the time of a closed loop's turns, of
         which the median over the attempts.
     """
