@@ -139,7 +139,7 @@ def make_data(config: Config, processes: Team) -> TrainingData:
 def make_trainer(config: Config, data: TrainingData, processes: Team) -> Trainer:
     """Make a network with seeded weights, or those of train.initial, and its optimiser."""
     torch.manual_seed(config.seed)
-    model = make_network(config, config.train.max_width or data.max_width)
+    model = make_network(config, config.train.max_width or data.max_width, not processes.is_main)
     total_steps = steps_per_epoch(config, len(data.train)) * config.train.epochs
     if config.adaptation.target is not None:
         return AdaptingTrainer(model, config.train, total_steps, processes, config.adaptation)

@@ -108,16 +108,16 @@ def load_graspnet(path: Path | str) -> SavedGraspNet:
     return saved
 
 
-def load_initial(model: GraspNet, path: Path | str) -> None:
+def load_initial(model: GraspNet, path: Path | str, quiet: bool = False) -> None:
     """Copy the weights of a saved network into a new one of the same backbone.
 
     A centre head that only the saved network has is left out; one that only the new network has
-    keeps its random weights. The widths of the new one end at its own `max_width`; a remark is
-    printed where the saved one ended elsewhere. Raises UserError as `load_graspnet` does, and if
+    keeps its random weights. The widths of the new one end at its own `max_width`; unless
+    `quiet`, a remark is printed where the saved one ended elsewhere. Raises UserError as `load_graspnet` does, and if
     the weights do not fit.
     """
     saved = load_graspnet(path).model
-    if saved.max_width != model.max_width:
+    if saved.max_width != model.max_width and not quiet:
         print(
             f"{path}: its widths end at {saved.max_width:g} m, the new network's at "
             f"{model.max_width:g} m; they are {model.max_width / saved.max_width:.2g} times as "

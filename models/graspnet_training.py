@@ -56,13 +56,14 @@ def warm_up_and_cosine(step: int, total: int, warmup_share: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))
 
 
-def make_network(config: Config, max_width: float) -> GraspNet:
-    """Make the network that the config describes; raises UserError if that is impossible."""
+def make_network(config: Config, max_width: float, quiet: bool = False) -> GraspNet:
+    """Make the network that the config describes; raises UserError if that is impossible. quiet:
+    without a remark on its first weights."""
     # Only simulated images are labelled with centres of mass.
     centre_head = config.data.kind == "simulated" and config.train.centre_weight > 0
     model = create_model(name=config.train.backbone, max_width=max_width, centre_head=centre_head)
     if config.train.initial is not None:
-        load_initial(model, config.train.initial)
+        load_initial(model, config.train.initial, quiet)
     return model
 
 

@@ -88,6 +88,8 @@ def test_a_network_starts_from_another_with_or_without_a_centre_head(
     assert "net.pt: its widths end at 0.08 m, the new network's at 0.2 m; they are 2.5 times" in (
         capsys.readouterr().out
     )
+    load_initial(new, tmp_path / "net.pt", quiet=True)
+    assert capsys.readouterr().out == ""
     with pytest.raises(UserError, match="net.pt.*another architecture"):
         load_initial(GraspNet(backbone="tutorial"), tmp_path / "net.pt")
 
