@@ -113,8 +113,8 @@ def load_initial(model: GraspNet, path: Path | str, quiet: bool = False) -> None
 
     A centre head that only the saved network has is left out; one that only the new network has
     keeps its random weights. The widths of the new one end at its own `max_width`; unless
-    `quiet`, a remark is printed where the saved one ended elsewhere. Raises UserError as `load_graspnet` does, and if
-    the weights do not fit.
+    `quiet`, a remark is printed where the saved one ended elsewhere. Raises UserError as
+    `load_graspnet` does, and if the weights do not fit.
     """
     saved = load_graspnet(path).model
     if saved.max_width != model.max_width and not quiet:
