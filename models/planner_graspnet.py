@@ -1,10 +1,11 @@
-"""GraspNet as a planner: the antipodal search proposes grasps, the network and a critic rank them.
+"""GraspNet as a planner: its peaks and an antipodal search propose grasps, which a critic ranks.
 
-A network's maps are exact to a few millimetres; fingers beside an object need better. So the
-antipodal search proposes exact poses, and the network's quality at their places and angles is a
-factor on their scores: before they are measured on the height map, so that few have to be, and
-after. Of the best, a critic says how likely they succeed (`models.grasp_critic`). What the network
-tells about a frame is the subject of `models.graspnet_view`.
+A network's maps are exact to a few millimetres; fingers beside an object need better. So the grasps
+at its peaks are fitted to the height map. Where none of them is likely to succeed, an antipodal
+search proposes others, and the network's quality at their places and angles is a factor on their
+scores: before they are measured on the height map, so that few have to be, and after. Of the best,
+a critic says how likely they succeed (`models.grasp_critic`). What the network tells about a frame
+is the subject of `models.graspnet_view`.
 """
 
 from __future__ import annotations
@@ -47,6 +48,9 @@ DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of th
 # are both closer and less turned than this, m and rad.
 PLANAR_JUDGED, VIEW_JUDGED = 40, 12
 JUDGED_DISTANCE, JUDGED_TURN = 0.01, np.deg2rad(20)
+# The critic's chance from which a grasp is as good as any: no other ones are looked for. Between
+# two limits that were compared on training objects (docs/choices.md).
+LIKELY = 0.975
 
 Judge = Callable[[HeightMap, Candidates, CriticInputs], np.ndarray]
 
@@ -90,7 +94,9 @@ class WithCritic:
 
 
 class GraspNetPlanner(WithCritic, SearchPlanner):
-    """Antipodal search ranked by a network, then by a critic, on the RGB-D image alone.
+    """Grasps at the peaks of a network's quality map and, where a critic finds none of them likely,
+    of an antipodal search that the network values, ranked by the critic, on the RGB-D image alone.
+    A network without a critic ranks the search.
 
     checkpoint: file of the network, unless `network` is given. critic: has the last word; where
     none is given, the shipped one for the shipped network, with which it was trained, and none for
@@ -125,69 +131,99 @@ class GraspNetPlanner(WithCritic, SearchPlanner):
         heights = only_target(seen.heights, frame)
         if len(heights.centres) == 0:  # table and walls alone
             return []
-        count = max(PLANAR_JUDGED, self.settings.returned)
-        found = self.judged(heights, self.found(heights, seen), seen, count)
-        return self.grasps(found, frame.roughness)
+        return self.grasps(self.ranked(heights, seen), frame.roughness)
 
-    def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
-        """Measured candidates on the map of a view, best first."""
-        return self.search(heights, partial(seen.value, heights))
+    def ranked(self, heights: HeightMap, seen: NetworkView) -> Candidates:
+        """Candidates on the map of a view, best first."""
+        if self.judge is None:
+            return self.searched(heights, seen)
+        at_peaks = self.at_peaks(heights, seen)
+        if len(at_peaks) and at_peaks.score[0] >= LIKELY:
+            return at_peaks
+        both = Candidates.joined([at_peaks, self.searched(heights, seen)])
+        return both.best(len(both))
+
+    def searched(self, heights: HeightMap, seen: NetworkView) -> Candidates:
+        """Those of the antipodal search, judged."""
+        found = self.search(heights, partial(seen.value, heights))
+        return self.judged(heights, found, seen, self._count)
+
+    def at_peaks(self, heights: HeightMap, seen: NetworkView) -> Candidates:
+        """Those at the network's peaks, judged.
+
+        At each peak of the quality map, and at the angles that the network prefers there, a grasp
+        is posed: centred between its contacts, turned onto the faces, as deep as a label is or a
+        little more or less. Of those whose fingers and palm find room, the critic judges the ones
+        that the search would rank first.
+        """
+        found = fitted_peaks(heights, seen, self.gripper, self.workspace, self.settings)
+        return self.judged(heights, found, seen, self._count)
+
+    @property
+    def _count(self) -> int:
+        return max(PLANAR_JUDGED, self.settings.returned)
 
     def heights(self, frame: RGBDFrame) -> HeightMap:
         return NetworkView(self.network, frame, self.workspace).heights
 
 
 class GraspNetDirectPlanner(GraspNetPlanner):
-    """The network's own peaks instead of a search.
+    """The network's own peaks alone: nothing is searched."""
 
-    At each peak of the quality map, and at the angles that the network prefers there, a grasp is
-    posed on the height map: centred between its contacts, turned onto the faces, as deep as a label
-    is or a little more or less. Of those whose fingers and palm find room, the critic judges the
-    ones that the search would rank first.
-    """
+    def ranked(self, heights: HeightMap, seen: NetworkView) -> Candidates:
+        return self.at_peaks(heights, seen)
 
-    def found(self, heights: HeightMap, seen: NetworkView) -> Candidates:
-        value = partial(seen.value, heights)
-        rough = self._at_peaks(seen.peaks(PEAKS), heights)
-        rough = replace(rough, score=value(rough)).best(self.settings.shortlist)
-        strict = self.settings
-        for settings in (strict, strict.relaxed(), strict.off_centre()):
-            found = measure(
-                self._at_depths(rough, settings), heights, self.gripper, settings, len(DEPTH_STEPS)
-            )
-            found = found.best(settings.finalists)
-            if len(found):
-                found = turn_onto_faces(found, heights, self.gripper, settings)
-                return replace(found, score=found.score * value(found)).best(len(found))
-        return found
 
-    def _at_peaks(self, points: np.ndarray, heights: HeightMap) -> Candidates:
-        """Candidates at points (N, 3) at all angles, their fingertips at the surface."""
-        away = np.abs(points[:, :2] - self.workspace.centre).max(axis=1)
-        points = points[away < self.workspace.size / 2 + self.settings.reach]
-        points = points[heights.label[heights.index(points[:, :2])] != OTHER_LABEL]
-        count = self.settings.angles
-        angle = np.tile(np.arange(count) * np.pi / count, len(points))
-        xy = np.repeat(points[:, :2], count, axis=0)
-        surface = heights.height[heights.index(xy)]
-        width = self.gripper.max_opening - 2 * self.settings.rooms[0]
-        return Candidates.rough(xy, angle, surface, np.full(len(xy), width), np.ones(len(xy)))
+def fitted_peaks(
+    heights: HeightMap,
+    seen: NetworkView,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    settings: SearchSettings,
+) -> Candidates:
+    """Measured candidates at the peaks of a network's quality, scored as the search does."""
+    value = partial(seen.value, heights)
+    rough = _at_points(seen.peaks(PEAKS), heights, gripper, workspace, settings)
+    rough = replace(rough, score=value(rough)).best(settings.shortlist)
+    for margins in (settings, settings.relaxed(), settings.off_centre()):
+        deep = _at_depths(rough, workspace.table_height, margins)
+        found = measure(deep, heights, gripper, margins, len(DEPTH_STEPS)).best(margins.finalists)
+        if len(found):
+            found = turn_onto_faces(found, heights, gripper, margins)
+            return replace(found, score=found.score * value(found)).best(len(found))
+    return found
 
-    def _at_depths(self, rough: Candidates, settings: SearchSettings) -> Candidates:
-        """Each candidate with its fingertips DEPTH_STEPS over the depth that a label has."""
-        table = self.workspace.table_height
-        tip = rough.tip - grasp_depth(rough.tip, table)
-        lowest = table + settings.table_clearance
-        return Candidates.joined(
-            [replace(rough, tip=np.maximum(tip + step, lowest)) for step in DEPTH_STEPS]
-        )
+
+def _at_points(
+    points: np.ndarray,
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    workspace: Workspace,
+    settings: SearchSettings,
+) -> Candidates:
+    """Candidates at points (N, 3) at all angles, their fingertips at the surface."""
+    away = np.abs(points[:, :2] - workspace.centre).max(axis=1)
+    points = points[away < workspace.size / 2 + settings.reach]
+    points = points[heights.label[heights.index(points[:, :2])] != OTHER_LABEL]
+    count = settings.angles
+    angle = np.tile(np.arange(count) * np.pi / count, len(points))
+    xy = np.repeat(points[:, :2], count, axis=0)
+    surface = heights.height[heights.index(xy)]
+    width = gripper.max_opening - 2 * settings.rooms[0]
+    return Candidates.rough(xy, angle, surface, np.full(len(xy), width), np.ones(len(xy)))
+
+
+def _at_depths(rough: Candidates, table: float, settings: SearchSettings) -> Candidates:
+    """Each candidate with its fingertips DEPTH_STEPS over the depth that a label has. table: m."""
+    tip = rough.tip - grasp_depth(rough.tip, table)
+    lowest = table + settings.table_clearance
+    return Candidates.joined(
+        [replace(rough, tip=np.maximum(tip + step, lowest)) for step in DEPTH_STEPS]
+    )
 
 
 # The critic's chance tells already what a tilt costs; what is left is the room for the arm.
 JUDGED_FAN = FanSettings(tilt_scale=3.0)
-# The critic's chance from which a grasp from straight above is as good as any: between two limits
-# that were compared on training objects (docs/choices.md).
-LIKELY = 0.975
 
 
 class GraspNetFanPlanner(WithCritic, FanPlanner):

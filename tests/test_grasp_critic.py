@@ -247,6 +247,30 @@ def test_other_sides_are_looked_at_where_no_grasp_from_above_is_likely(chance, l
     assert (planner._above.settings.returned, planner.fan.returned) == (33, 40)
 
 
+@pytest.mark.parametrize(("chance", "searches"), [(0.98, False), (0.97, True)])
+def test_a_search_follows_where_no_peak_is_likely(chance, searches) -> None:
+    """From a chance of 0.975 on, the plan is that of the peaks alone, grasp by grasp; below, the
+    search's grasps stand among them, first those that are more likely."""
+    parts = GripperGeometry(), Workspace()
+    planner, peaks = GraspNetPlanner(*parts), GraspNetDirectPlanner(*parts)
+    asked = []
+
+    def judge(heights: HeightMap, found: Candidates, inputs: CriticInputs) -> np.ndarray:
+        asked.append(found)
+        return np.full(len(found), chance if len(asked) == 1 else 0.99)
+
+    planner.judge, peaks.judge = judge, lambda _, found, __: np.full(len(found), chance)
+    grasps, of_peaks = planner(BOX), peaks(BOX)
+    assert len(asked) == 1 + searches
+    if searches:
+        assert grasps[0].quality == 0.99
+        found = asked[1].grasps(planner.gripper)
+        assert any(np.array_equal(grasps[0].pose, one.pose) for one in found)
+    else:
+        assert len(of_peaks) > 1
+        np.testing.assert_array_equal([g.pose for g in grasps], [g.pose for g in of_peaks])
+
+
 def test_the_wrist_keeps_clear_of_what_stands_beside_a_grasp_from_above() -> None:
     """Within 3 cm of a box 5 cm high stands one that is 22 cm high. The wrist is 12 cm wide and
     begins 13 cm over the fingertips: no grasp from above is nearer than 6 cm to the high one."""
