@@ -142,7 +142,7 @@ def bench_backbone(
         Metric("frame_to_grasps_vs_network", over_network, "x"),
         Metric("for_inference_speedup", faster, "x"),
         Metric("fastest_dtype_speedup", over_float32, "x"),  # 1 where it is float32
-        # As evaluate.py plans: grasps made exact on the depth image as well.
+        # As evaluate.py plans with a network of one's own, which has no critic: by a search.
         Metric("planner_ms", planned, "ms", at_most=25),
         Metric("planner_post_processing_ms", planned - prepared - network_ms, "ms", at_most=4),
     ]

@@ -174,7 +174,7 @@ PARTS = (
                     "evaluate.object_sets=random_urdfs", noises=noise, kept=3)
         for name, noise in (("vgn", "gaussian"), ("giga", "gamma"))
     )),
-    Part("direct", "the network's own peaks beside the search that it ranks", 20, (
+    Part("direct", "the network's peaks alone, and with a search where none is likely", 20, (
         _evaluation("direct", 20, "evaluate.policies=graspnet,graspnet_direct "
                     "evaluate.scenarios=packed,pile,dense evaluate.object_sets=random_urdfs",
                     noises=NOISY_FIRST, kept=3),

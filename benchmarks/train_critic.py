@@ -1,16 +1,16 @@
 """Train the grasp critic: python -m benchmarks.train_critic --output FILE.pt [key=value]
 
-Draws scenes of training objects, has a floating hand execute candidates of graspnet6d, graspnet and
-graspnet_direct (`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of
-them succeed, from random weights or from those of `--initial`. The executed grasps stay in the
-folder of `--examples`, where a run that was stopped finds them again; those in folders of `--more`
-are learned from as well, whatever they were played with. Every tenth scene is held out; on these it
-prints how often the candidate that is ranked first succeeds, of those that were drawn at random, by
-the search alone, by the critic that it began with, and by the new one, how far the stated chances
-of all are from frequencies, and their log loss. It trains on a GPU where there is one
-(`train.device`). Written to checkpoints/critic.pt, the critic is what graspnet, graspnet_direct and
-graspnet6d rank by from then on; their chances of success are then fitted again
-(`benchmarks.calibrate`). With `--folds K` it writes no weights, and compares for
+Draws scenes of training objects, has a floating hand execute candidates of graspnet6d and graspnet
+(`envs.critic_examples`), and fits the critic (`models.grasp_critic`) to which of them succeed, from
+random weights or from those of `--initial`. The executed grasps stay in the folder of `--examples`,
+where a run that was stopped finds them again; those in folders of `--more` are learned from as
+well, whatever they were played with. Every tenth scene is held out; on these it prints how often
+the candidate that is ranked first succeeds, of those that were drawn at random, by the search
+alone, by the critic that it began with, and by the new one, how far the stated chances of all are
+from frequencies, and their log loss. It trains on a GPU where there is one (`train.device`).
+Written to checkpoints/critic.pt, the critic is what graspnet, graspnet_direct and graspnet6d rank
+by from then on; their chances of success are then fitted again (`benchmarks.calibrate`).
+With `--folds K` it writes no weights, and compares for
 kinds of hands and cameras the critic that it begins with and what becomes of it: each Kth of the
 scenes is judged by weights that learned from the others.
 """
@@ -166,6 +166,7 @@ def check_same_settings(folder: Path, config: Config) -> None:
     sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera", "robot")
     settings = {name: getattr(config, name).model_dump(mode="json") for name in sections}
     settings |= {"seed": config.seed, "object_sets": usual_sets(config), "label": LABEL}
+    settings["candidates"] = PLANNERS
     settings["simulator"] = config.simulator
     for name, weights in (("critic", SHIPPED), ("network", SHIPPED_NETWORK)):
         settings[name] = hashlib.sha256(weights.read_bytes()).hexdigest()

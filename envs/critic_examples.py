@@ -28,7 +28,7 @@ from models.grasp_critic import INPUTS, CriticInputs, GraspCritic, nothing, ship
 from models.planner_candidates import Candidates
 from models.planner_graspnet import (
     JUDGED_FAN,
-    GraspNetDirectPlanner,
+    LIKELY,
     GraspNetFanPlanner,
     GraspNetPlanner,
     WithCritic,
@@ -44,7 +44,7 @@ from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
 
 # Whose candidates are executed, and how many of each plan's.
-PLANNERS = {"graspnet6d": 14, "graspnet": 10, "graspnet_direct": 10}
+PLANNERS = {"graspnet6d": 14, "graspnet": 20}  # the latter at peaks and of a search
 FRAMES_PER_SCENE = 2  # of the whole scene, then of a part of it, as in a round that clears it
 _LAYOUTS = {
     "isolated": 0.03, "packed": 0.12, "pile": 0.16, "bin": 0.15, "household": 0.29, "tall": 0.03,
@@ -170,7 +170,7 @@ def judged_by(
         for grasp in found.grasps(planner.gripper):
             pose = heights.T_WV @ grasp.pose
             grasps.append(Grasp.from_pose(pose, grasp.width, grasp.quality))
-        return np.full(len(found), 0.5)  # so that the planner goes on to look elsewhere
+        return np.full(len(found), LIKELY / 2)  # so that the planner goes on to look elsewhere
 
     planner.judge = judge
     planner(frame)
@@ -213,7 +213,6 @@ def _planners_of(config: Config, as_vgn: bool) -> list[WithCritic]:
     return [  # in the order of PLANNERS; these critics are never asked
         GraspNetFanPlanner(gripper, workspace, critic=GraspCritic()),
         GraspNetPlanner(gripper, workspace, critic=GraspCritic()),
-        GraspNetDirectPlanner(gripper, workspace, critic=GraspCritic()),
     ]
 
 

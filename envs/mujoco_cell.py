@@ -64,7 +64,7 @@ _OBJECT = re.compile(r"object\d+")  # names of the objects' bodies
 def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujoco.MjSpec:
     """A model of Panda, table, tray and the scene's objects at their resting poses, with a camera.
 
-    arm: False for the hand alone. Bodies are called `table`, `bin0` to `bin3` and `object0` on.
+    arm: False for the hand alone. Bodies are called `table`, `tray0` to `tray3` and `object0` on.
     Raises UserError without MuJoCo.
     """
     spec = set_up_physics(panda_spec(gripper) if arm else floating_spec(gripper))

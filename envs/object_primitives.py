@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -54,7 +55,7 @@ class NativeShape:
     kind: str
     size: tuple[float, ...]
 
-    def mesh(self, detail: str = "coarse") -> trimesh.Trimesh:
+    def mesh(self, detail: Literal["coarse", "drawn", "fine"] = "coarse") -> trimesh.Trimesh:
         """A tessellation. detail: "coarse", a union of few planes; "drawn", within 1 % of the
         radius, for pictures; "fine", for mass properties."""
         subdivisions, sections = _DETAILS[detail]

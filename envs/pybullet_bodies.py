@@ -248,6 +248,7 @@ def _drawn(shape: NativeShape) -> tuple[list, list, list]:
 
     PyBullet's own drawings are not what it collides: the caps of its capsule are cones, up to 4 mm
     inside the true ones, its spheres are 1 mm too small, its cylinders 1 mm too thick.
+    Boxes are the same to the last bit.
     """
     mesh = trimesh.graph.smooth_shade(shape.mesh("drawn"), angle=_EDGE)
     return mesh.vertices.tolist(), mesh.faces.ravel().tolist(), mesh.vertex_normals.tolist()

@@ -272,7 +272,7 @@ def conveyor(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, speed: float, turning: bool
 ) -> Conveyor:
     """A conveyor sideways past the robot, away from the tray (whose walls the hand would hit), up
-    to 30 degrees askew towards the middle of the workspace; `turning`: by 0.2 to 0.4 rad/s."""
+    to 30 degrees askew towards the middle of the workspace; `turning` so by 0.2 to 0.4 rad/s."""
     inwards = 1.0 if place[0] > centre[0] else -1.0  # left of +y lies -x
     heading = np.pi / 2 + inwards * rng.uniform(0, np.pi / 6)
     turn_rate = inwards * rng.uniform(0.2, 0.4) if turning else 0.0

@@ -41,15 +41,16 @@ from utils.transforms import PLANAR, Grasp, RGBDFrame, known_depth, top_down_pos
 # Half the heuristic's angles: turning onto the faces and the network make up for it. The split
 # factor is strict because the votes separate objects better than height alone.
 SETTINGS = SearchSettings(angles=9, shortlist=120, finalists=120, split_factor=0.1)
-# Of the planner without a search: many peaks, because the height map decides which of them fit.
+# Of the quality map: many peaks, because the height map decides which of them fit.
 PEAKS = PeakSettings(threshold=0.02, count=80, radius=3)
 DEPTH_STEPS = (0.0, 0.008, -0.008)  # m, of the fingertips, from the depth of the labels
 # Candidates that the critic judges: of a planar search, and of each view of a fan; no two of them
 # are both closer and less turned than this, m and rad.
 PLANAR_JUDGED, VIEW_JUDGED = 40, 12
 JUDGED_DISTANCE, JUDGED_TURN = 0.01, np.deg2rad(20)
-# The critic's chance from which a grasp is as good as any: no other ones are looked for. Between
-# two limits that were compared on training objects (docs/choices.md).
+# The critic's chance from which a grasp is as good as any: no other ones are looked for. For the
+# other sides of `graspnet6d` it lies between two limits that were compared on training objects
+# (docs/choices.md); the search beside the peaks took it over.
 LIKELY = 0.975
 
 Judge = Callable[[HeightMap, Candidates, CriticInputs], np.ndarray]

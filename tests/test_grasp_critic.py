@@ -247,28 +247,43 @@ def test_other_sides_are_looked_at_where_no_grasp_from_above_is_likely(chance, l
     assert (planner._above.settings.returned, planner.fan.returned) == (33, 40)
 
 
-@pytest.mark.parametrize(("chance", "searches"), [(0.98, False), (0.97, True)])
-def test_a_search_follows_where_no_peak_is_likely(chance, searches) -> None:
-    """From a chance of 0.975 on, the plan is that of the peaks alone, grasp by grasp; below, the
-    search's grasps stand among them, first those that are more likely."""
+@pytest.mark.parametrize(
+    ("of_peaks", "of_search", "asked_twice"),
+    [(0.98, 0.99, False), (0.975, 0.99, False), (0.97, 0.99, True), (0.97, 0.5, True)],
+)
+def test_a_search_follows_where_no_peak_is_likely(of_peaks, of_search, asked_twice) -> None:
+    """From a chance of 0.975 on, the plan is that of the peaks alone, grasp by grasp; below, those
+    of the search are ranked with them."""
     parts = GripperGeometry(), Workspace()
     planner, peaks = GraspNetPlanner(*parts), GraspNetDirectPlanner(*parts)
     asked = []
 
     def judge(heights: HeightMap, found: Candidates, inputs: CriticInputs) -> np.ndarray:
         asked.append(found)
-        return np.full(len(found), chance if len(asked) == 1 else 0.99)
+        return np.full(len(found), of_peaks if len(asked) == 1 else of_search)
 
-    planner.judge, peaks.judge = judge, lambda _, found, __: np.full(len(found), chance)
-    grasps, of_peaks = planner(BOX), peaks(BOX)
-    assert len(asked) == 1 + searches
-    if searches:
-        assert grasps[0].quality == 0.99
-        found = asked[1].grasps(planner.gripper)
-        assert any(np.array_equal(grasps[0].pose, one.pose) for one in found)
-    else:
-        assert len(of_peaks) > 1
-        np.testing.assert_array_equal([g.pose for g in grasps], [g.pose for g in of_peaks])
+    planner.judge, peaks.judge = judge, lambda _, found, __: np.full(len(found), of_peaks)
+    grasps, alone = planner(BOX), peaks(BOX)
+    assert len(asked) == 1 + asked_twice
+    if not asked_twice:
+        assert len(alone) > 1
+        np.testing.assert_array_equal([g.pose for g in grasps], [g.pose for g in alone])
+        return
+    assert grasps[0].quality == max(of_peaks, of_search)
+    proposed = {of_peaks: alone, of_search: asked[1].grasps(planner.gripper)}
+    for grasp in grasps:
+        assert any(np.array_equal(grasp.pose, one.pose) for one in proposed[grasp.quality])
+
+
+def test_examples_are_grasps_at_peaks_and_of_the_search() -> None:
+    """On the box the best peak is likely, and a plan is that of the peaks alone."""
+    kinds = (GraspNetDirectPlanner, GraspNetPlanner)
+    peaks, both = (
+        critic_examples.judged_by(kind(GripperGeometry(), Workspace()), BOX)[2] for kind in kinds
+    )
+    poses = [grasp.pose for grasp in both]
+    assert all(np.array([pose == one.pose for pose in poses]).all((1, 2)).any() for one in peaks)
+    assert len(both) > len(peaks) > 0
 
 
 def test_the_wrist_keeps_clear_of_what_stands_beside_a_grasp_from_above() -> None:

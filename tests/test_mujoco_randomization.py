@@ -171,7 +171,7 @@ def test_rolling_friction_in_every_contact_of_an_object(
 
 @pytest.mark.parametrize("change", [("scale", [0.5]), ("set", [0.25]), ("add", [-0.25])])
 def test_friction_of_an_object_changes_in_every_contact(cell, change):
-    """The cube's is 0.5 and becomes 0.25: half of that on bin, palm and arm, its square on another
+    """The cube's is 0.5 and becomes 0.25: half of that on tray, palm and arm, its square on another
     cube."""
     model = cell.robot.model
     scene = apply(cell, object_friction=change)

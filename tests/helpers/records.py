@@ -37,7 +37,7 @@ CONFIG = load_config(
      "evaluate.object_sets=box", "evaluate.depth_noises=none"],
 )  # fmt: skip
 
-# One object was wanted: two of three rounds end with it in the bin, after 1 and 4 grasps.
+# One object was wanted: two of three rounds end with it in the tray, after 1 and 4 grasps.
 RETRIEVED = [
     replace(
         a_round("heuristic", seed, 5, 2, [attempt("success")] * picks, "target" if found else
