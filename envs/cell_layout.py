@@ -45,6 +45,7 @@ _REST_CHECK_SECONDS = 0.05  # between two checks of whether objects rest
 CERTAIN_REST_CHECKS = 5
 # The same for what was stood upright, which may begin to topple from its very edge: 1 s.
 STANDING_REST_CHECKS = 20
+STANDING_MOVED = 0.004  # m, by which it may move in that time where it is put down anew
 
 
 def rest_check_steps(frequency: float) -> int:

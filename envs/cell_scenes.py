@@ -20,11 +20,18 @@ module knows no robot, camera or task.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from envs.cell_arrangements import ARRANGEMENTS, FIXED, WALLS, leans, viewpoint_of
-from envs.cell_layout import STANDING_REST_CHECKS, Placement, Scene
+from envs.cell_layout import (
+    STANDING_MOVED,
+    STANDING_REST_CHECKS,
+    ObjectModel,
+    Placement,
+    Scene,
+)
 from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
 from models.planner_contacts import buried_share
@@ -83,6 +90,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             if bodies is None or not table.settle(bodies, checks):
                 continue
             poses = [table.pose(body) for body in bodies]
+        if layout == "packed" and not _stand_for_good(config, models, poses):
+            continue
         if all(_inside(position, config) for position, _ in poses):
             placements = tuple(Placement(model, *pose) for model, pose in zip(models, poses))
             if layout == "wall" and not all(map(leans, placements)):
@@ -96,6 +105,17 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         f"inside the {config.workspace.size} m workspace{covering} in {_DRAWS} tries; use smaller "
         "objects (objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
+
+
+def _stand_for_good(config: Config, models: Sequence[ObjectModel], poses) -> bool:
+    """Whether objects that came to rest in these poses stay there when a cell puts them down anew:
+    what stands on its very edge may be held by the contacts in which it came to rest."""
+    with make_layout_table(config, models) as table:
+        bodies = [table.put(model, *pose) for model, pose in zip(models, poses)]
+        if not table.settle(bodies, STANDING_REST_CHECKS):
+            return False
+        moved = [np.linalg.norm(table.pose(b)[0] - pose[0]) for b, pose in zip(bodies, poses)]
+    return max(moved) < STANDING_MOVED
 
 
 def _mixed(objects: ObjectSet, count: int, rng, config: Config) -> np.ndarray:

@@ -120,10 +120,11 @@ def test_packed_objects_stand_apart(primitives, laid_out):
             assert table.is_near(body, [one for one in bodies if one != body], 0.3)
 
 
-@pytest.mark.parametrize("seed", [98600010, 98600028])
+@pytest.mark.parametrize("seed", [98600010, 98600028, 99300022, 99300117])
 def test_what_stands_upright_goes_on_standing(config, seed):
-    """Boards of 8 cm on their edge of 2 cm: after 2 s nothing has moved by 4 mm. Of these two
-    scenes, found at rest once, three objects had toppled."""
+    """Boards of 8 cm on their edge of 2 cm: after 2 s nothing has moved by 4 mm. Of the
+    first two scenes, found at rest once, three objects had toppled; of the others, found at rest
+    for a second, one each when it was put down anew (on some machines)."""
     objects = load_object_set("random_urdfs", cache_dir=config.cache_folder, split="train")
     scene = make_scene("packed", objects, seed, config)
     with make_cell(config) as cell:
