@@ -101,7 +101,8 @@ class GraspNetPlanner(WithCritic, SearchPlanner):
 
     checkpoint: file of the network, unless `network` is given. critic: has the last word; where
     none is given, the shipped one for the shipped network, with which it was trained, and none for
-    others. Raises UserError if a file cannot be loaded.
+    others. likely: the critic's chance of the best peak, from which nothing is searched. Raises
+    UserError if a file cannot be loaded.
     """
 
     def __init__(
@@ -113,9 +114,11 @@ class GraspNetPlanner(WithCritic, SearchPlanner):
         network: SavedGraspNet | None = None,
         settings: SearchSettings = SETTINGS,
         critic: GraspCritic | None = None,
+        likely: float = LIKELY,
     ):
         super().__init__(gripper, workspace, seed, settings)
         self.network = network or loaded(checkpoint)
+        self.likely = likely
         if critic is None and network is None and checkpoint.resolve() == SHIPPED:
             critic = shipped_critic()
         if critic is not None:
@@ -139,7 +142,7 @@ class GraspNetPlanner(WithCritic, SearchPlanner):
         if self.judge is None:
             return self.searched(heights, seen)
         at_peaks = self.at_peaks(heights, seen)
-        if len(at_peaks) and at_peaks.score[0] >= LIKELY:
+        if len(at_peaks) and at_peaks.score[0] >= self.likely:
             return at_peaks
         both = Candidates.joined([at_peaks, self.searched(heights, seen)])
         return both.best(len(both))
@@ -235,10 +238,11 @@ class GraspNetFanPlanner(WithCritic, FanPlanner):
     of another network without a critic of its own.
 
     likely: the critic's chance of the best grasp from straight above, from which no other side is
-    looked at; over 1, the fan alone serves. device: of the network. at_once: whether all views are
-    searched in one pass there (`models.fan_search`); by default on a GPU alone, though with many
-    cores it is quicker on a CPU, too. Frames with fixtures or a second look, and those of a planner
-    with another `judge`, are searched view by view, the latter in the fan alone.
+    looked at (and of the best peak there, from which nothing is searched); over 1, the fan alone
+    serves. device: of the network. at_once: whether all views are searched in one pass there
+    (`models.fan_search`); by default on a GPU alone, though with many cores it is quicker on a CPU,
+    too. Frames with fixtures or a second look, and those of a planner with another `judge`, are
+    searched view by view, the latter in the fan alone.
     """
 
     def __init__(
@@ -265,7 +269,12 @@ class GraspNetFanPlanner(WithCritic, FanPlanner):
         self.judge = self._own_judge = chances_by(self.critic)
         self.likely = likely
         self._above = GraspNetPlanner(
-            self._with_wrist, workspace, seed, network=self.network, critic=self.critic
+            self._with_wrist,
+            workspace,
+            seed,
+            network=self.network,
+            critic=self.critic,
+            likely=likely,
         )
         self.at_once = self.device.type == "cuda"
 

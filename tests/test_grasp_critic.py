@@ -247,6 +247,23 @@ def test_other_sides_are_looked_at_where_no_grasp_from_above_is_likely(chance, l
     assert (planner._above.settings.returned, planner.fan.returned) == (33, 40)
 
 
+def test_how_likely_a_peak_has_to_be_is_the_users_to_say() -> None:
+    """Under it the search is asked as well, also from straight above by the planner of a fan."""
+    parts = GripperGeometry(), Workspace()
+    above = GraspNetFanPlanner(*parts, likely=0.99)._above
+    for likely, planner in ((0.975, GraspNetPlanner(*parts)), (0.99, above)):
+        for chance in (likely - 0.001, likely):
+            asked = []
+
+            def judge(heights: HeightMap, found: Candidates, _, chance=chance, asked=asked):
+                asked.append(found)
+                return np.full(len(found), chance)
+
+            planner.judge = judge
+            planner(BOX)
+            assert len(asked) == (2 if chance < likely else 1)
+
+
 @pytest.mark.parametrize(
     ("of_peaks", "of_search", "asked_twice"),
     [(0.98, 0.99, False), (0.975, 0.99, False), (0.97, 0.99, True), (0.97, 0.5, True)],
