@@ -46,7 +46,7 @@ SOLVER_RESIDUAL = 1e-7
 # The flag of URDF files means the same to `createCollisionShape`, which has no name for it and
 # passes it over for boxes.
 WHOLE_FACES = pybullet.URDF_INITIALIZE_SAT_FEATURES
-_EDGE = np.radians(20)  # a sharper one is drawn as an edge, not as a curve
+_EDGE = np.radians(20)  # between two faces; a sharper one is drawn as an edge, not as a curve
 Quaternion = Sequence[float]  # x, y, z, w
 _HERE = (0.0, 0.0, 0.0)
 
