@@ -1,8 +1,8 @@
 """Candidates of all views of a fan, posed on their maps, measured and scored, as tensors.
 
-`measure` is that of `models.planner_measure` with PyTorch: names and order are the same, what a
-step is for is told there, and a test holds both to the same numbers. On a GPU it is recorded as a
-CUDA graph.
+`measure` and the others are those of `models.planner_measure` with PyTorch: names and order are the
+same, what a step is for is told there, and a test holds both to the same numbers. On a GPU,
+`measure` is recorded as a CUDA graph.
 """
 
 from __future__ import annotations
@@ -17,8 +17,17 @@ import torch
 
 from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews
-from models.planner_candidates import SearchSettings, grip_score
-from models.planner_measure import LINES, PALM_STEP, REACH, UNSURE
+from models.planner_candidates import FACTS, SearchSettings, grip_score
+from models.planner_measure import (
+    BESIDE,
+    BESIDE_LINES,
+    HIGHEST_CELL,
+    LINES,
+    PALM_STEP,
+    REACH,
+    UNSURE,
+)
+from utils.depth_correction import bump_height
 from utils.geometry import GripperGeometry
 from utils.grasp_quality import NEAR_FACE, TOUCH, contact_levels
 from utils.height_map import OTHER_LABEL, WALL_LABEL
@@ -48,6 +57,27 @@ def turn_onto_faces(
             )
         )
     return found
+
+
+def without_bumps(found: FanCandidates, views: FanViews, gripper: GripperGeometry) -> FanCandidates:
+    """The candidates but for those on bumps that the noise of a depth image has made."""
+    if views.roughness == 0:
+        return found
+    along, across = found.axes()
+    lines = {"device": found.xy.device, "dtype": found.xy.dtype}
+    beside = torch.linspace(*BESIDE, BESIDE_LINES, **lines) + found.width[:, None] / 2
+    beside = torch.stack([-beside, beside], dim=1)[..., None, None]  # (N, side, line, 1, 1)
+    over = torch.linspace(-1, 1, BESIDE_LINES, **lines)[:, None] * gripper.finger_half_width
+    points = found.xy[:, None, None, None] + beside * along[:, None, None, None]
+    points = points + over * across[:, None, None, None]
+    where = views.cells(found.view[:, None, None, None], points).flatten(2)
+    low = views.height.flatten()[where].median(dim=2).values
+    bare = (views.label.flatten()[where] < 0).double().mean(dim=2) >= 0.5
+    engagement = found.facts[:, FACTS.index("engagement")]
+    rise = (found.tip + engagement)[:, None] - low
+    kept = (bare | (rise > bump_height(views.roughness))).all(dim=1)
+    kept &= engagement > HIGHEST_CELL * views.roughness
+    return found.take(torch.nonzero(kept)[:, 0])
 
 
 def measure(

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from models.fan_candidates import FanCandidates
-from models.fan_measure import cells_around, measure, turn_onto_faces
+from models.fan_measure import cells_around, measure, turn_onto_faces, without_bumps
 from models.fan_views import FanViews, highest_within
 from models.grasp_critic import ACROSS, ALONG, LEAST_LOGGED, MOST, STEP, UNIT, GraspCritic
 from models.planner_candidates import FACTS, SearchSettings
@@ -44,6 +44,7 @@ def search_once(
         found = FanCandidates.joined([found, replace(tilted, view=tilted.view + 1)])
     found = _valued(found, value(views, found)).best(settings.shortlist)
     found = measure(found, views, gripper, settings).best(settings.finalists)
+    found = without_bumps(found, views, gripper)
     found = turn_onto_faces(found, views, gripper, settings)
     return _valued(found, value(views, found)).best()
 

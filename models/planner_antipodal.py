@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from models.planner_candidates import Candidates, SearchSettings
-from models.planner_measure import measure, turn_onto_faces
+from models.planner_measure import measure, turn_onto_faces, without_bumps
 from models.planner_runs import dense_candidates
 from utils.calibration import Calibration
 from utils.depth_correction import corrected
@@ -113,6 +113,7 @@ def search_once(
     if len(found) == 0:
         return found
     found = measure(found, heights, gripper, settings).best(settings.finalists)
+    found = without_bumps(found, heights, gripper)
     found = turn_onto_faces(found, heights, gripper, settings)
     return _valued(found, value).best(len(found))
 

@@ -29,7 +29,7 @@ from models.graspnet_view import NetworkView
 from models.planner_antipodal import SearchPlanner
 from models.planner_candidates import Candidates, SearchSettings, with_chances
 from models.planner_fan import SEARCH, FanPlanner, FanSettings, distinct
-from models.planner_measure import measure, turn_onto_faces
+from models.planner_measure import measure, turn_onto_faces, without_bumps
 from utils.depth_correction import corrected
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
@@ -192,6 +192,7 @@ def fitted_peaks(
     for margins in (settings, settings.relaxed(), settings.off_centre()):
         deep = _at_depths(rough, workspace.table_height, margins)
         found = measure(deep, heights, gripper, margins, len(DEPTH_STEPS)).best(margins.finalists)
+        found = without_bumps(found, heights, gripper)
         if len(found):
             found = turn_onto_faces(found, heights, gripper, margins)
             return replace(found, score=found.score * value(found)).best(len(found))

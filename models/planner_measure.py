@@ -1,7 +1,8 @@
 """The second stage of the antipodal search: candidates posed on a height map and measured.
 
 `measure` finds contacts, clearances and lever arms, centres each candidate and scores it;
-`turn_onto_faces` turns it until the pads lie flat. `models.fan_measure` does the same for a fan of
+`without_bumps` leaves out what only noise has raised; `turn_onto_faces` turns the others until the
+pads lie flat. `models.fan_measure` does the same for a fan of
 views with PyTorch.
 """
 
@@ -12,7 +13,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from models.planner_candidates import Candidates, SearchSettings, grip_score
+from models.planner_candidates import FACTS, Candidates, SearchSettings, grip_score
+from utils.depth_correction import bump_height
 from utils.geometry import GripperGeometry
 from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap
@@ -21,6 +23,9 @@ UNSURE = 0.001  # m, by which `_thickness` may be wrong
 LINES = 9  # across a pad, along which contacts are looked for
 REACH = 0.004  # m beyond the open fingers that are looked at
 PALM_STEP = 0.006  # m between the points under the palm that are looked at
+# m from a contact, where what lies beside it is looked at, on so many lines along and across.
+BESIDE, BESIDE_LINES = (0.003, 0.008), 5
+HIGHEST_CELL = 2.0  # times the roughness of an image, by which noise raises a grasp's highest cell
 
 
 def turn_onto_faces(
@@ -166,6 +171,28 @@ def measure(
     facts = np.nan_to_num(facts, posinf=np.pi, neginf=-np.pi)  # of what touches nothing
     score *= feasible
     return Candidates(xy, candidates.angle, tip, width, opening, offset, turn, label, score, facts)
+
+
+def without_bumps(found: Candidates, heights: HeightMap, gripper: GripperGeometry) -> Candidates:
+    """The candidates but for those on bumps that the noise of a depth image has made.
+
+    What fingers hold rises over their tips by more than the highest of many noisy cells does, and
+    over the surface beside it, unless that is the table, by more than the bumps of a rough image.
+    """
+    if heights.roughness == 0 or len(found) == 0:
+        return found
+    along, across = found.axes()
+    beside = np.linspace(*BESIDE, BESIDE_LINES) + found.width[:, None] / 2
+    beside = np.stack([-beside, beside], axis=1)[..., None, None]  # (N, side, line, 1, 1)
+    over = np.linspace(-1, 1, BESIDE_LINES)[:, None] * gripper.finger_half_width
+    points = found.xy[:, None, None, None] + beside * along[:, None, None, None]
+    where = heights.index(points + over * across[:, None, None, None])
+    low = np.median(heights.height[where], axis=(2, 3))
+    bare = (heights.label[where] < 0).mean(axis=(2, 3)) >= 0.5
+    engagement = found.facts[:, FACTS.index("engagement")]
+    rise = (found.tip + engagement)[:, None] - low
+    kept = (bare | (rise > bump_height(heights.roughness))).all(axis=1)
+    return found.take(kept & (engagement > HIGHEST_CELL * heights.roughness))
 
 
 def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:

@@ -19,7 +19,7 @@ from models.grasp_critic import critic_inputs, shipped_critic
 from models.planner_candidates import Candidates
 from models.planner_fan import SEARCH, turns_between
 from models.planner_graspnet import GraspNetFanPlanner
-from models.planner_measure import measure, turn_onto_faces
+from models.planner_measure import measure, turn_onto_faces, without_bumps
 from models.planner_runs import dense_candidates
 from tests.helpers.box_frames import boxes_frame, shelf_frame
 from utils.geometry import GripperGeometry, Workspace
@@ -138,7 +138,7 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
     }.get(name, GripperGeometry())
     workspace, critic = Workspace(), shipped_critic()
     single, views = both(frame_of(0.001), others=name == "target")
-    feasible = 0
+    feasible = bumps = 0
     for number, heights in enumerate(single):
         one = views.part(number, number + 1)
         heights = replace(
@@ -161,6 +161,13 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
         expected = expected.best(60)
         if len(expected) == 0:
             continue
+        rough = replace(heights, roughness=0.01)
+        high, found_high = (
+            without_bumps(expected, rough, gripper),
+            fan_measure.without_bumps(found.best(60), replace(one, roughness=0.01), gripper),
+        )
+        assert_same(found_high, high)
+        bumps += len(expected) - len(high)
         expected, found = (
             turn_onto_faces(expected, heights, gripper, SEARCH),
             fan_measure.turn_onto_faces(found.best(60), one, gripper, SEARCH),
@@ -171,7 +178,7 @@ def test_each_stage_is_that_of_one_view(name: str) -> None:
         found = replace(found, value=torch.from_numpy(value))
         chance = fan_search.chances(found, one, towards, gripper.least_held, critic)
         np.testing.assert_allclose(chance.detach(), critic.chance(inputs), atol=1e-4)
-    assert feasible > 20
+    assert feasible > 20 and bumps > 0, bumps
 
 
 def alike_rough(found: FanCandidates, expected: Candidates) -> float:

@@ -61,6 +61,7 @@ class HeightMap:
     beyond: (R, C) bool, cells that the image does not show: what its border cuts off is thought to
         go on there (`with_surroundings`), and no grasp has its middle there; None where nothing is
         cut off.
+    roughness: m, of the table in the depth image (`utils.depth_correction`); 0 for exact heights.
     """
 
     height: np.ndarray
@@ -73,6 +74,7 @@ class HeightMap:
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
     fixed: np.ndarray | None = None
     beyond: np.ndarray | None = None
+    roughness: float = 0.0
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,7 +163,7 @@ def height_map_from_frame(
     above. holeless: the frame `without_holes`, where that is known.
     """
     grid, origin = grid_points(workspace, margin, cell)
-    table = float(workspace.table_height)
+    table, rough = float(workspace.table_height), frame.roughness
     filled, hiding = holeless or without_holes(frame, workspace)
     if below:
         filled, hiding = _uncovered(filled, hiding, table)
@@ -176,7 +178,9 @@ def height_map_from_frame(
         if _goes_on(filled, frame):
             points = np.concatenate([grid, seen.height[..., None]], axis=-1)
             beyond = outside(frame, points)
-        return HeightMap(*seen.walled(), label, centres, origin, cell, table, beyond=beyond)
+        return HeightMap(
+            *seen.walled(), label, centres, origin, cell, table, beyond=beyond, roughness=rough
+        )
     fixed = _tops(filled.fixtures, grid, origin, cell)
     bare = _bare(seen.height, fixed)
     label = label_pieces(np.where(bare, table, surface), table, cell)
@@ -186,7 +190,9 @@ def height_map_from_frame(
     centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
-    return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed)
+    return HeightMap(
+        height, ceiling, label, centres, origin, cell, table, fixed=fixed, roughness=rough
+    )
 
 
 def _goes_on(filled: RGBDFrame, frame: RGBDFrame) -> bool:
@@ -301,7 +307,10 @@ def tilted_height_map(
     else:
         fixed = None
     table = overhead.table_height
-    return HeightMap(height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond)
+    return HeightMap(
+        height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond,
+        overhead.roughness,
+    )  # fmt: skip
 
 
 def height_map_from_scene(
