@@ -21,11 +21,11 @@ from models.planner_candidates import FACTS, SearchSettings, grip_score
 from models.planner_measure import (
     BESIDE,
     BESIDE_LINES,
-    HIGHEST_CELL,
     LINES,
     PALM_STEP,
     REACH,
     UNSURE,
+    least_engagement,
 )
 from utils.depth_correction import bump_height
 from utils.geometry import GripperGeometry
@@ -61,7 +61,7 @@ def turn_onto_faces(
 
 def without_bumps(found: FanCandidates, views: FanViews, gripper: GripperGeometry) -> FanCandidates:
     """The candidates but for those on bumps that the noise of a depth image has made."""
-    if views.roughness == 0:
+    if views.noise == 0:
         return found
     along, across = found.axes()
     lines = {"device": found.xy.device, "dtype": found.xy.dtype}
@@ -71,12 +71,13 @@ def without_bumps(found: FanCandidates, views: FanViews, gripper: GripperGeometr
     points = found.xy[:, None, None, None] + beside * along[:, None, None, None]
     points = points + over * across[:, None, None, None]
     where = views.cells(found.view[:, None, None, None], points).flatten(2)
-    low = views.height.flatten()[where].median(dim=2).values
-    bare = (views.label.flatten()[where] < 0).double().mean(dim=2) >= 0.5
+    surface = views.height.flatten()[where].median(dim=2).values
+    label = views.label.flatten()[where]
+    on_table = ((label == -1) | (label == WALL_LABEL)).double().mean(dim=2) >= 0.5
     engagement = found.facts[:, FACTS.index("engagement")]
-    rise = (found.tip + engagement)[:, None] - low
-    kept = (bare | (rise > bump_height(views.roughness))).all(dim=1)
-    kept &= engagement > HIGHEST_CELL * views.roughness
+    rise = (found.tip + engagement)[:, None] - surface
+    kept = (on_table | (rise > bump_height(views.noise))).all(dim=1)
+    kept &= engagement > least_engagement(views.noise)
     return found.take(torch.nonzero(kept)[:, 0])
 
 

@@ -42,7 +42,7 @@ class FanViews:
     height, ceiling: (B, R, C) float32; label: (B, R, C) int64; centres: (B, M, 3) float64; beyond:
     (B, R, C) bool, or None; each as of `HeightMap`; the last of the centres may be filled up with
     zeros. T_WV: (B, 4, 4) float64. origin: (x, y) m in V. cell: m. table_height: m in W. others:
-    whether OTHER_LABEL occurs. roughness: as of `HeightMap`.
+    whether OTHER_LABEL occurs. noise: as of `HeightMap`.
     """
 
     height: torch.Tensor
@@ -55,7 +55,7 @@ class FanViews:
     table_height: float
     beyond: torch.Tensor | None = None
     others: bool = False
-    roughness: float = 0.0
+    noise: float = 0.0
     _ceiling_within: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -182,7 +182,7 @@ def fan_views(
     others = bool((overhead.label == OTHER_LABEL).any())
     return FanViews(
         walled, ceiling, label, centres, frames, origin, cell, table, beyond, others,
-        overhead.roughness,
+        overhead.noise,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from models.planner_candidates import FACTS, Candidates, SearchSettings, grip_score
-from utils.depth_correction import bump_height
+from utils.depth_correction import TRUSTED_ROUGHNESS, bump_height
 from utils.geometry import GripperGeometry
 from utils.grasp_quality import contact_levels, fit_faces
 from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap
@@ -23,9 +23,12 @@ UNSURE = 0.001  # m, by which `_thickness` may be wrong
 LINES = 9  # across a pad, along which contacts are looked for
 REACH = 0.004  # m beyond the open fingers that are looked at
 PALM_STEP = 0.006  # m between the points under the palm that are looked at
-# m from a contact, where what lies beside it is looked at, on so many lines along and across.
+# m from a contact to the nearest and the farthest place beside it that is looked at, and how many
+# places along the closing line and across it.
 BESIDE, BESIDE_LINES = (0.003, 0.008), 5
-HIGHEST_CELL = 2.0  # times the roughness of an image, by which noise raises a grasp's highest cell
+# Standard deviations by which noise raises the highest cell between the fingers: a choice
+# (docs/choices.md).
+HIGHEST_CELL = 2.0
 
 
 def turn_onto_faces(
@@ -176,10 +179,10 @@ def measure(
 def without_bumps(found: Candidates, heights: HeightMap, gripper: GripperGeometry) -> Candidates:
     """The candidates but for those on bumps that the noise of a depth image has made.
 
-    What fingers hold rises over their tips by more than the highest of many noisy cells does, and
-    over the surface beside it, unless that is the table, by more than the bumps of a rough image.
+    What fingers hold rises over their tips, and over the surface beside it unless that is the table
+    or a wall, by more than noise may raise the highest cell between them.
     """
-    if heights.roughness == 0 or len(found) == 0:
+    if heights.noise == 0 or len(found) == 0:
         return found
     along, across = found.axes()
     beside = np.linspace(*BESIDE, BESIDE_LINES) + found.width[:, None] / 2
@@ -187,12 +190,18 @@ def without_bumps(found: Candidates, heights: HeightMap, gripper: GripperGeometr
     over = np.linspace(-1, 1, BESIDE_LINES)[:, None] * gripper.finger_half_width
     points = found.xy[:, None, None, None] + beside * along[:, None, None, None]
     where = heights.index(points + over * across[:, None, None, None])
-    low = np.median(heights.height[where], axis=(2, 3))
-    bare = (heights.label[where] < 0).mean(axis=(2, 3)) >= 0.5
+    surface, label = np.median(heights.height[where], axis=(2, 3)), heights.label[where]
+    on_table = ((label == -1) | (label == WALL_LABEL)).mean(axis=(2, 3)) >= 0.5
     engagement = found.facts[:, FACTS.index("engagement")]
-    rise = (found.tip + engagement)[:, None] - low
-    kept = (bare | (rise > bump_height(heights.roughness))).all(axis=1)
-    return found.take(kept & (engagement > HIGHEST_CELL * heights.roughness))
+    rise = (found.tip + engagement)[:, None] - surface
+    kept = (on_table | (rise > bump_height(heights.noise))).all(axis=1)
+    return found.take(kept & (engagement > least_engagement(heights.noise)))
+
+
+def least_engagement(noise: float) -> float:
+    """Metres that what is held has to rise over the fingertips where flat surfaces have this
+    standard deviation, m. What is less flat than a smoothed image has another reason than noise."""
+    return HIGHEST_CELL * min(noise, TRUSTED_ROUGHNESS)
 
 
 def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:

@@ -4,30 +4,45 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from models.fan_views import fan_views
+from models.planner_antipodal import search
 from models.planner_candidates import Candidates, SearchSettings
 from models.planner_measure import measure, without_bumps
 from models.planners import make_planner
 from tests.helpers.box_frames import boxes_frame
 from utils.depth import RealSenseNoise
+from utils.depth_correction import corrected
 from utils.geometry import GripperGeometry, Workspace
-from utils.height_map import HeightMap
+from utils.height_map import (
+    OTHER_LABEL,
+    WALL_LABEL,
+    HeightMap,
+    height_map_from_frame,
+    height_map_from_scene,
+    tilted_height_map,
+    tilted_view,
+)  # fmt: skip
+from utils.seen_heights import without_holes
+from utils.target import only_target
+from utils.transforms import RGBDFrame
 
 HAND = GripperGeometry()
 CELL, SLAB = 0.002, 0.05  # m, of the map and from the table to the slab's top
 
 
-def ridge_on_a_slab(rise: float, roughness: float, beside: int) -> HeightMap:
-    """A ridge 2 cm wide along y in the middle of a slab. beside: the slab's label; -1 makes a table
-    of it on the right of the ridge."""
-    height, label = np.full((101, 101), SLAB), np.zeros((101, 101), int)
+def ridge_on_a_slab(rise: float, noise: float, label: int) -> HeightMap:
+    """A ridge 2 cm wide along y, of object 0, in the middle of a slab with this label on the right;
+    on the left it is a part of the object."""
+    height, labels = np.full((101, 101), SLAB), np.zeros((101, 101), int)
     height[20:81, 45:56] += rise
-    label[:, 56:] = beside
+    labels[:, 56:] = label
     centres = np.array([[0.0, 0.0, SLAB]])
     origin = np.array([-0.1, -0.1])
-    return HeightMap(height, height, label, centres, origin, CELL, 0.0, roughness=roughness)
+    return HeightMap(height, height, labels, centres, origin, CELL, 0.0, noise=noise)
 
 
 def across(heights: HeightMap, depth: float) -> Candidates:
@@ -41,31 +56,74 @@ def across(heights: HeightMap, depth: float) -> Candidates:
     return found
 
 
-@given(st.floats(0.006, 0.03), st.floats(0.0001, 0.004), st.floats(0.3, 0.9))
-def test_a_ridge_counts_from_five_times_the_roughness_and_15_mm(rise, roughness, share) -> None:
-    bumps, depth = min(5 * roughness, 0.015), share * rise
-    assume(abs(rise - bumps) > 1e-6 and abs(depth - 2 * roughness) > 1e-6)
-    deep = depth > 2 * roughness
-    for beside in (0, -1):
-        heights = ridge_on_a_slab(rise, roughness, beside)
+@given(st.floats(0.007, 0.03), st.floats(0.0001, 0.006), st.floats(0.3, 0.9))
+def test_a_ridge_counts_from_five_standard_deviations_and_15_mm(rise, noise, share) -> None:
+    bumps, least, depth = min(5 * noise, 0.015), min(2 * noise, 0.006), share * rise
+    assume(abs(rise - bumps) > 1e-6 and abs(depth - least) > 1e-6)
+    for label in (0, OTHER_LABEL, -1, WALL_LABEL):
+        heights = ridge_on_a_slab(rise, noise, label)
         found = across(heights, depth)
-        # On the left there is the slab in either case.
-        assert len(without_bumps(found, heights, HAND)) == (deep and rise > bumps)
-        exact = replace(heights, roughness=0.0)
-        assert len(without_bumps(found, exact, HAND)) == 1
-        on_table = replace(heights, label=np.where(heights.height > SLAB, 0, -1))
-        assert len(without_bumps(found, on_table, HAND)) == deep
+        assert len(without_bumps(found, heights, HAND)) == (depth > least and rise > bumps)
+        left_too = np.where(heights.height > SLAB, 0, label)
+        alone = len(without_bumps(found, replace(heights, label=left_too), HAND))
+        below = label in (-1, WALL_LABEL)  # nothing else can be there
+        assert alone == (depth > least and (below or rise > bumps))
+        assert len(without_bumps(found, replace(heights, noise=0.0), HAND)) == 1
 
 
-@pytest.mark.parametrize("name", ["heuristic", "graspnet", "graspnet_direct"])
-@pytest.mark.parametrize("height", [0.05, 0.10])
-def test_a_noisy_box_wider_than_the_hand_is_left_alone(name, height) -> None:
-    """Without the check, `graspnet` gives ridges of noise chances of up to 0.68 and 0.94."""
-    frame = boxes_frame([((0.12, 0.12, height), 0.3, (0.5, 0.0))])
+def seen_by_a_realsense(boxes: list, seed: int) -> RGBDFrame:
+    """Blue boxes on a grey table."""
+    frame = boxes_frame(boxes)
     frame.rgb[:] = 120
     frame.rgb[frame.depth < 0.79] = (60, 100, 180)
     noise = RealSenseNoise(image_focal=frame.K[0, 0])
-    plan = make_planner(name, HAND, Workspace(), 0)
-    for seed in range(12):
-        depth = noise(frame.depth, np.random.default_rng(seed)).astype(np.float32)
-        assert [grasp for grasp in plan(replace(frame, depth=depth)) if grasp.quality > 0.3] == []
+    depth = noise(frame.depth, np.random.default_rng(seed)).astype(np.float32)
+    return replace(frame, depth=depth)
+
+
+WIDE = ((0.12, 0.12, 0.1), 0.3, (0.5, 0.0))  # than the hand opens
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_ridge_of_5_mm_in_noise_is_left_alone_and_a_bar_on_the_box_is_not(seed: int) -> None:
+    plan = make_planner("heuristic", HAND, Workspace(), 0)
+
+    def found(thickness: float, checked: bool) -> int:
+        bar = ((0.025, 0.08, thickness), 0.3, (0.5, 0.0, WIDE[0][2]))
+        heights = plan.heights(corrected(seen_by_a_realsense([WIDE, bar], seed), 0.0))
+        assert 0.002 < heights.noise < 0.003
+        heights = heights if checked else replace(heights, noise=0.0)
+        return len(search(heights, HAND, Workspace(), plan.settings))
+
+    assert found(0.005, checked=False) > 0 and found(0.005, checked=True) == 0
+    assert found(0.02, checked=True) > 0
+
+
+def test_maps_know_the_noise_of_their_frames() -> None:
+    """That of the noisier frame, in each kind of map."""
+    workspace, clean = Workspace(), corrected(boxes_frame([WIDE]), 0.0)
+    noisy = corrected(seen_by_a_realsense([WIDE], 0), 0.0)
+    assert clean.noise < 1e-4 and 0.002 < noisy.noise < 0.003
+    shelf = replace(noisy, fixtures=tuple(boxes_frame([WIDE], walls=1).truth.walls))
+    for frame in (noisy, replace(clean, second=noisy), shelf):
+        heights = height_map_from_frame(frame, workspace)
+        T_WV = tilted_view(np.array([0.5, 0.0, -np.sqrt(0.75)]), workspace)
+        holeless = without_holes(frame, workspace)
+        views = fan_views(heights, *holeless, T_WV[None], torch.device("cpu"))
+        target = replace(frame, target=np.ones(frame.depth.shape, bool))
+        for drawn in (
+            heights, heights.every(2), tilted_height_map(heights, *holeless, T_WV),
+            only_target(heights, target), views, views.every(2), views.part(0, 1),
+        ):  # fmt: skip
+            assert drawn.noise == noisy.noise
+    assert height_map_from_scene(clean.truth, workspace).noise == 0
+
+
+def test_the_noise_is_that_of_the_smoothed_depth() -> None:
+    """A table of 5 mm is smoothed first; correcting it again changes nothing."""
+    frame = boxes_frame([WIDE])
+    depth = frame.depth + np.random.default_rng(0).normal(0, 0.005, frame.depth.shape)
+    once = corrected(replace(frame, depth=depth.astype(np.float32)), 0.0)
+    assert once.roughness == pytest.approx(0.005, rel=0.1) and once.noise < 0.002
+    twice = corrected(once, 0.0)
+    assert (twice.roughness, twice.noise) == (once.roughness, once.noise)

@@ -45,7 +45,8 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     if rest > TRUSTED_FLATNESS:
         frame = replace(frame, depth=flattened_by_colour(frame, table_height, rest))
     # A frame that was corrected before is less rough now, but no more certain.
-    return replace(frame, roughness=max(frame.roughness, roughness))
+    roughness, rest = max(frame.roughness, roughness), max(frame.noise, rest)
+    return replace(frame, roughness=roughness, noise=rest)
 
 
 def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
@@ -195,7 +196,8 @@ def flattened_by_colour(frame: RGBDFrame, table_height: float, roughness: float)
 
 
 def bump_height(roughness: float) -> float:
-    """Metres up to which what has the table's colour counts as table. roughness: of it, m."""
+    """Metres up to which a flat surface of this roughness (m) rises: what has the table's colour
+    counts as table so far, and what rises less is nothing to grasp."""
     return min(TABLE_SPREAD * roughness, HIGHEST_BUMP)
 
 

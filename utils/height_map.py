@@ -61,7 +61,8 @@ class HeightMap:
     beyond: (R, C) bool, cells that the image does not show: what its border cuts off is thought to
         go on there (`with_surroundings`), and no grasp has its middle there; None where nothing is
         cut off.
-    roughness: m, of the table in the depth image (`utils.depth_correction`); 0 for exact heights.
+    noise: m, standard deviation of flat surfaces: the larger `noise` of the frame and its second
+        one; 0 for exact heights.
     """
 
     height: np.ndarray
@@ -74,7 +75,7 @@ class HeightMap:
     T_WV: np.ndarray = field(default_factory=lambda: np.eye(4))
     fixed: np.ndarray | None = None
     beyond: np.ndarray | None = None
-    roughness: float = 0.0
+    noise: float = 0.0
     _highest: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def index(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +164,7 @@ def height_map_from_frame(
     above. holeless: the frame `without_holes`, where that is known.
     """
     grid, origin = grid_points(workspace, margin, cell)
-    table, rough = float(workspace.table_height), frame.roughness
+    table, noise = float(workspace.table_height), _noise(frame)
     filled, hiding = holeless or without_holes(frame, workspace)
     if below:
         filled, hiding = _uncovered(filled, hiding, table)
@@ -179,7 +180,7 @@ def height_map_from_frame(
             points = np.concatenate([grid, seen.height[..., None]], axis=-1)
             beyond = outside(frame, points)
         return HeightMap(
-            *seen.walled(), label, centres, origin, cell, table, beyond=beyond, roughness=rough
+            *seen.walled(), label, centres, origin, cell, table, beyond=beyond, noise=noise
         )
     fixed = _tops(filled.fixtures, grid, origin, cell)
     bare = _bare(seen.height, fixed)
@@ -190,9 +191,12 @@ def height_map_from_frame(
     centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
-    return HeightMap(
-        height, ceiling, label, centres, origin, cell, table, fixed=fixed, roughness=rough
-    )
+    return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed, noise=noise)
+
+
+def _noise(frame: RGBDFrame) -> float:
+    """Metres, of the noisier of the images that a map is drawn from."""
+    return frame.noise if frame.second is None else max(frame.noise, frame.second.noise)
 
 
 def _goes_on(filled: RGBDFrame, frame: RGBDFrame) -> bool:
@@ -309,7 +313,7 @@ def tilted_height_map(
     table = overhead.table_height
     return HeightMap(
         height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond,
-        overhead.roughness,
+        overhead.noise,
     )  # fmt: skip
 
 

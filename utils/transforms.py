@@ -155,7 +155,8 @@ class RGBDFrame:
     second: another frame of the same still scene, from another side, which adds to what this one
         shows; None: there is none. Its own fixtures, target and second count for nothing.
     roughness: m, how rough the table is in the depth that the camera measured, as
-        `utils.depth_correction.corrected` found it; 0 before.
+        `utils.depth_correction.corrected` found it; 0 before. noise: m, how rough it was still
+        once its depth was smoothed.
     """
 
     rgb: np.ndarray
@@ -168,6 +169,7 @@ class RGBDFrame:
     target: np.ndarray | None = None
     second: RGBDFrame | None = None
     roughness: float = 0.0
+    noise: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises UserError where an image, K or T_WC is none, and where the images differ in
