@@ -2,8 +2,7 @@
 
 `measure` finds contacts, clearances and lever arms, centres each candidate and scores it;
 `without_bumps` leaves out what only noise has raised; `turn_onto_faces` turns the others until the
-pads lie flat. `models.fan_measure` does the same for a fan of
-views with PyTorch.
+pads lie flat. `models.fan_measure` does the same for a fan of views with PyTorch.
 """
 
 from __future__ import annotations

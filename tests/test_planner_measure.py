@@ -25,7 +25,7 @@ from utils.height_map import (
     height_map_from_scene,
     tilted_height_map,
     tilted_view,
-)  # fmt: skip
+)
 from utils.seen_heights import without_holes
 from utils.target import only_target
 from utils.transforms import RGBDFrame

@@ -312,8 +312,7 @@ def tilted_height_map(
         fixed = None
     table = overhead.table_height
     return HeightMap(
-        height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond,
-        overhead.noise,
+        height, ceiling, label, centres, origin, cell, table, T_WV, fixed, beyond, overhead.noise
     )  # fmt: skip
 
 

@@ -155,8 +155,8 @@ class RGBDFrame:
     second: another frame of the same still scene, from another side, which adds to what this one
         shows; None: there is none. Its own fixtures, target and second count for nothing.
     roughness: m, how rough the table is in the depth that the camera measured, as
-        `utils.depth_correction.corrected` found it; 0 before. noise: m, how rough it was still
-        once its depth was smoothed.
+        `utils.depth_correction.corrected` found it; 0 before.
+    noise: m, how rough the table still was once the depth was smoothed; 0 before.
     """
 
     rgb: np.ndarray
