@@ -93,8 +93,7 @@ class Candidates:
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) unit vectors along the closing line and across it."""
-        along = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
-        return along, np.stack([-along[:, 1], along[:, 0]], axis=-1)
+        return closing_axes(self.angle)
 
     def distinct(self, count: int, distance: float, angle: float) -> Candidates:
         """Non-maximum suppression: at most `count`, no two closer than both distance and angle."""
@@ -118,6 +117,12 @@ class Candidates:
                 middle, height, self.angle, self.opening.tolist(), self.score.tolist()
             )
         ]
+
+
+def closing_axes(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(..., 2) unit vectors along closing lines at angles (...) and across them."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.stack([cosine, sine], axis=-1), np.stack([-sine, cosine], axis=-1)
 
 
 def with_chances(

@@ -9,11 +9,12 @@ for a fan of views with PyTorch.
 from __future__ import annotations
 
 import itertools
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from models.planner_candidates import Candidates, SearchSettings
+from models.planner_candidates import Candidates, SearchSettings, closing_axes
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import OTHER_LABEL, HeightMap
 from utils.transforms import transform_points
@@ -23,114 +24,184 @@ EDGE_BLUR = 0.002  # m, standard deviation over the heights whose gradients are 
 MOST_AT_ONCE = 2**19  # cells of turned maps
 
 
+class _Square(NamedTuple):
+    """What of a map is turned: all graspable matter, and fingers beside it, at any angle. centre:
+    (2,) column and row of the middle cell. half: cells from there to a side."""
+
+    centre: np.ndarray
+    half: int
+
+    @property
+    def size(self) -> int:
+        return 2 * self.half + 1
+
+
+class _Turned(NamedTuple):
+    """The square at some angles, so that the closing line lies along its rows. angles: (A,).
+    heights, objects, under_finger and under_palm: (A, S, S) m, of everything, of what stands on the
+    table, and the highest matter in reach of a finger and of the palm around each cell."""
+
+    angles: np.ndarray
+    heights: np.ndarray
+    objects: np.ndarray
+    under_finger: np.ndarray
+    under_palm: np.ndarray
+
+
+class _Runs(NamedTuple):
+    """M runs of matter over a height of the fingertips. row: (M,) of all turned maps, one under the
+    other. first, last: (M,) columns. tip: (M,) m."""
+
+    row: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    tip: np.ndarray
+
+    def take(self, index: np.ndarray) -> _Runs:
+        return _Runs(*(column[index] for column in self))
+
+
 def dense_candidates(
     heights: HeightMap, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
 ) -> Candidates:
     """Runs of matter that may fit between the fingers, for every angle, fingertip height and row
     of the map."""
-    cell, on_objects = heights.cell, heights.label >= 0
-    levels = _levels(heights, on_objects, gripper, settings)
+    levels = _levels(heights, gripper, settings)
     if len(levels) == 0:
         return Candidates.rough(np.empty((0, 2)), *np.empty((4, 0)))
-    # A square that holds all graspable matter, and fingers beside it, at any angle.
-    matter = np.argwhere(on_objects)[:, ::-1]
+    square, slope = _square(heights, gripper, settings), _slopes(heights)
+    angles = np.arange(settings.angles) * np.pi / settings.angles
+    # As many at once as make few array operations, but no large arrays.
+    count = max(1, MOST_AT_ONCE // square.size**2)
+    parts = []
+    for one in range(0, len(angles), count):
+        turned = _turned(heights, square, angles[one : one + count], gripper)
+        widest = gripper.max_opening - 2 * settings.rooms[0]
+        runs = _runs(turned.objects, levels, widest, heights.cell)
+        runs = _under_a_palm(runs, turned, heights.cell, gripper, settings)
+        runs = _between_fingers(runs, turned, heights.cell, gripper, settings)
+        parts.append(_scored(runs, turned, square, slope, heights, workspace, settings))
+    return Candidates.joined(parts)
+
+
+def _square(heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings) -> _Square:
+    matter = np.argwhere(heights.label >= 0)[:, ::-1]
     first, last = matter.min(axis=0), matter.max(axis=0)
-    centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
-    beside = (gripper.max_opening if gripper.opens_fully else max(settings.rooms)) + 2 * thickness
+    beside = gripper.max_opening if gripper.opens_fully else max(settings.rooms)
+    beside += 2 * gripper.finger_thickness
     beside += 2 * np.abs(settings.offsets).max()
     if (heights.label == OTHER_LABEL).any():  # what is not to be grasped may be under the palm
         beside += gripper.palm_half_length
-    half = int(np.linalg.norm(last - first) / 2 + beside / cell) + 2
-    size, middle = 2 * half + 1, heights.origin + cell * centre_cell
-    # Gradients of the blurred map point across an edge whatever its height.
-    slope = np.stack(
-        np.gradient(cv2.GaussianBlur(heights.height, (0, 0), EDGE_BLUR / cell))[::-1], axis=-1
-    )
+    half = int(np.linalg.norm(last - first) / 2 + beside / heights.cell) + 2
+    return _Square((first + last) // 2, half)
+
+
+def _turned(
+    heights: HeightMap, square: _Square, angles: np.ndarray, gripper: GripperGeometry
+) -> _Turned:
+    cell, size, half = heights.cell, square.size, square.half
     finger = np.ones(
-        (2 * int(gripper.finger_half_width / cell) + 1, int(thickness / cell)), np.uint8
+        (2 * int(gripper.finger_half_width / cell) + 1, int(gripper.finger_thickness / cell)),
+        np.uint8,
     )
-    palm_half = int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
+    palm_half = int(gripper.palm_half_width / cell), int(gripper.palm_half_length / cell)
     palm = np.ones((2 * palm_half[0] + 1, 2 * palm_half[1] + 1), np.uint8)
     # Only what stands on the table is gripped; the table itself is in the way of a tilted hand.
     standing = np.where(heights.label == -1, NOWHERE, heights.height).astype(np.float32)
     ground = float(heights.height.min())
-    every_angle = np.arange(settings.angles) * np.pi / settings.angles
-    # As many at once as make few array operations, but no large arrays.
-    count = max(1, MOST_AT_ONCE // size**2)
-    parts = []
-    for one in range(0, len(every_angle), count):
-        angles = every_angle[one : one + count]
-        along = np.column_stack([np.cos(angles), np.sin(angles)])
-        across = np.column_stack([-along[:, 1], along[:, 0]])
-        turned, objects, under_finger, under_palm = np.empty(
-            (4, len(angles), size, size), np.float32
-        )
-        for n in range(len(angles)):
-            axes = np.column_stack([along[n], across[n]])
-            warp = np.column_stack([axes, centre_cell - axes @ (half, half)])
-            for image, outside, out in (
-                (heights.height, ground, turned[n]), (standing, NOWHERE, objects[n]),
-            ):  # fmt: skip
-                cv2.warpAffine(
-                    image, warp, (size, size), out, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-                    borderValue=outside,
-                )  # fmt: skip
-            cv2.dilate(turned[n], finger, under_finger[n])
-            cv2.dilate(turned[n], palm, under_palm[n])
+    turned = _Turned(angles, *np.empty((4, len(angles), size, size), np.float32))
+    for n, angle in enumerate(angles):
+        axes = np.column_stack(closing_axes(angle))
+        warp = np.column_stack([axes, square.centre - axes @ (half, half)])
+        for image, outside, out in (
+            (heights.height, ground, turned.heights[n]), (standing, NOWHERE, turned.objects[n]),
+        ):  # fmt: skip
+            cv2.warpAffine(
+                image, warp, (size, size), out, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+                borderValue=outside,
+            )  # fmt: skip
+        cv2.dilate(turned.heights[n], finger, turned.under_finger[n])
+        cv2.dilate(turned.heights[n], palm, turned.under_palm[n])
+    return turned
 
-        # Of these angles at once: rows of the turned maps, one map under the other.
-        turned, under_finger, under_palm = (
-            maps.reshape(-1, size) for maps in (turned, under_finger, under_palm)
-        )
-        level, row, first, last = _runs(
-            objects, levels, gripper.max_opening - 2 * settings.rooms[0], cell
-        )
-        tip, centre = levels[level], np.rint((first + last) / 2).astype(int)
-        away = np.rint(np.divide(settings.offsets, cell)).astype(int)[:, None]
-        under_hand = under_palm[row, np.clip(centre + away, 0, size - 1)].min(axis=0)
-        free = under_hand < tip - settings.clearance + gripper.palm_height
-        row, first, last, tip = row[free], first[free], last[free], tip[free]
-        limit, free = tip - settings.clearance, np.zeros(len(tip), bool)
-        rooms = settings.rooms  # a sloping flank needs more room
-        if gripper.opens_fully:
-            rooms = ((gripper.max_opening - (last - first + 1) * cell) / 2,)
-        for room, away in itertools.product(rooms, settings.offsets):
-            beside = room + thickness / 2  # from the contact to the finger's middle
-            # Beside a wall it may be outside.
-            left = np.rint(first - (beside + max(-2 * away, 0)) / cell).astype(int)
-            right = np.rint(last + (beside + max(2 * away, 0)) / cell).astype(int)
-            left, right = np.maximum(left, 0), np.minimum(right, size - 1)
-            fits = (under_finger[row, left] < limit) & (under_finger[row, right] < limit)
-            opening = (last - first + 1) * cell + 2 * (room + abs(away))
-            free |= fits & (opening < gripper.max_opening + 2 * cell)
-        row, first, last, tip = row[free], first[free], last[free], tip[free]
 
-        rise = turned[row, first] - tip
-        angle, row = np.divmod(row, size)
-        along, across, angle = along[angle], across[angle], angles[angle]
-        base = middle + cell * (row - half)[:, None] * across
-        at_first, at_inside, xy, at_last = (
-            base + cell * (column - half)[:, None] * along
-            for column in (first, first + 1.5, (first + last) / 2, last)
-        )
-        place = transform_points(heights.T_WV, np.column_stack([xy, tip]))[:, :2]
-        reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
-        # Outward normals are minus the gradient: cosines against the closing line on both sides.
-        facing = np.minimum(
-            (_unit(slope[heights.index(at_first)]) * along).sum(axis=1),
-            -(_unit(slope[heights.index(at_last)]) * along).sum(axis=1),
-        )
-        inside = heights.label[heights.index(at_inside)]
-        arm = np.abs(((heights.centres[np.maximum(inside, -1), :2] - xy) * across).sum(axis=1))
-        score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
-        score *= (
-            reach
-            * (inside >= 0)
-            * (facing > settings.min_facing)
-            * np.clip(rise / settings.good_engagement, 0.2, 1)
-        )
-        parts.append(Candidates.rough(xy, angle, tip, (last - first + 1) * cell, score))
-    return Candidates.joined(parts)
+def _under_a_palm(
+    runs: _Runs, turned: _Turned, cell: float, gripper: GripperGeometry, settings: SearchSettings
+) -> _Runs:
+    """Those over which the palm has room, wherever the hand may stand."""
+    size = turned.under_palm.shape[2]
+    centre = np.rint((runs.first + runs.last) / 2).astype(int)
+    away = np.rint(np.divide(settings.offsets, cell)).astype(int)[:, None]
+    column = np.clip(centre + away, 0, size - 1)
+    under_hand = turned.under_palm.reshape(-1, size)[runs.row, column].min(axis=0)
+    return runs.take(under_hand < runs.tip - settings.clearance + gripper.palm_height)
+
+
+def _between_fingers(
+    runs: _Runs, turned: _Turned, cell: float, gripper: GripperGeometry, settings: SearchSettings
+) -> _Runs:
+    """Those beside which both fingers have room, wherever the hand may stand."""
+    size = turned.under_finger.shape[2]
+    under_finger = turned.under_finger.reshape(-1, size)
+    limit, width = runs.tip - settings.clearance, (runs.last - runs.first + 1) * cell
+    rooms = settings.rooms  # a sloping flank needs more room
+    if gripper.opens_fully:
+        rooms = ((gripper.max_opening - width) / 2,)
+    free = np.zeros(len(runs.row), bool)
+    for room, offset in itertools.product(rooms, settings.offsets):
+        # A hand off the centre that opens no further has less room on one side.
+        least = room - abs(offset) if gripper.opens_fully else room
+        beside = least + gripper.finger_thickness / 2  # from the contact to the finger's middle
+        # Beside a wall it may be outside.
+        left = np.rint(runs.first - (beside + max(-2 * offset, 0)) / cell).astype(int)
+        right = np.rint(runs.last + (beside + max(2 * offset, 0)) / cell).astype(int)
+        left, right = np.maximum(left, 0), np.minimum(right, size - 1)
+        fits = (under_finger[runs.row, left] < limit) & (under_finger[runs.row, right] < limit)
+        fits &= least > settings.rooms[0] - cell
+        free |= fits & (width + 2 * (least + abs(offset)) < gripper.max_opening + 2 * cell)
+    return runs.take(free)
+
+
+def _scored(
+    runs: _Runs,
+    turned: _Turned,
+    square: _Square,
+    slope: np.ndarray,
+    heights: HeightMap,
+    workspace: Workspace,
+    settings: SearchSettings,
+) -> Candidates:
+    """The runs as candidates, scored without contacts. slope: (R, C, 2) of `_slopes`."""
+    cell, half, (row, first, last, tip) = heights.cell, square.half, runs
+    rise = turned.heights.reshape(-1, square.size)[row, first] - tip
+    number, row = np.divmod(row, square.size)
+    angle = turned.angles[number]
+    along, across = closing_axes(angle)
+    base = heights.origin + cell * square.centre + cell * (row - half)[:, None] * across
+    at_first, at_inside, xy, at_last = (
+        base + cell * (column - half)[:, None] * along
+        for column in (first, first + 1.5, (first + last) / 2, last)
+    )
+    place = transform_points(heights.T_WV, np.column_stack([xy, tip]))[:, :2]
+    reach = np.abs(place - workspace.centre).max(axis=1) < workspace.size / 2 + settings.reach
+    # Outward normals are minus the gradient: cosines against the closing line on both sides.
+    facing = np.minimum(
+        (_unit(slope[heights.index(at_first)]) * along).sum(axis=1),
+        -(_unit(slope[heights.index(at_last)]) * along).sum(axis=1),
+    )
+    inside = heights.label[heights.index(at_inside)]
+    centre = heights.centres[np.maximum(inside, 0), :2]  # walls and table have none
+    arm = np.abs(((centre - xy) * across).sum(axis=1))
+    score = np.exp(-((arm / 0.03) ** 2)) * np.clip(facing, 0, 1) ** 2
+    score *= reach * (inside >= 0) * (facing > settings.min_facing)
+    score *= np.clip(rise / settings.good_engagement, 0.2, 1)
+    return Candidates.rough(xy, angle, tip, (last - first + 1) * cell, score)
+
+
+def _slopes(heights: HeightMap) -> np.ndarray:
+    """(R, C, 2) gradients of the blurred map, which point across an edge whatever its height."""
+    blurred = cv2.GaussianBlur(heights.height, (0, 0), EDGE_BLUR / heights.cell)
+    return np.stack(np.gradient(blurred)[::-1], axis=-1)
 
 
 def _unit(slope: np.ndarray) -> np.ndarray:
@@ -138,11 +209,10 @@ def _unit(slope: np.ndarray) -> np.ndarray:
     return slope / (np.linalg.norm(slope, axis=-1, keepdims=True) + 1e-9)
 
 
-def _levels(
-    heights: HeightMap, on_objects: np.ndarray, gripper: GripperGeometry, settings: SearchSettings
-) -> np.ndarray:
+def _levels(heights: HeightMap, gripper: GripperGeometry, settings: SearchSettings) -> np.ndarray:
     """(L,) heights of the fingertips to try: over the table, and no deeper below the lowest matter
-    than the palm lets them reach; may be empty. on_objects: (R, C) bool."""
+    than the palm lets them reach; may be empty."""
+    on_objects = heights.label >= 0
     if not on_objects.any() or len(heights.centres) == 0:
         return np.empty(0)
     lowest = float(heights.table()[on_objects].min()) + settings.table_clearance
@@ -152,11 +222,8 @@ def _levels(
     return np.arange(first, height.max() - settings.min_engagement, settings.level_step)
 
 
-def _runs(
-    turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float
-) -> tuple[np.ndarray, ...]:
-    """Runs of cells over a level along the rows of maps (A, R, C): level, row of all A x R, first
-    and last column, each (M,), sorted by map.
+def _runs(turned: np.ndarray, levels: np.ndarray, max_width: float, cell: float) -> _Runs:
+    """Runs of cells over a level along the rows of maps (A, R, C), sorted by map.
 
     A run may bridge a gap to the next one or two of its row (a ring, a mug). Every second row is
     enough: the pad spans several.
@@ -184,7 +251,7 @@ def _runs(
     level, row = np.divmod(line, max(len(picked), 1))
     row = picked[row]
     order = np.argsort(row // rows, kind="stable")
-    return level[order], row[order], first[order], last[order]
+    return _Runs(row, first, last, levels[level]).take(order)
 
 
 def _every_second(rows: np.ndarray) -> np.ndarray:

@@ -182,6 +182,23 @@ def test_a_hand_off_the_centre_looks_where_its_far_finger_goes(opens_fully, apar
     assert bool(plan(boxes_frame([*scene, *bin_walls()], walls=4))) == free
 
 
+@pytest.mark.parametrize(("apart", "free"), [(0.015, False), (0.030, True)])
+def test_a_hand_that_opens_fully_stands_off_the_centre_of_what_a_block_is_beside(
+    apart, free
+) -> None:
+    """A bar 30 mm wide between fingers 80 mm apart has 25 mm of room on each side. A block as high
+    on one side, 30 mm away, leaves a finger that is 14.5 mm thick room only off the centre, and one
+    15 mm away none."""
+    bar, block = (0.03, 0.12, 0.03), (0.10, 0.20, 0.03)
+    beside = bar[0] / 2 + apart + block[0] / 2
+    frame = boxes_frame([(bar, 0.0, (0.5, 0.0)), (block, 0.0, (0.5 + beside, 0.0))])
+    hand = GripperGeometry(opens_fully=True)
+    grasps = make_planner("heuristic", hand, Workspace(), 0)(frame)
+    assert bool(grasps) == free
+    for grasp in grasps:
+        assert 0.5 - grasp.position[0] > 0.009 and grasp.width == 0.08
+
+
 @pytest.mark.parametrize("degrees", [0, 35, 90])
 def test_a_flat_stick_is_held_below_its_top_and_above_the_table(degrees: int) -> None:
     """7 mm high: the usual margins leave no room for fingers, so relaxed ones serve."""

@@ -187,6 +187,16 @@ class GripperGeometry:
         return self.max_opening if self.opens_fully else width
 
     @property
+    def finger_thickness(self) -> float:
+        """Metres along, of a finger's tip."""
+        return self.finger_outline[1][0]
+
+    @property
+    def palm_half_width(self) -> float:
+        """Metres across, of the hand's lowest part."""
+        return self.palm_outline[1][0]
+
+    @property
     def palm_height(self) -> float:
         """Height of the hand's lowest point above the fingertips, metres."""
         return self.palm_outline[0][1]
