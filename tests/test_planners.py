@@ -183,9 +183,7 @@ def test_a_hand_off_the_centre_looks_where_its_far_finger_goes(opens_fully, apar
 
 
 @pytest.mark.parametrize(("apart", "free"), [(0.015, False), (0.030, True)])
-def test_a_hand_that_opens_fully_stands_off_the_centre_of_what_a_block_is_beside(
-    apart, free
-) -> None:
+def test_a_hand_that_opens_fully_stands_off_the_centre_beside_a_block(apart, free) -> None:
     """A bar 30 mm wide between fingers 80 mm apart has 25 mm of room on each side. A block as high
     on one side, 30 mm away, leaves a finger that is 14.5 mm thick room only off the centre, and one
     15 mm away none."""
