@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
+from utils.atomic_files import append_line
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError
 
@@ -27,7 +28,8 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
 
     journal: file to which every finished episode appends a line of JSON, None for none. A line
     holds `is_success` and the options that repeat the episode: `scene_seed`, `start` and
-    `randomization`.
+    `randomization`. Environments may share one (`utils.atomic_files.append_line`). A step raises
+    UserError where the line cannot be written, as on a full disk.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -69,5 +71,4 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
     def _append_to_journal(self, info: Mapping[str, Any]) -> None:
         line = {name: info[name] for name in ("is_success", "scene_seed")}
         line |= {"start": self.start, "randomization": self.randomizer.sample}
-        with self.journal.open("a", encoding="utf-8") as journal:
-            journal.write(json.dumps(line, allow_nan=False) + "\n")
+        append_line(self.journal, json.dumps(line, allow_nan=False) + "\n")

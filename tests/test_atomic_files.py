@@ -1,14 +1,25 @@
-"""Files that are written whole or not at all."""
+"""Files, and lines, that are written whole or not at all."""
 
+import errno
 import math
 import os
 import shlex
 import stat
+import time
+from concurrent.futures import ThreadPoolExecutor
+from io import FileIO
 from pathlib import Path
 
 import pytest
 
-from utils.atomic_files import check_writable, resumption, write_atomic, write_json_atomic
+from utils import atomic_files
+from utils.atomic_files import (
+    append_line,
+    check_writable,
+    resumption,
+    write_atomic,
+    write_json_atomic,
+)
 from utils.errors import UserError
 
 
@@ -79,6 +90,67 @@ def test_json_refuses_nan(tmp_path):
     with pytest.raises(ValueError):
         write_json_atomic(tmp_path / "x.json", {"a": math.inf})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_line_is_on_the_disk_and_takes_the_place_of_one_that_was_cut_short(tmp_path, monkeypatch):
+    path, on_disk = tmp_path / "lines", []
+    path.write_text("first\nsecond\ntor")
+    monkeypatch.setattr(os, "fsync", lambda number: on_disk.append(path.read_text()))
+    append_line(path, "third\n")
+    assert on_disk == ["first\nsecond\nthird\n"] == [path.read_text()]
+    path.write_text("torn alone")
+    append_line(path, "whole\n")
+    assert path.read_text() == "whole\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no /dev/full")
+def test_a_full_disk_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="/dev/full: cannot be written .No space left on device"):
+        append_line(Path("/dev/full"), "line\n")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError, match="folder: cannot be written"):
+        append_line(tmp_path / "folder", "line\n")
+
+
+def test_a_line_for_which_there_is_no_room_leaves_nothing(tmp_path, monkeypatch):
+    class Small(FileIO):
+        def write(self, data):
+            return super().write(data[:3])
+
+    path = tmp_path / "lines"
+    append_line(path, "before\n")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", lambda path, mode, buffering: Small(path, "a+"))
+        with pytest.raises(UserError, match=os.strerror(errno.ENOSPC)):
+            append_line(path, "afterwards\n")
+    assert path.read_text() == "before\n"
+
+
+def test_many_add_whole_lines_to_one_file(tmp_path, monkeypatch):
+    """Each write comes in two parts, as a busy disk may take it."""
+
+    class Slow(FileIO):
+        def write(self, data):
+            first = super().write(data[:50])
+            time.sleep(0.002)
+            return first + super().write(data[50:])
+
+    path = tmp_path / "lines"
+    lines = [f"{number}" * 100 + "\n" for number in range(40)]
+    with monkeypatch.context() as patched, ThreadPoolExecutor(4) as threads:
+        patched.setattr(Path, "open", lambda path, mode, buffering: Slow(path, "a+"))
+        list(threads.map(append_line, [path] * 40, lines))
+    assert sorted(path.read_text().splitlines(keepends=True)) == sorted(lines)
+
+
+def test_a_file_system_without_locks_keeps_what_may_be_anothers_line(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(atomic_files.fcntl, "flock", no_locks)
+    (tmp_path / "lines").write_text("half")
+    append_line(tmp_path / "lines", "whole\n")
+    assert (tmp_path / "lines").read_text() == "halfwhole\n"
 
 
 def test_a_run_goes_on_with_the_files_of_its_options():

@@ -3,7 +3,9 @@
 import colorsys
 import importlib.util
 import json
+import os
 from functools import cache
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -21,7 +23,7 @@ from tests.helpers.simulators import INSTALLED, is_pybullet, needs_pybullet, pyb
 from utils.config import load_config
 from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
-from utils.errors import UserError
+from utils.errors import UserError, one_line
 from utils.result_records import append_round, read_rounds
 
 PHYSICS, VISION = PhysicsRangesConfig.model_fields, VisionRangesConfig.model_fields
@@ -630,17 +632,19 @@ def test_an_episode_that_began_near_is_replayed_too(tmp_path):
     assert again == first
 
 
+ONE_STEP = [
+    "rl.env_id=RandomizedGrasping-v0", "env.observations=state", "env.max_steps=1",
+    "env.substeps=1", "sim.renderer=tiny",
+]  # fmt: skip
+
+
 def one_step(env, index):
     env.reset(seed=index)
     yield env.step(np.zeros(env.action_space.shape, np.float32))
 
 
 def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
-    config = load_config(
-        None,
-        ["rl.env_id=RandomizedGrasping-v0", "rl.parallel=false", "env.observations=state",
-         "env.max_steps=1", "env.substeps=1", "sim.renderer=tiny"],
-    )  # fmt: skip
+    config = load_config(None, [*ONE_STEP, "rl.parallel=false"])
     with training_envs(config, 2) as several:
         several.record_episodes(tmp_path / "episodes", first=2)
         several.each(one_step)
@@ -650,6 +654,31 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
     assert [file.name for file in files] == ["env2.jsonl", "env3.jsonl"]
     one, two = (json.loads(file.read_text()) for file in files)
     assert one["randomization"]["seed"] != two["randomization"]["seed"]
+
+
+@pytest.mark.parametrize("parallel", ["false", "true"])
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no /dev/full")
+def test_a_full_disk_ends_an_episode_with_one_sentence(tmp_path, parallel):
+    config = load_config(None, [*ONE_STEP, f"rl.parallel={parallel}"])
+    with (
+        pytest.raises(UserError) as refused,
+        training_envs(config, 2) as several,
+    ):
+        several.record_episodes(tmp_path)
+        several._set("journal", [tmp_path / "env0.jsonl", Path("/dev/full")])
+        several.each(one_step)
+    reason = "cannot be written (No space left on device); make room"
+    assert one_line(refused.value).startswith(f"environment 1: /dev/full: {reason}")
+    assert "Traceback" not in str(refused.value)
+
+
+def test_an_episode_follows_the_last_whole_line_of_its_journal(env, tmp_path, monkeypatch):
+    path = tmp_path / "env0.jsonl"
+    path.write_text('{"is_success": true}\n{"is_succ')
+    monkeypatch.setattr(env.unwrapped, "journal", path)
+    episode(env, seed=4)
+    first, second = (json.loads(line) for line in path.read_text().splitlines())
+    assert first == {"is_success": True} and "scene_seed" in second
 
 
 def test_env_keeps_gymnasiums_rules(env):

@@ -1,5 +1,5 @@
-"""Files that are written whole or not at all, whatever ends the program or fills the disk, and by
-one process at a time."""
+"""Files, and lines of journals, that are written whole or not at all, whatever ends the program or
+fills the disk, and by one process at a time."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import stat
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO
 
@@ -60,6 +61,59 @@ def write_atomic(path: Path, content: str | bytes) -> None:
             raise
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line, which its newline ends, to a file of lines: whole and on the disk, or not at all.
+
+    Several processes and threads may add to the same file, one after the other. A last line that a
+    killed process left without its end is removed first; where the file system knows no locks it
+    stays, because a line that another process is adding would look the same. Raises UserError where
+    nothing can be written, as on a full disk.
+    """
+    data = line.encode()
+    try:
+        with path.open("a+b", buffering=0) as file, _alone(file) as alone:
+            if alone:
+                _cut_torn_line(file)
+            end = file.seek(0, os.SEEK_END)
+            written = file.write(data)
+            if written < len(data):  # the disk is full: the next write would say so
+                if os.fstat(file.fileno()).st_size == end + written:  # nobody has written since
+                    file.truncate(end)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def _alone(file: FileIO) -> Iterator[bool]:
+    """Wait until nobody else is in this context with the same file; gives False where the system
+    knows no such locks. The lock is that of the open file, which threads do not share."""
+    if sys.platform == "win32":  # its locks would keep readers out
+        yield False
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+    except OSError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _cut_torn_line(file: FileIO) -> None:
+    """Remove what stands after the last newline of a file of lines."""
+    size = os.fstat(file.fileno()).st_size  # 0 of a device
+    if size == 0:
+        return
+    file.seek(size - 1)
+    if file.read(1) != b"\n":
+        file.seek(0)
+        file.truncate(file.readall().rfind(b"\n") + 1)
 
 
 def _no_file(path: Path) -> bool:

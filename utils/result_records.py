@@ -7,10 +7,8 @@ packages, so that anyone can play the same rounds again (`python evaluate.py --r
 
 from __future__ import annotations
 
-import errno
 import json
 import math
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -18,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from utils.atomic_files import cannot_write, locked, write_atomic
+from utils.atomic_files import append_line, locked, write_atomic
 from utils.config import changed_keys, load_config, values_of
 from utils.errors import UserError
 from utils.transforms import ImageGrasp
@@ -195,17 +193,7 @@ def writing(path: Path) -> AbstractContextManager[None]:
 def append_round(path: Path, record: RoundRecord) -> None:
     """Add a finished round to the journal, on the disk, or nothing. Raises UserError where that
     cannot be done, as on a full disk."""
-    line = _line(record).encode()
-    try:
-        with path.open("ab", buffering=0) as journal:
-            end = journal.tell()
-            written = journal.write(line)
-            if written < len(line):  # the disk is full: the next write would say so
-                journal.truncate(end)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            os.fsync(journal.fileno())
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    append_line(path, _line(record))
 
 
 def _line(record: RoundRecord) -> str:
