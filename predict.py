@@ -59,7 +59,7 @@ from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached, least_width
 from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
-from utils.atomic_files import write_atomic
+from utils.atomic_files import check_writable, write_atomic
 from utils.calibration import unlikely_ones
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
@@ -79,6 +79,7 @@ PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the
 def main(argv: Sequence[str] | None = None) -> int:
     options = parse_options(argv)
     if options.export is not None:
+        check_writable("--export", options.export)
         export_onnx(load_graspnet(options.checkpoint or SHIPPED), options.export)
         print(f"wrote {options.export}", file=sys.stderr)
         return 0

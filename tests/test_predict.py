@@ -660,6 +660,13 @@ def test_a_bad_input_ends_with_status_2():
 # --- Export ---------------------------------------------------------------------------------
 
 
+def test_an_export_that_cannot_be_written_is_refused_before_the_network_is_read(tmp_path):
+    path = tmp_path / "none" / "dir" / "x.onnx"
+    with pytest.raises(UserError, match=f"--export {path}: not a file in an existing folder"):
+        predict.main(["--checkpoint", str(tmp_path / "missing.pt"), "--export", str(path)])
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_export_replaces_its_own_file_and_no_other(tmp_path, capsys):
     save_graspnet(tmp_path / "net.pt", GraspNet(backbone="ggcnn"), PIXEL)
