@@ -7,9 +7,6 @@ every round.
 
 from __future__ import annotations
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
-
 from envs.cell import camera_intrinsics, require_arm
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
 from envs.execution import GraspOutcome, check_tray
@@ -163,11 +160,10 @@ def work(config: Config, task: Task) -> TaskResult:
             )
         )  # fmt: skip
         if film is not None:
-            name = film_name(task, policy, noise, config.evaluate.film_format)
-            with TemporaryDirectory() as folder:  # the run's folder may be on another machine
-                film.write(Path(folder) / name)
-                content = (Path(folder) / name).read_bytes()
-            result.films.append(FilmFile(name, content, caption))
+            ending = config.evaluate.film_format
+            name = film_name(task, policy, noise, ending)
+            # Not written here: the run's folder may be on another machine.
+            result.films.append(FilmFile(name, film.encoded(ending), caption))
     return result
 
 

@@ -11,13 +11,13 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 
 from envs.grasping_env import RobotGraspingEnv
 from envs.robot_kinematics import forward_kinematics
 from envs.studio import write_film
 from utils.config import with_settings
+from utils.image_overlay import write_picture
 from utils.runs import new_run_folder, parse_args
 
 # Of the way down that is left, in one action: the arm still moves by what it was told before. With
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if not options.gui:
         folder = new_run_folder("grasping_env", None, config)
-        imageio.imwrite(folder / "picture.png", pictures[-1])
+        write_picture(folder / "picture.png", pictures[-1])
         write_film(folder / "film.mp4", pictures, env.metadata["render_fps"])
         print(f"picture and film: {folder / 'picture.png'}, {folder / 'film.mp4'}")
     env.close()

@@ -13,6 +13,7 @@ predict.py. `film_episode` films any Gymnasium environment that renders "rgb_arr
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shlex
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.simulators import make_cell
-from utils.atomic_files import check_writable
+from utils.atomic_files import check_writable, new_folder, write_atomic
 from utils.errors import UserError
 from utils.image_overlay import write_picture
 from utils.runs import parse_args, run_script, this_python
@@ -36,6 +37,7 @@ from utils.transforms import RGBDFrame, look_at
 SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
 FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
+SCENE = "scene.png"  # the picture of a scene, where no name is given
 PICTURES = (".png", ".jpg", ".jpeg")
 _HOLD = 6  # pictures for which the last one of an episode stays
 
@@ -70,7 +72,7 @@ class Studio:
 
 
 class Film:
-    """Films a cell from now on until it is stopped or written.
+    """Films a cell from now on until it is stopped.
 
     rate: pictures a second of simulated time. size: width and height, pixels.
     """
@@ -93,9 +95,10 @@ class Film:
         self._studio.close()
         return self._pictures
 
-    def write(self, path: Path, speed: float = 2.0) -> None:
-        """Stop filming and write an MP4 or GIF that runs at `speed` times real time."""
-        _write(path, self.stop(), speed * self._rate)
+    def encoded(self, ending: str, speed: float = 2.0) -> bytes:
+        """Stop filming; returns a file that runs at `speed` times real time. ending: its name's,
+        "mp4" or "gif"."""
+        return _encoded(ending, self.stop(), speed * self._rate)
 
 
 def film_episode(
@@ -115,29 +118,37 @@ def film_episode(
 
 
 def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
-    """Write an MP4 or GIF of `rate` pictures a second; the last one stays for a while."""
-    _write(path, [*pictures, *[pictures[-1]] * _HOLD], rate)
+    """Write an MP4 or GIF of `rate` pictures a second, whole or not at all; the last one stays for
+    a while."""
+    write_atomic(path, _encoded(path.suffix[1:], [*pictures, *[pictures[-1]] * _HOLD], rate))
 
 
-def _write(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        imageio.mimwrite(path, pictures, duration=1000 / rate, loop=0)
-    else:
-        imageio.mimwrite(path, pictures, fps=rate, quality=6)
+def _encoded(ending: str, pictures: Sequence[np.ndarray], rate: float) -> bytes:
+    """A film as the bytes of a file whose name ends so."""
+    if ending == "gif":
+        return imageio.mimwrite("<bytes>", pictures, format="gif", duration=1000 / rate, loop=0)
+    return imageio.mimwrite("<bytes>", pictures, format=ending, fps=rate, quality=6)
 
 
-def write_rgbd(frame: RGBDFrame, folder: Path) -> list[str]:
+def write_rgbd(frame: RGBDFrame, folder: Path, scene: np.ndarray | None = None) -> list[str]:
     """Write color.png, depth.png in millimetres, intrinsics.json in pixels and T_WC.txt of a frame
-    into a new folder; returns the arguments with which predict.py reads them."""
-    folder.mkdir(parents=True)
-    imageio.imwrite(folder / "color.png", frame.rgb)
-    imageio.imwrite(folder / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
+    into a new folder, all or nothing; returns the arguments with which predict.py reads them.
+
+    scene: (H, W, 3) uint8, also written there as scene.png; None for none. Raises UserError where
+    the folder exists or cannot be written.
+    """
     height, width = frame.depth.shape
     (fx, _, cx), (_, fy, cy) = frame.K[:2].tolist()
     numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
-    (folder / "intrinsics.json").write_text(json.dumps(numbers) + "\n", encoding="utf-8")
-    np.savetxt(folder / "T_WC.txt", frame.T_WC)
+    pose = io.StringIO()
+    np.savetxt(pose, frame.T_WC)
+    with new_folder(folder) as new:
+        write_picture(new / "color.png", frame.rgb)
+        write_picture(new / "depth.png", np.rint(1000 * frame.depth).astype(np.uint16))
+        write_atomic(new / "intrinsics.json", json.dumps(numbers) + "\n")
+        write_atomic(new / "T_WC.txt", pose.getvalue())
+        if scene is not None:
+            write_picture(new / SCENE, scene)
     files = {
         "--rgb": "color.png", "--depth": "depth.png", "--intrinsics": "intrinsics.json",
         "--camera-pose": "T_WC.txt", "--out": "grasps",
@@ -172,8 +183,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.add_argument("--rgbd", type=Path, metavar="FOLDER", help="an RGB-D image, too")
 
     config, chosen = parse_args(argv, "Picture a scene; `seed` chooses it.", options, resumes=False)
-    output = chosen.output or (chosen.rgbd or Path()) / "scene.png"
-    check_files(output if chosen.rgbd is None else chosen.output, chosen.rgbd)
+    with_image = chosen.rgbd is not None and chosen.output is None
+    output = chosen.output or (chosen.rgbd or Path()) / SCENE
+    check_files(None if with_image else output, chosen.rgbd)
     objects = load_object_set(
         chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
     )
@@ -183,10 +195,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         with Studio(cell) as studio:
             picture = studio.picture()
         if chosen.rgbd is not None:
-            arguments = write_rgbd(cell.frame(), chosen.rgbd)
+            arguments = write_rgbd(cell.frame(), chosen.rgbd, picture if with_image else None)
             command = f"{this_python()} {shlex.join(['predict.py', *arguments])}"
-    verb = "replaced" if output.exists() else "wrote"
-    write_picture(output, picture)
+    verb = "replaced" if output.exists() and not with_image else "wrote"
+    if not with_image:
+        write_picture(output, picture)
     print(f"{verb} {output}")
     if chosen.rgbd is not None:
         print(f"wrote {chosen.rgbd}: color.png, depth.png, intrinsics.json, T_WC.txt")

@@ -16,6 +16,7 @@ from utils import atomic_files
 from utils.atomic_files import (
     append_line,
     check_writable,
+    new_folder,
     resumption,
     write_atomic,
     write_json_atomic,
@@ -84,6 +85,24 @@ def test_a_file_that_could_not_be_written_at_the_end_is_refused_at_once(tmp_path
         check_writable("--csv", Path("/proc/x.csv"))
     with pytest.raises(UserError, match="none/x.csv: not a file in an existing folder"):
         check_writable("--csv", tmp_path / "none" / "x.csv")
+
+
+def test_a_folder_is_there_when_it_is_whole(tmp_path):
+    folder = tmp_path / "in" / "new"
+    with pytest.raises(KeyboardInterrupt), new_folder(folder) as filled:
+        write_atomic(filled / "half", "1")
+        raise KeyboardInterrupt
+    assert list(folder.parent.iterdir()) == []
+    with new_folder(folder) as filled:
+        write_atomic(filled / "one", "1")
+        assert not folder.exists() and filled.parent == folder.parent
+        write_atomic(filled / "two", "2")
+    assert list(folder.parent.iterdir()) == [folder]
+    assert sorted(file.name for file in folder.iterdir()) == ["one", "two"]
+    with pytest.raises(UserError, match="new: this name is taken"), new_folder(folder):
+        pass
+    with pytest.raises(UserError, match="cannot be written"), new_folder(Path("/proc/new")):
+        pass
 
 
 def test_json_refuses_nan(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.servo_cases import CORNERS, LAW_NAMES, LAWS
+from utils.errors import UserError
 from utils.servo_history import plot_histories
 from utils.servo_loop import ServoView
 from utils.servo_reference import CAMERA, GOAL, SQUARE, START
@@ -87,3 +88,25 @@ def test_runs_are_compared_in_one_picture(tmp_path):
     assert last[1] / last[0] == pytest.approx((0.92 / 0.96) ** 50)
     names = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
     assert [name.split(":")[0] for name in names] == ["gain 1.0", "gain 2.0"]
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_one_before(tmp_path):
+    history = LAWS[0].simulate(SQUARE, START, GOAL, max_iterations=5)
+    path = tmp_path / "servo.png"
+    history.plot(path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):  # mathtext that has no end fails within the drawing
+        history.plot(path, title="$\\frac{$")
+    assert path.read_bytes() == before
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(UserError, match="servo.png: exists and is no file"):
+        history.plot(path)
+
+
+def test_a_picture_has_the_format_of_its_name_and_else_is_a_png(tmp_path):
+    history = LAWS[0].simulate(SQUARE, START, GOAL, max_iterations=5)
+    history.plot(tmp_path / "servo.svg")
+    history.plot(tmp_path / "servo")
+    assert "<svg" in (tmp_path / "servo.svg").read_text()
+    assert (tmp_path / "servo.png").read_bytes().startswith(b"\x89PNG")

@@ -1,5 +1,5 @@
-"""Files, and lines of journals, that are written whole or not at all, whatever ends the program or
-fills the disk, and by one process at a time."""
+"""Files, folders, and lines of journals that are written whole or not at all, whatever ends the
+program or fills the disk, and by one process at a time."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import os
 import secrets
 import shlex
+import shutil
 import stat
 import sys
 from collections.abc import Iterator, Mapping
@@ -58,6 +59,27 @@ def write_atomic(path: Path, content: str | bytes) -> None:
             os.replace(file.name, target)
         except BaseException:
             os.unlink(file.name)
+            raise
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A temporary neighbour, to be filled within this context, that becomes the new folder `path`
+    at its end; after an error nothing is left. What is written into it has to be on the disk, as
+    after `write_atomic`. Raises UserError where the name is taken or nothing can be written."""
+    if path.exists():
+        raise UserError(f"{path}: this name is taken; give a folder that does not exist")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = _neighbour_name(path)
+        folder.mkdir()
+        try:
+            yield folder
+            os.rename(folder, path)
+        except BaseException:
+            shutil.rmtree(folder)
             raise
     except OSError as error:
         raise cannot_write(path, error) from error
@@ -124,7 +146,11 @@ def _no_file(path: Path) -> bool:
 def _neighbour(path: Path) -> BinaryIO:
     """A new file beside another one. Unlike those of `tempfile`, it has the permissions that the
     system gives to new files."""
-    return (path.parent / f".{path.name}.{secrets.token_hex(4)}").open("xb")
+    return _neighbour_name(path).open("xb")
+
+
+def _neighbour_name(path: Path) -> Path:
+    return path.parent / f".{path.name}.{secrets.token_hex(4)}"
 
 
 def check_writable(option: str, path: Path | None) -> None:

@@ -5,6 +5,7 @@ This module knows no control law: a history holds what each step recorded.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from utils.atomic_files import write_atomic
 from utils.transforms import rotation_log
 
 if TYPE_CHECKING:
@@ -189,6 +191,8 @@ _COMPARED = (
 
 def _saved(figure: Figure, path: Path | str | None) -> Figure:
     if path is not None:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=90)
+        path, picture = Path(path), io.BytesIO()
+        path = path if path.suffix else path.with_name(f"{path.name}.png")
+        figure.savefig(picture, format=path.suffix[1:], dpi=90)
+        write_atomic(path, picture.getvalue())
     return figure
