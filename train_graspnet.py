@@ -37,7 +37,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.cell import camera_intrinsics
@@ -51,6 +50,7 @@ from models.graspnet_scores import (
     closing_words,
     draw_curves,
     draw_predictions,
+    open_curves,
     row_in_words,
     write_curves,
 )
@@ -160,11 +160,11 @@ def train(
     is_main = processes.is_main
     if is_main:
         print(trainer.announcement(config, len(data.train), run), flush=True)
-    writer = SummaryWriter(run / "tensorboard", purge_step=trainer.step + 1) if is_main else None
+    curves = open_curves(run / "tensorboard", trainer.step, is_main)
     quiet = not is_main or trainer.was_finished
     bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=quiet)
     last_save = time.monotonic()
-    with stop_on_interrupt() as interrupted, bar:
+    with stop_on_interrupt() as interrupted, bar, curves as writer:
         for epoch in range(len(history), config.train.epochs):
             skip = trainer.step - epoch * steps
             for batch in epoch_loader(config, data, processes, epoch, skip):

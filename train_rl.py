@@ -32,6 +32,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from tqdm import tqdm
@@ -228,13 +229,12 @@ def film(config: Config, run: Path, ppo: GraspPPO) -> None:
     """Film the first `rl.films` episodes of the evaluations, played by the policy as it is now."""
     if not config.rl.films:
         return
-    env = make_env(config, render_mode="rgb_array")
     seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
-    for number, seed in enumerate(seeds[: config.rl.films]):
-        path = run / "films" / f"{number}.mp4"
-        reason = film_episode(env, ppo.action, seed, path, full_difficulty(config.rl.env_id))
-        print(f"{path}: {reason}")
-    env.close()
+    with closing(make_env(config, render_mode="rgb_array")) as env:
+        for number, seed in enumerate(seeds[: config.rl.films]):
+            path = run / "films" / f"{number}.mp4"
+            reason = film_episode(env, ppo.action, seed, path, full_difficulty(config.rl.env_id))
+            print(f"{path}: {reason}")
 
 
 if __name__ == "__main__":

@@ -161,9 +161,9 @@ def work(config: Config, task: Task) -> TaskResult:
         )  # fmt: skip
         if film is not None:
             ending = config.evaluate.film_format
-            name = film_name(task, policy, noise, ending)
+            file = film_name(task, policy, noise, ending)
             # Not written here: the run's folder may be on another machine.
-            result.films.append(FilmFile(name, film.encoded(ending), caption))
+            result.films.append(FilmFile(file, film.encoded(ending), caption))
     return result
 
 

@@ -6,7 +6,8 @@ images that it was not trained on. No planner's search takes part.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -192,6 +193,19 @@ def curve_tag(name: str) -> str:
     """Return the TensorBoard tag of an entry of a history row: "validation/width_error_m"."""
     origin, unit = CURVES[name]
     return f"{origin}/{name}_{unit}" if unit else f"{origin}/{name}"
+
+
+@contextmanager
+def open_curves(folder: Path, first_step: int, is_main: bool) -> Iterator[SummaryWriter | None]:
+    """TensorBoard curves of a training, closed at the end; None but for the main process. What lies
+    beyond `first_step`, of a training that is resumed before it, is dropped."""
+    if not is_main:
+        yield None
+        return
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and few callers need it
+
+    with SummaryWriter(folder, purge_step=first_step + 1) as writer:
+        yield writer
 
 
 def write_curves(writer: SummaryWriter, row: Mapping[str, float]) -> None:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from torch.utils.tensorboard import SummaryWriter
 
 import train_graspnet
+from utils.config import load_config
+from utils.distributed import ALONE
 from utils.errors import UserError
 
 
@@ -41,3 +45,28 @@ def test_the_check_of_the_network_says_nothing_of_its_widths(tmp_path, monkeypat
     with pytest.raises(AssertionError, match="no data"):
         train_graspnet.main(["train.device=cpu", f"train.initial={shipped}"])
     assert "widths" not in capsys.readouterr().out
+
+
+def test_the_curves_are_closed_where_a_training_fails(tmp_path, monkeypatch):
+    """Until then the newest of them are in memory alone."""
+
+    class Broken:
+        team, step, total_steps, was_finished, save = ALONE, 0, 1, False, print
+
+        def resume(self, path):
+            return [], []
+
+        def announcement(self, *_):
+            return "training"
+
+        def train_step(self, batch):
+            raise UserError("no number")
+
+    closed, close = [], SummaryWriter.close
+    monkeypatch.setattr(SummaryWriter, "close", lambda writer: (closed.append(True), close(writer)))
+    monkeypatch.setattr(train_graspnet, "epoch_loader", lambda *_: [None])
+    config = load_config(None, ["train.batch_size=1"])
+    data = SimpleNamespace(train=[None], metres_per_pixel=0.001)
+    with pytest.raises(UserError, match="no number"):
+        train_graspnet.train(config, tmp_path, data, Broken())
+    assert closed == [True]

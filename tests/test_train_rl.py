@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -576,3 +577,18 @@ def test_episodes_are_filmed(tmp_path):
     env.close()
     pictures = iio.imread(path)
     assert pictures.shape == (1 + 3 + 6, 480, 640, 3) and pictures.std() > 20
+
+
+def test_the_environment_of_films_is_closed_where_one_fails(tmp_path, monkeypatch):
+    closed = []
+
+    def broken(*_):
+        raise UserError("no room for a film")
+
+    monkeypatch.setattr(train_rl, "film_episode", broken)
+    monkeypatch.setattr(
+        train_rl, "make_env", lambda *_, **__: SimpleNamespace(close=lambda: closed.append(True))
+    )
+    with pytest.raises(UserError, match="no room for a film"):
+        train_rl.film(load_config(None, ["rl.films=1"]), tmp_path, SimpleNamespace(action=None))
+    assert closed == [True]
