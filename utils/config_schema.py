@@ -26,6 +26,7 @@ from utils.config_types import (
     Names,
     Pixels,
     Positive,
+    PositiveWait,
     RandomizationConfig,
     RunName,
     Section,
@@ -38,6 +39,7 @@ from utils.config_types import (
     TrainingSets,
     Vector2,
     Vector3,
+    Wait,
     changed,
     no_repeats,
 )
@@ -148,14 +150,14 @@ class ObjectsConfig(Section):
 class SceneConfig(Section):
     simulator: SimulatorName
     count: Annotated[int, Field(ge=1, le=50)]
-    settle_seconds: Positive
+    settle_seconds: PositiveWait
 
 
 class ExecutionConfig(Section):
     pregrasp_height: Annotated[float, Field(gt=0, le=0.3)]
     approach_speed: Annotated[float, Field(gt=0, le=1.7)]
     lift_height: Annotated[float, Field(gt=0, le=0.3)]
-    hold_seconds: Annotated[float, Field(ge=0)]
+    hold_seconds: Wait
     contact_stop: Positive
     strict: bool
     on_contact: Literal["fail", "grip"]
@@ -195,10 +197,10 @@ class ClosedLoopConfig(Section):
     aligned_distance: Positive
     aligned_angle: Positive
     floor: Annotated[float, Field(ge=0)]
-    compute_seconds: Annotated[float, Field(ge=0)]
-    lost_seconds: Positive
-    final_seconds: Positive
-    seconds: Positive
+    compute_seconds: Wait
+    lost_seconds: PositiveWait
+    final_seconds: PositiveWait
+    seconds: PositiveWait
     camera_shift: Annotated[float, Field(ge=0)]
     camera_turn_deg: Annotated[float, Field(ge=0, le=45)]
 
@@ -328,7 +330,7 @@ class EnvConfig(Section):
     max_steps: Count
     substeps: Annotated[int, Field(ge=1, le=1000)]
     lift_height: Annotated[float, Field(gt=0, le=0.4)]
-    hold_seconds: Annotated[float, Field(ge=0)]
+    hold_seconds: Wait
     position_step: Positive
     rotation_step: Positive
     joint_step: Positive

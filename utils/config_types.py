@@ -43,6 +43,10 @@ TermScales = Annotated[dict[str, float], Field(min_length=1), AfterValidator(Arg
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 Timeout = Annotated[float, Field(gt=0, le=604_800)]  # s, a week: systems have limits
+# s of simulated time for which something is waited, so that a typing error hangs no worker.
+MOST_SECONDS = 60
+Wait = Annotated[float, Field(ge=0, le=MOST_SECONDS)]
+PositiveWait = Annotated[float, Field(gt=0, le=MOST_SECONDS)]
 Share = Annotated[float, Field(gt=0, le=1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Pixels = Annotated[int, Field(ge=16, le=4096)]
