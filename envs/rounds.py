@@ -29,7 +29,7 @@ from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp
 from envs.floating_execution import execute_floating
 from envs.next_grasp import Failures, choose, least_quality
 from envs.objects import fits
-from envs.scenarios import SCENARIOS, CameraCalibration, disturbed, teach
+from envs.scenarios import SCENARIOS, CameraCalibration, Scenario, disturbed, teach
 from envs.second_look import CM3, SecondLook
 from models.planner_target import TargetPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner
@@ -58,6 +58,9 @@ class GraspFinder(Protocol):
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult: ...
 
 
+OnAttempt = Callable[[RGBDFrame, Grasp, GraspOutcome], None]
+
+
 class PlannerError(Exception):
     """A planner raised an exception or returned something else than grasps."""
 
@@ -76,7 +79,7 @@ def run_round(
     max_failures: int,
     scenario: str | None = None,
     controller: str = OPEN_LOOP,
-    on_attempt: Callable[[RGBDFrame, Grasp, GraspOutcome], None] | None = None,
+    on_attempt: OnAttempt | None = None,
     approach_by: GraspFinder | None = None,
     abstain: float | None = 0.0,
     second_look: float = 0.0,
@@ -95,121 +98,188 @@ def run_round(
         attempt; 0: it takes none. Planners that see the truth need none, nor do learned policies.
     """
     scenario = scenario or scene.layout
-    conditions = SCENARIOS[scenario]
-    privileged, chances = needs_truth(plan), calibration_of(plan)
-    if chances is not None and not cell.has_arm:
-        chances = replace(chances, doubt=0.0)  # an arm's
-    least = least_quality(plan, abstain, cell.has_arm)
-    taught = None if controller == OPEN_LOOP else teach(cell, scene)
-    cell.load(scene)
-    calibration = conditions.calibration(cell)
-    too_large = {
-        index
-        for index, placed in enumerate(scene.placements)
-        if not fits(placed.model, cell.gripper)
-    }
-    sees_all = privileged or approach_by is not None
-    look_again = SecondLook(
-        cell,
-        0.0 if sees_all else second_look * CM3,
-        partial(calibrated, cell, calibration, "wrist"),
-    )
-    wanted = scene.target
-    if wanted is not None:
-        plan = TargetPlanner(plan)
-    attempts: list[AttemptRecord] = []
-    failures = Failures()
-    plan_seconds, began, ended = 0.0, cell.seconds, "cleared"
-    table_height = Workspace().table_height
-
-    def see() -> RGBDFrame:
-        mount = cell.config.camera.mount
-        return calibrated(cell, calibration, mount, cell.frame(privileged))
-
-    try:
-        with planner_errors(policy):
-            reset_planner(plan, scene.seed)
-        while cell.remaining and len(failures.in_a_row) < max_failures:
-            plan_seconds, began = 0.0, cell.seconds
-            frame = look_again(see)
-            if wanted is not None:
-                assert frame.segmentation is not None  # a cell's frames have it
-                frame = replace(frame, target=frame.segmentation == wanted)
-            start = time.perf_counter()
-            try:
-                with planner_errors(policy):
-                    grasps = checked_grasps(
-                        plan(frame if privileged else frame.without_truth()),
-                        planar=controller != OPEN_LOOP,
-                    )
-            finally:
-                plan_seconds = time.perf_counter() - start + look_again.plan_seconds
-            grasp, why = choose(cell, grasps, failures, least, chances)
-            if grasp is None:
-                detail, spent = _details(look_again.remark, why), look_again.sim_seconds
-                attempts.append(AttemptRecord(False, NO_PLAN, plan_seconds, spent, detail=detail))
-                ended = NO_PLAN
-                break
-            approach = approach_by or open_loop
-            if controller != OPEN_LOOP:
-                seen = frame.without_truth()
-                # The time to process an image counts as if the image had come later.
-                late = conditions.latency + cell.config.closed_loop.compute_seconds
-                approach = ClosedLoop(cell, controller, seen, calibration, taught, late)
-            aim = nearest_object(cell, grasp) if too_large else None
-            with disturbed(cell, conditions.motion(cell, len(attempts))):
-                outcome = (
-                    execute_grasp(cell, grasp, approach, firmly=failures.slipped)
-                    if cell.has_arm
-                    else execute_floating(cell, grasp)
-                )
-            if approach_by is not None and approach_by.closed_at is not None:
-                grasp = approach_by.closed_at
-            held = outcome.object_index
-            record = AttemptRecord(
-                outcome.success,
-                outcome.reason,
-                plan_seconds,
-                outcome.sim_seconds + look_again.sim_seconds,
-                grasp_to_image(grasp, frame.K, frame.T_WC),
-                detail=_details(look_again.remark, outcome.detail),
-                held=None if held is None else scene.placements[held].model.name,
-                graspable=(aim if held is None else held) not in too_large,
-                tilt=grasp.tilt,
-                roughness=0.0 if privileged else table_roughness(frame, table_height),
-                **_in_hand(outcome),
-                **_turn_ms(approach),
-            )
-            attempts.append(record)
-            failures.note(grasp, outcome)
-            if on_attempt is not None:
-                on_attempt(frame, grasp, outcome)
-            if wanted is not None:
-                if wanted not in cell.remaining:
-                    ended = "target" if outcome.success and held == wanted else FELL_OFF
-                    break
-                if len(attempts) == len(scene.placements):
-                    ended = "picks"
-                    break
-    except PlannerError as error:
-        detail, spent = _details(look_again.remark, str(error)), look_again.sim_seconds
-        attempts.append(AttemptRecord(False, PLANNER_ERROR, plan_seconds, spent, detail=detail))
-        ended = PLANNER_ERROR
-    except PhysicsError:
-        attempts.append(AttemptRecord(False, "physics", plan_seconds, cell.seconds - began))
-        ended = "physics"
-    if ended == "cleared" and cell.remaining:
-        ended = "failures"
-    cleared = sum(attempt.success for attempt in attempts)
-    if ended == "cleared" and cleared < len(scene.placements):
-        ended = FELL_OFF
-    return RoundRecord(
-        policy_name(policy, controller), scenario, objects, scene.seed, len(scene.placements),
-        cleared, tuple(attempts), ended, controller, cell.sample, len(too_large),
-        cell.config.camera.depth_noise,
-        None if chances is None else astuple(chances),
-        None if wanted is None else ended == "target",
+    work = _Round(
+        cell, scene, plan, policy, SCENARIOS[scenario], controller, approach_by, abstain,
+        second_look,
     )  # fmt: skip
+    ended = work.play(max_failures, on_attempt)
+    return work.record(scenario, objects, ended)
+
+
+class _Round:
+    """A round under way, whose scene is loaded as it is made; its arguments are those of
+    `run_round`.
+
+    attempts: those that are over. plan_seconds: wall-clock time of the planning for the attempt
+    under way. began: simulated time of its beginning, s.
+    """
+
+    def __init__(
+        self, cell: Cell, scene: Scene, plan: Planner, policy: str, conditions: Scenario,
+        controller: str, approach_by: GraspFinder | None, abstain: float | None, second_look: float,
+    ):  # fmt: skip
+        self.cell, self.scene, self.policy = cell, scene, policy
+        self.conditions, self.controller, self.approach_by = conditions, controller, approach_by
+        self.privileged, self.chances = needs_truth(plan), calibration_of(plan)
+        if self.chances is not None and not cell.has_arm:
+            self.chances = replace(self.chances, doubt=0.0)  # an arm's
+        self.least = least_quality(plan, abstain, cell.has_arm)
+        self.taught = None if controller == OPEN_LOOP else teach(cell, scene)
+        cell.load(scene)
+        self.calibration = conditions.calibration(cell)
+        self.too_large = {
+            index
+            for index, placed in enumerate(scene.placements)
+            if not fits(placed.model, cell.gripper)
+        }
+        sees_all = self.privileged or approach_by is not None
+        self.look_again = SecondLook(
+            cell,
+            0.0 if sees_all else second_look * CM3,
+            partial(calibrated, cell, self.calibration, "wrist"),
+        )
+        self.planner = plan if scene.target is None else TargetPlanner(plan)
+        self.attempts: list[AttemptRecord] = []
+        self.failures = Failures()
+        self.plan_seconds, self.began = 0.0, cell.seconds
+
+    def play(self, max_failures: int, on_attempt: OnAttempt | None) -> str:
+        """Work on the scene until the round ends; returns the key of ENDINGS."""
+        try:
+            with planner_errors(self.policy):
+                reset_planner(self.planner, self.scene.seed)
+            while self.cell.remaining and len(self.failures.in_a_row) < max_failures:
+                ended = self.turn(on_attempt)
+                if ended is not None:
+                    return ended
+        except PlannerError as error:
+            return self.without_grasp(PLANNER_ERROR, str(error))
+        except PhysicsError:
+            spent = self.cell.seconds - self.began
+            self.attempts.append(AttemptRecord(False, "physics", self.plan_seconds, spent))
+            return "physics"
+        if self.cell.remaining:
+            return "failures"
+        return "cleared" if self.cleared == len(self.scene.placements) else FELL_OFF
+
+    def turn(self, on_attempt: OnAttempt | None) -> str | None:
+        """Look, plan and, where a grasp is likely enough, try it; returns the key of ENDINGS if the
+        round ends with that, or else None."""
+        self.plan_seconds, self.began = 0.0, self.cell.seconds
+        frame = self.look()
+        grasps = self.plan(frame)
+        grasp, why = choose(self.cell, grasps, self.failures, self.least, self.chances)
+        if grasp is None:
+            return self.without_grasp(NO_PLAN, why)
+        grasp, outcome = self.attempt(frame, grasp)
+        if on_attempt is not None:
+            on_attempt(frame, grasp, outcome)
+        return self.ending(outcome)
+
+    def look(self) -> RGBDFrame:
+        """What the cameras see now, with the target's pixels where there is one."""
+        frame = self.look_again(self.see)
+        if self.scene.target is None:
+            return frame
+        assert frame.segmentation is not None  # a cell's frames have it
+        return replace(frame, target=frame.segmentation == self.scene.target)
+
+    def see(self) -> RGBDFrame:
+        """A frame of the cell's camera, which only a privileged planner's has the truth of."""
+        mount = self.cell.config.camera.mount
+        return calibrated(self.cell, self.calibration, mount, self.cell.frame(self.privileged))
+
+    def plan(self, frame: RGBDFrame) -> Sequence[Grasp]:
+        """The planner's grasps; the time that it took counts even where it raises PlannerError."""
+        start = time.perf_counter()
+        try:
+            with planner_errors(self.policy):
+                return checked_grasps(
+                    self.planner(frame if self.privileged else frame.without_truth()),
+                    planar=self.controller != OPEN_LOOP,
+                )
+        finally:
+            self.plan_seconds = time.perf_counter() - start + self.look_again.plan_seconds
+
+    def without_grasp(self, reason: str, why: str) -> str:
+        """Record that the round ends for lack of a grasp; returns the reason, a key of ENDINGS."""
+        detail, spent = _details(self.look_again.remark, why), self.look_again.sim_seconds
+        self.attempts.append(AttemptRecord(False, reason, self.plan_seconds, spent, detail=detail))
+        return reason
+
+    def attempt(self, frame: RGBDFrame, grasp: Grasp) -> tuple[Grasp, GraspOutcome]:
+        """Execute a grasp and record it; returns the one at which the hand closed."""
+        cell, approach = self.cell, self.approach(frame)
+        aim = nearest_object(cell, grasp) if self.too_large else None
+        with disturbed(cell, self.conditions.motion(cell, len(self.attempts))):
+            outcome = (
+                execute_grasp(cell, grasp, approach, firmly=self.failures.slipped)
+                if cell.has_arm
+                else execute_floating(cell, grasp)
+            )
+        if self.approach_by is not None and self.approach_by.closed_at is not None:
+            grasp = self.approach_by.closed_at
+        self.attempts.append(self.executed(frame, grasp, aim, approach, outcome))
+        self.failures.note(grasp, outcome)
+        return grasp, outcome
+
+    def approach(self, frame: RGBDFrame) -> Approach:
+        """How the arm reaches the grasp that was planned on a frame."""
+        if self.controller == OPEN_LOOP:
+            return self.approach_by or open_loop
+        # The time to process an image counts as if the image had come later.
+        late = self.conditions.latency + self.cell.config.closed_loop.compute_seconds
+        return ClosedLoop(
+            self.cell, self.controller, frame.without_truth(), self.calibration, self.taught, late
+        )
+
+    def executed(
+        self, frame: RGBDFrame, grasp: Grasp, aim: int | None, approach: Approach,
+        outcome: GraspOutcome,
+    ) -> AttemptRecord:  # fmt: skip
+        """The record of an executed grasp. aim: the number of the object nearest to the planned
+        one; None where all objects fit the hand."""
+        held, table_height = outcome.object_index, Workspace().table_height
+        return AttemptRecord(
+            outcome.success,
+            outcome.reason,
+            self.plan_seconds,
+            outcome.sim_seconds + self.look_again.sim_seconds,
+            grasp_to_image(grasp, frame.K, frame.T_WC),
+            detail=_details(self.look_again.remark, outcome.detail),
+            held=None if held is None else self.scene.placements[held].model.name,
+            graspable=(aim if held is None else held) not in self.too_large,
+            tilt=grasp.tilt,
+            roughness=0.0 if self.privileged else table_roughness(frame, table_height),
+            **_in_hand(outcome),
+            **_turn_ms(approach),
+        )
+
+    def ending(self, outcome: GraspOutcome) -> str | None:
+        """The key of ENDINGS with which the last attempt has ended a round with a target, None
+        where the round goes on."""
+        wanted = self.scene.target
+        if wanted is None:
+            return None
+        if wanted not in self.cell.remaining:
+            return "target" if outcome.success and outcome.object_index == wanted else FELL_OFF
+        return "picks" if len(self.attempts) == len(self.scene.placements) else None
+
+    @property
+    def cleared(self) -> int:
+        """Objects that were picked."""
+        return sum(attempt.success for attempt in self.attempts)
+
+    def record(self, scenario: str, objects: str, ended: str) -> RoundRecord:
+        """The record of the round, which has ended."""
+        cell, scene = self.cell, self.scene
+        return RoundRecord(
+            policy_name(self.policy, self.controller), scenario, objects, scene.seed,
+            len(scene.placements), self.cleared, tuple(self.attempts), ended, self.controller,
+            cell.sample, len(self.too_large), cell.config.camera.depth_noise,
+            None if self.chances is None else astuple(self.chances),
+            None if scene.target is None else ended == "target",
+        )  # fmt: skip
 
 
 # --- Parts of a round ------------------------------------------------------------------------
