@@ -27,13 +27,13 @@ from utils.config import load_config
 from utils.errors import TargetLostError
 from utils.geometry import GripperGeometry, Workspace
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
+from utils.random_streams import Stream
 from utils.runs import run_script
 from utils.transforms import Grasp, inverse_pose, planar, planar_part
 
 HEIGHTS = (0.25, 0.16, 0.10)  # m over the grasp: far, where the near stage begins, and below that
 SHIFT, TURN = 0.015, np.radians(10)  # most that the object has moved from where it is expected
 _BESIDE, _TILT = 0.015, np.radians(3)  # m and rad off the grasp's axis, of the hand
-_STREAM = 11  # keeps these draws apart from the scene's of the same seed
 
 
 @dataclass
@@ -83,7 +83,7 @@ def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Er
         camera = WristCamera(cell)
         size = camera.intrinsics.width, camera.intrinsics.height
         tracker = TemplateMatcher(template, camera.intrinsics.K, size)
-        rng, T_WB = np.random.default_rng([seed, _STREAM]), cell.object_pose(0)
+        rng, T_WB = np.random.default_rng([seed, Stream.TRACKED_MOTION]), cell.object_pose(0)
         for height in HEIGHTS:
             found = sightings(cell, camera, tracker, T_WB, grasps[0], height, views, rng)
             for place, turn in found:

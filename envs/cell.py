@@ -22,10 +22,11 @@ from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
 from envs.views import side_view
 from utils.config import CameraConfig, Config
-from utils.depth import NoiseStream, seeded_noise
+from utils.depth import seeded_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
 from utils.geometry import HANGS_FROM, SceneGeometry, SolidObject
+from utils.random_streams import Stream
 from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at
 
@@ -383,7 +384,7 @@ class Cell(ABC):
                 raise ValueError(
                     "Depth noise follows the scene's seed; build or load a scene first"
                 )
-            measure = seeded_noise(noise, NoiseStream.PLANNING, self.scene.seed, self.frames)
+            measure = seeded_noise(noise, Stream.PLANNING_NOISE, self.scene.seed, self.frames)
             frame = replace(frame, depth=measure(frame.depth, frame.rgb))
         self.frames += 1
         return frame

@@ -17,10 +17,11 @@ import numpy as np
 
 from envs.cell import Cell, Intrinsics
 from envs.robot_kinematics import forward_kinematics
-from utils.depth import NoiseStream, seeded_noise
+from utils.depth import seeded_noise
 from utils.errors import TargetLostError
 from utils.object_motion import PlanarMotion
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
+from utils.random_streams import Stream
 from utils.transforms import Grasp, RGBDFrame, inverse_pose, planar, planar_part
 
 
@@ -48,7 +49,7 @@ class WristCamera:
         )
         self._coming: deque[WristImage] = deque()
         noise = camera.make_noise(float(self.intrinsics.K[0, 0]))
-        self._measure = seeded_noise(noise, NoiseStream.WRIST, cell.scene.seed, cell.frames)
+        self._measure = seeded_noise(noise, Stream.WRIST_NOISE, cell.scene.seed, cell.frames)
 
     def __call__(self) -> WristImage | None:
         """Take an image now; the newest image that has arrived since the last call, or None."""

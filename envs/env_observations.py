@@ -17,8 +17,9 @@ from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.env_rewards import GraspGoals, Outline
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY
 from utils.config import Config
-from utils.depth import NoiseStream, seeded_noise
+from utils.depth import seeded_noise
 from utils.errors import unknown_choice
+from utils.random_streams import Stream
 
 # Entries of info that can be observed, and their sizes.
 INFO_OBSERVATIONS = {
@@ -162,7 +163,7 @@ class Observer:
         else:
             T_WC = self._cell.camera_pose(camera=self._camera)
         image = self._cell.image(self._intrinsics, T_WC)
-        seed, stream = self._cell.scene.seed, NoiseStream.OBSERVATION
+        seed, stream = self._cell.scene.seed, Stream.OBSERVATION_NOISE
         measure = seeded_noise(self._depth_noise, stream, seed, self._cell.observations)
         self._cell.observations += 1
         return image.rgb, measure(image.depth, image.rgb)[..., None]

@@ -29,6 +29,7 @@ from envs.cell import Cell, Intrinsics, require_arm, wrist_mount
 from envs.cell_layout import EMPTY, Scene
 from envs.cell_scenes import LAYOUTS
 from envs.robot_kinematics import forward_kinematics
+from utils.random_streams import Stream
 from utils.table_plane import fit_table_plane
 from utils.transforms import RGBDFrame, inverse_pose, planar
 
@@ -122,7 +123,6 @@ def _measure_mount(cell: Cell, scene: Scene) -> np.ndarray:
 
 
 _START_SECONDS = 0.2  # in which a conveyor gets up to speed, so that objects do not topple
-_STREAM = 7  # keeps these draws apart from the scene's of the same seed
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ class Scenario:
         return wrong_calibration(cell, rng, error.camera_shift, np.radians(error.camera_turn_deg))
 
     def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
-        return np.random.default_rng([cell.scene.seed, attempt + 1, _STREAM])
+        return np.random.default_rng([cell.scene.seed, attempt + 1, Stream.MOTION])
 
 
 def displacement(

@@ -27,11 +27,12 @@ from envs.robot_kinematics import (
 )
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError
-from utils.depth import NoiseStream, seeded_noise, surfaces_in_holes, table_in_holes
+from utils.depth import seeded_noise, surfaces_in_holes, table_in_holes
 from utils.depth_correction import corrected
 from utils.geometry import Workspace
 from utils.height_map import HeightMap, height_map_from_frame
 from utils.next_view import OpenSpace, dome
+from utils.random_streams import Stream
 from utils.transforms import RGBDFrame, inverse_pose
 
 CM3 = 1e-6  # m3
@@ -100,7 +101,7 @@ def wrist_frame(cell: Cell) -> RGBDFrame:
     )
     frame = cell.look(intrinsics, cell.camera_pose("wrist"))
     noise = camera.make_noise(float(frame.K[0, 0]))
-    measure = seeded_noise(noise, NoiseStream.SECOND, cell.scene.seed, cell.frames)
+    measure = seeded_noise(noise, Stream.SECOND_NOISE, cell.scene.seed, cell.frames)
     assert frame.segmentation is not None  # a cell's frames have it
     depth = np.where(frame.segmentation == ROBOT, 0, measure(frame.depth, frame.rgb))
     return replace(frame, depth=depth.astype(np.float32))

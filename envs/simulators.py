@@ -20,8 +20,7 @@ from envs.cell_layout import Box, LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
 from utils.errors import UserError, unknown_choice
-
-_STREAM = 13  # keeps the seed of a scene's randomisation apart from what else its seed draws
+from utils.random_streams import Stream
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def make_cell(config: Config, gui: bool = False) -> Cell:
 def _seed_of_sample(scene_seed: int) -> int:
     """A seed apart from the scene's: with that itself, colours would be the numbers that placed an
     isolated object, and a policy could see from them where it is."""
-    return int(np.random.default_rng([scene_seed, _STREAM]).integers(2**31))
+    return int(np.random.default_rng([scene_seed, Stream.APPEARANCE]).integers(2**31))
 
 
 def make_layout_table(

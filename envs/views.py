@@ -9,9 +9,8 @@ import numpy as np
 
 from utils.config import CameraConfig, WorkspaceConfig
 from utils.errors import UserError
+from utils.random_streams import Stream
 from utils.transforms import look_at, project
-
-_STREAM = 11  # keeps these draws apart from others of the scene's seed
 
 
 def side_view(camera: CameraConfig, workspace: WorkspaceConfig, seed: int) -> np.ndarray:
@@ -19,7 +18,7 @@ def side_view(camera: CameraConfig, workspace: WorkspaceConfig, seed: int) -> np
 
     Tilt, distance and azimuth are uniform in their ranges; the same seed gives the same pose.
     """
-    rng = np.random.default_rng([seed, _STREAM])
+    rng = np.random.default_rng([seed, Stream.SIDE_VIEW])
     tilt, azimuth = (
         np.radians(rng.uniform(*bounds))
         for bounds in (camera.side_tilt_deg, camera.side_azimuth_deg)

@@ -292,7 +292,7 @@ def _together(function: Callable, parts: Sequence[Observations], dim: int) -> Ob
 
 def derived_seeds(count: int, *place: int) -> list[int]:
     """`count` seeds for a place such as (run's seed, purpose, rank, update), unrelated to those of
-    any other place."""
+    any other place, but for one that differs in zeros at its end (`utils.random_streams`)."""
     return np.random.SeedSequence(place).generate_state(count).tolist()
 
 

@@ -4,8 +4,8 @@ A depth noise is a callable `noise(depth, rng) -> depth` that turns a clean dept
 measured one; one with `sees_colours = True` is called with the colours too, `noise(depth, rng,
 rgb)`. `DEPTH_NOISES` lists the known ones; `make_depth_noise` makes one of them, or one of
 your own, for all that measure depth: the cell's cameras, the closed loop, the environments, the
-randomisation and the training. `seeded_noise` gives it the random numbers of a scene; `NoiseStream`
-lists who draws them.
+randomisation and the training. `seeded_noise` gives it the random numbers of a scene;
+`utils.random_streams` lists who draws them.
 
 `KinectNoise` has four effects, after Handa et al., "A benchmark for RGB-D visual odometry, 3D
 reconstruction and SLAM" (ICRA 2014), Barron and Malik, "Intrinsic scene properties from a single
@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,6 +33,7 @@ from scipy.special import ndtri
 
 from utils.errors import UserError, unknown_choice
 from utils.plugins import is_import_path, load_plugin
+from utils.random_streams import Stream
 from utils.transforms import RGBDFrame, known_depth, ray_component
 
 # (H, W) float32 metres and a generator for the draws, and (H, W, 3) uint8 colours for noises that
@@ -436,18 +436,6 @@ def make_depth_noise(
     return noise
 
 
-class NoiseStream(IntEnum):
-    """Who draws depth noise: each measures with random numbers of its own in the same scene.
-
-    The number 7 is taken by the motions of `envs.scenarios`.
-    """
-
-    PLANNING = 1  # frames that planners see (`envs.cell.Cell.frame`)
-    WRIST = 3  # images of the closed loop (`envs.closed_loop_tracker.WristCamera`)
-    OBSERVATION = 5  # images of the environment (`envs.env_observations.Observer`)
-    SECOND = 9  # second frames (`envs.second_look.SecondLook`)
-
-
 def measure(
     noise: DepthNoise,
     depth: np.ndarray,
@@ -461,7 +449,7 @@ def measure(
 
 
 def seeded_noise(
-    noise: DepthNoise | None, stream: NoiseStream, seed: int, frame: int
+    noise: DepthNoise | None, stream: Stream, seed: int, frame: int
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """A function from a clean depth image and its colours to the measured depth; for no noise, the
     clean one.

@@ -1,0 +1,29 @@
+"""Who draws random numbers from a scene's seed besides the scene itself.
+
+A generator's key is a list of numbers. NumPy fills it up with zeros, so that [seed], [seed, 0] and
+[seed, 0, 0] give the same numbers; a scene is drawn with [seed, i], where i is the place of its
+layout in `envs.cell_scenes.LAYOUTS`. No key of another draw may therefore end with 0, and one of
+two numbers ends with a stream beyond all layouts.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, unique
+
+
+@unique
+class Stream(IntEnum):
+    """The last number of a key."""
+
+    # [seed, number of the frame, stream]
+    PLANNING_NOISE = 1  # frames that planners see (`envs.cell.Cell.frame`)
+    WRIST_NOISE = 3  # images of the closed loop (`envs.closed_loop_tracker.WristCamera`)
+    OBSERVATION_NOISE = 5  # images of the environment (`envs.env_observations.Observer`)
+    SECOND_NOISE = 9  # second frames (`envs.second_look.SecondLook`)
+    # [seed, number of the attempt from 1, stream]
+    MOTION = 7  # objects that move (`envs.scenarios`)
+    # [seed, stream]
+    SIDE_VIEW = 11  # the pose of a camera at the side (`envs.views`)
+    APPEARANCE = 13  # a randomised scene (`envs.simulators`)
+    TRACKED_MOTION = 15  # of an object that is tracked (`benchmarks.bench_tracking`)
+    RANDOM_PLANNER = 17  # `models.planners.RandomPlanner`
