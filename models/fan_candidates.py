@@ -48,8 +48,7 @@ class FanCandidates:
 
     def axes(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, 2) unit vectors along the closing line and across it."""
-        along = torch.stack([self.angle.cos(), self.angle.sin()], dim=-1)
-        return along, torch.stack([-along[:, 1], along[:, 0]], dim=-1)
+        return closing_axes(self.angle)
 
     def best(self, count: int | None = None) -> FanCandidates:
         """The `count` best feasible candidates of each view, view by view, best first."""
@@ -80,6 +79,12 @@ class FanCandidates:
             free &= apart[every, first]
             free[every, first] = False
         return self.take(number[kept])
+
+
+def closing_axes(angle: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(..., 2) unit vectors along closing lines at angles (...) and across them."""
+    cosine, sine = angle.cos(), angle.sin()
+    return torch.stack([cosine, sine], dim=-1), torch.stack([-sine, cosine], dim=-1)
 
 
 def _place(view: torch.Tensor) -> torch.Tensor:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from models.fan_candidates import FanCandidates
+from models.fan_candidates import FanCandidates, closing_axes
 from models.fan_measure import cells_around, measure, turn_onto_faces, without_bumps
 from models.fan_views import FanViews, highest_within
 from models.grasp_critic import ACROSS, ALONG, LEAST_LOGGED, MOST, STEP, UNIT, GraspCritic
@@ -53,98 +54,168 @@ def _valued(found: FanCandidates, value: torch.Tensor) -> FanCandidates:
     return replace(found, score=found.score * value, value=value)
 
 
+class _Squares(NamedTuple):
+    """What is turned of each view: all graspable matter, and fingers beside it, at any angle.
+    centre: (B, 2) int64 column and row of the middle cell. half: cells from there to a side."""
+
+    centre: torch.Tensor
+    half: int
+
+    @property
+    def size(self) -> int:
+        return 2 * self.half + 1
+
+
+class _Turned(NamedTuple):
+    """The squares of all views at every angle, view by view: (I, S, S) m in V, as `_Turned` of
+    `models.planner_runs`."""
+
+    heights: torch.Tensor
+    objects: torch.Tensor
+    under_finger: torch.Tensor
+    under_palm: torch.Tensor
+
+
+class _Runs(NamedTuple):
+    """M runs of matter over a height of the fingertips. image: (M,) of `_Turned`. row, first, last:
+    (M,) where they are in it. tip: (M,) m in V."""
+
+    image: torch.Tensor
+    row: torch.Tensor
+    first: torch.Tensor
+    last: torch.Tensor
+    tip: torch.Tensor
+
+    def take(self, some: torch.Tensor) -> _Runs:
+        """Those that are marked in `some`, (M,) bool."""
+        index = torch.nonzero(some)[:, 0]
+        return _Runs(*(column[index] for column in self))
+
+    def of(self, images: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+        """(..., M) of images (I, S, S) at columns (..., M) of the runs' rows."""
+        size = images.shape[2]
+        return images.flatten()[(self.image * size + self.row) * size + column]
+
+
 def dense_candidates(
     views: FanViews, gripper: GripperGeometry, workspace: Workspace, settings: SearchSettings
 ) -> FanCandidates:
     """Runs of matter that may fit between the fingers, in every view."""
-    device, cell, (rows, columns) = views.height.device, views.cell, views.height.shape[1:]
-    on_objects, height = views.label >= 0, views.height
-    levels = _levels(views, on_objects, gripper, settings)
-    # A square that holds all graspable matter of a view, and fingers beside it, at any angle.
+    squares = _squares(views, gripper, settings)
+    angles = torch.arange(settings.angles, dtype=torch.float64, device=views.height.device)
+    angles = angles * np.pi / settings.angles
+    turned = _turned(views, squares, angles, gripper)
+    levels = _levels(views, gripper, settings).repeat_interleave(settings.angles, dim=0)
+    widest = gripper.max_opening - 2 * settings.rooms[0]
+    runs = _runs(turned.objects, levels, widest, views.cell)
+    runs = _under_a_palm(runs, turned, gripper, settings)
+    runs = _between_fingers(runs, turned, views.cell, gripper, settings)
+    return _scored(runs, turned, squares, angles, views, workspace, settings)
+
+
+def _squares(views: FanViews, gripper: GripperGeometry, settings: SearchSettings) -> _Squares:
+    on_objects = views.label >= 0
     sides = [on_objects.any(dim=1), on_objects.any(dim=2)]
     first = torch.stack([side.int().argmax(dim=1) for side in sides], dim=1)
     last = torch.stack(
         [side.shape[1] - 1 - side.flip(1).int().argmax(dim=1) for side in sides], dim=1
     )
-    last = torch.where(on_objects.any(dim=1).any(dim=1, keepdim=True), last, first)
-    centre_cell, thickness = (first + last) // 2, gripper.finger_outline[1][0]
-    beside = (gripper.max_opening if gripper.opens_fully else max(settings.rooms)) + 2 * thickness
+    last = torch.where(sides[0].any(dim=1, keepdim=True), last, first)
+    beside = gripper.max_opening if gripper.opens_fully else max(settings.rooms)
+    beside += 2 * gripper.finger_thickness
     if views.others:
         beside += gripper.palm_half_length
-    half = int((last - first).double().norm(dim=1).max() / 2 + beside / cell) + 2
-    size, middle = 2 * half + 1, _pair(views.origin, device) + cell * centre_cell.double()
+    half = int((last - first).double().norm(dim=1).max() / 2 + beside / views.cell) + 2
+    return _Squares((first + last) // 2, half)
 
-    # Every view at every angle.
-    angles = torch.arange(settings.angles, dtype=torch.float64, device=device)
-    angles = angles * np.pi / settings.angles
-    along = torch.stack([angles.cos(), angles.sin()], dim=1)
-    across = torch.stack([-along[:, 1], along[:, 0]], dim=1)
-    step = torch.arange(-half, half + 1, device=device)
+
+def _turned(
+    views: FanViews, squares: _Squares, angles: torch.Tensor, gripper: GripperGeometry
+) -> _Turned:
+    height, cell = views.height, views.cell
+    device, (count, rows, columns) = height.device, height.shape
+    along, across = closing_axes(angles)
+    step = torch.arange(-squares.half, squares.half + 1, device=device)
     column, row = (
         along[:, k, None, None] * step + across[:, k, None, None] * step[:, None] for k in (0, 1)
     )
     column, row = (
-        torch.floor(part + centre_cell[:, k, None, None, None] + 0.5).long()
+        torch.floor(part + squares.centre[:, k, None, None, None] + 0.5).long()
         for k, part in enumerate((column, row))
     )  # (B, A, S, S)
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    every = torch.arange(len(views), device=device)
-    where = (every[:, None, None, None] * rows + row.clamp(0, rows - 1)) * columns
+    number = torch.arange(count, device=device)
+    where = (number[:, None, None, None] * rows + row.clamp(0, rows - 1)) * columns
     where = (where + column.clamp(0, columns - 1)).flatten(0, 1)
     inside = inside.flatten(0, 1)
-    ground = height.amin(dim=(1, 2)).repeat_interleave(settings.angles)[:, None, None]
+    ground = height.amin(dim=(1, 2)).repeat_interleave(len(angles))[:, None, None]
+    heights = torch.where(inside, height.flatten()[where], ground)
     standing = torch.where(views.label == -1, NOWHERE, height)
-    turned = torch.where(inside, height.flatten()[where], ground)
     objects = torch.where(inside, standing.flatten()[where], NOWHERE)
-
-    image, level, row, first, last = _runs(
-        objects, levels.repeat_interleave(settings.angles, dim=0),
-        gripper.max_opening - 2 * settings.rooms[0], cell,
-    )  # fmt: skip
-    width = int(thickness / cell)
-    finger = highest_within(
-        turned, int(gripper.finger_half_width / cell), (width // 2, width - 1 - width // 2)
+    width = int(gripper.finger_thickness / cell)
+    under_finger = highest_within(
+        heights, int(gripper.finger_half_width / cell), (width // 2, width - 1 - width // 2)
     )
-    palm = highest_within(
-        turned, int(gripper.palm_outline[1][0] / cell), int(gripper.palm_half_length / cell)
+    under_palm = highest_within(
+        heights, int(gripper.palm_half_width / cell), int(gripper.palm_half_length / cell)
     )
-    view, turn = image // settings.angles, image % settings.angles
-    tip = levels[view, level]
+    return _Turned(heights, objects, under_finger, under_palm)
 
-    def at(images: torch.Tensor, column: torch.Tensor, some: torch.Tensor) -> torch.Tensor:
-        return images.flatten()[(image[some] * size + row[some]) * size + column]
 
-    length = (last - first + 1).double() * cell
-    centre = ((first + last).double() / 2).round().long()
-    every = torch.arange(len(tip), device=device)
-    free = torch.nonzero(at(palm, centre, every) < tip - settings.clearance + gripper.palm_height)[
-        :, 0
-    ]
-    limit = tip[free] - settings.clearance
-    rooms = tip.new_tensor(settings.rooms)[:, None]  # (rooms, M) from here on
+def _under_a_palm(
+    runs: _Runs, turned: _Turned, gripper: GripperGeometry, settings: SearchSettings
+) -> _Runs:
+    """Those over which the palm has room."""
+    centre = ((runs.first + runs.last).double() / 2).round().long()
+    under_hand = runs.of(turned.under_palm, centre)
+    return runs.take(under_hand < runs.tip - settings.clearance + gripper.palm_height)
+
+
+def _between_fingers(
+    runs: _Runs, turned: _Turned, cell: float, gripper: GripperGeometry, settings: SearchSettings
+) -> _Runs:
+    """Those beside which both fingers have room."""
+    size, width = turned.under_finger.shape[2], (runs.last - runs.first + 1).double() * cell
+    rooms = width.new_tensor(settings.rooms)[:, None]  # (rooms, M) from here on
     if gripper.opens_fully:
-        rooms = (gripper.max_opening - length[None, free]) / 2
-    offset = (rooms + thickness / 2) / cell
-    left = (first[free] - offset).round().long().clamp(min=0)
-    right = (last[free] + offset).round().long().clamp(max=size - 1)
-    fits = (at(finger, left, free) < limit) & (at(finger, right, free) < limit)
-    fits &= length[free] + 2 * rooms < gripper.max_opening + 2 * cell
-    free = free[fits.any(dim=0)]
-    view, turn, row, tip = view[free], turn[free], row[free], tip[free]
-    first, last, image, width = first[free], last[free], image[free], length[free]
+        rooms = (gripper.max_opening - width[None]) / 2
+    beside = (rooms + gripper.finger_thickness / 2) / cell
+    left = (runs.first - beside).round().long().clamp(min=0)
+    right = (runs.last + beside).round().long().clamp(max=size - 1)
+    limit = runs.tip - settings.clearance
+    fits = runs.of(turned.under_finger, left) < limit
+    fits &= runs.of(turned.under_finger, right) < limit
+    fits &= width + 2 * rooms < gripper.max_opening + 2 * cell
+    return runs.take(fits.any(dim=0))
 
-    along, across = along[turn], across[turn]
-    base = middle[view] + cell * (row - half).double()[:, None] * across
+
+def _scored(
+    runs: _Runs,
+    turned: _Turned,
+    squares: _Squares,
+    angles: torch.Tensor,
+    views: FanViews,
+    workspace: Workspace,
+    settings: SearchSettings,
+) -> FanCandidates:
+    """The runs as candidates, with a score that needs no contacts; those without one left out."""
+    cell, device = views.cell, angles.device
+    view, turn = runs.image // len(angles), runs.image % len(angles)
+    along, across = (axes[turn] for axes in closing_axes(angles))
+    middle = _pair(views.origin, device) + cell * squares.centre.double()
+    base = middle[view] + cell * (runs.row - squares.half).double()[:, None] * across
     at_first, at_inside, xy, at_last = (
-        base + cell * (column.double() - half)[:, None] * along
-        for column in (first, first + 1.5, (first + last).double() / 2, last)
-    )
+        base + cell * (column.double() - squares.half)[:, None] * along
+        for column in (
+            runs.first, runs.first + 1.5, (runs.first + runs.last).double() / 2, runs.last
+        )
+    )  # fmt: skip
     frames = views.T_WV[view]
-    place = (frames[:, :2, :3] @ torch.cat([xy, tip[:, None]], dim=1)[..., None])[..., 0]
+    place = (frames[:, :2, :3] @ torch.cat([xy, runs.tip[:, None]], dim=1)[..., None])[..., 0]
     place = place + frames[:, :2, 3]
     away = (place - _pair(workspace.centre, device)).abs().amax(dim=1)
     reach = away < workspace.size / 2 + settings.reach
-    slope = _slopes(height, cell)
+    slope = _slopes(views.height, cell)
     facing = torch.minimum(
         *(
             sign * (F.normalize(slope[views.cells(view, end)], dim=1, eps=1e-9) * along).sum(dim=1)
@@ -153,23 +224,23 @@ def dense_candidates(
     )
     inside = views.label.flatten()[views.cells(view, at_inside)]
     arm = ((views.centres[view, inside.clamp(min=0), :2] - xy) * across).sum(dim=1).abs()
-    rise = turned.flatten()[(image * size + row) * size + first] - tip
+    rise = runs.of(turned.heights, runs.first) - runs.tip
     score = torch.exp(-((arm / 0.03) ** 2)) * facing.clamp(0, 1) ** 2
     score = score * (reach & (inside >= 0) & (facing > settings.min_facing))
     score = score * (rise / settings.good_engagement).clamp(0.2, 1)
     nothing, none = torch.zeros_like(score), torch.full_like(view, -1)
     facts = score.new_zeros(len(score), len(FACTS))
+    width = (runs.last - runs.first + 1).double() * cell
     found = FanCandidates(
-        view, xy, angles[turn], tip, width, width, nothing, none, score, facts, nothing
+        view, xy, angles[turn], runs.tip, width, width, nothing, none, score, facts, nothing
     )
     return found.take(torch.nonzero(score > 0)[:, 0])
 
 
-def _levels(
-    views: FanViews, on_objects: torch.Tensor, gripper: GripperGeometry, settings: SearchSettings
-) -> torch.Tensor:
+def _levels(views: FanViews, gripper: GripperGeometry, settings: SearchSettings) -> torch.Tensor:
     """(B, L) metres in V: heights of the fingertips to try in each view; infinite where a view has
-    fewer. on_objects: (B, R, C) bool."""
+    fewer."""
+    on_objects = views.label >= 0
     lowest = torch.where(on_objects, views.table, torch.inf).amin(dim=(1, 2)).double()
     lowest = lowest + settings.table_clearance
     low = torch.where(on_objects, views.height, torch.inf).amin(dim=(1, 2))
@@ -183,11 +254,8 @@ def _levels(
     return torch.where(number < count[:, None], levels, torch.inf)
 
 
-def _runs(
-    objects: torch.Tensor, levels: torch.Tensor, max_width: float, cell: float
-) -> tuple[torch.Tensor, ...]:
-    """Runs of cells over a level along the rows of images (I, S, S): image, level, row, first and
-    last column, each (M,). levels: (I, L)."""
+def _runs(objects: torch.Tensor, levels: torch.Tensor, max_width: float, cell: float) -> _Runs:
+    """Runs of cells over a level along the rows of images (I, S, S). levels: (I, L)."""
     size = objects.shape[2]
     some = objects.amax(dim=2) > levels[:, :1]
     first = some.int().argmax(dim=1)
@@ -210,7 +278,7 @@ def _runs(
     line, first, last = (torch.cat(column) for column in zip(*found))
     image, rest = line // (levels.shape[1] * max(count, 1)), line % max(count, 1)
     level = line // max(count, 1) % levels.shape[1]
-    return image, level, rows[image, rest], first, last
+    return _Runs(image, rows[image, rest], first, last, levels[image, level])
 
 
 def _slopes(height: torch.Tensor, cell: float) -> torch.Tensor:
