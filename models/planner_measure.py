@@ -7,7 +7,8 @@ pads lie flat. `models.fan_measure` does the same for a fan of views with PyTorc
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +29,68 @@ BESIDE, BESIDE_LINES = (0.003, 0.008), 5
 # Standard deviations by which noise raises the highest cell between the fingers: a choice
 # (docs/choices.md).
 HIGHEST_CELL = 2.0
+
+
+Array = TypeVar("Array")  # np.ndarray, or torch.Tensor in `models.fan_measure`
+
+
+@dataclass(frozen=True)
+class Lines(Generic[Array]):
+    """Cells of a map on lines beside N candidates. u: (U,) m along the closing line, from the
+    middle that a candidate claims. v: (V,) m, the places of the lines across it. where: (N, V, U)
+    flat indices. height: (N, V, U) m, and highest: (N, U) m of all lines."""
+
+    u: Array
+    v: Array
+    where: Array
+    height: Array
+    highest: Array
+
+
+@dataclass(frozen=True)
+class Contacts(Generic[Array]):
+    """Where flat pads meet matter, as they close on N candidates.
+
+    left, right: (N,) m along the closing line from the middle that a candidate claims; both 0 where
+    a pad meets nothing. touched: (N,) bool, whether both meet matter. top: (N,) m, of the highest
+    matter between them. chords: (N, V) m between the first contacts of each line across the pads.
+    turn, wedge, cover: (N,) of `fit_faces`. tilt_left, tilt_right: (N,) rad of the faces from
+    upright.
+    """
+
+    left: Array
+    right: Array
+    touched: Array
+    top: Array
+    chords: Array
+    turn: Array
+    wedge: Array
+    cover: Array
+    tilt_left: Array
+    tilt_right: Array
+
+    @property
+    def width(self) -> Array:
+        """(N,) m."""
+        return self.right - self.left
+
+    @property
+    def shift(self) -> Array:
+        """(N,) m, of the middle between the contacts from the one that a candidate claims."""
+        return (self.right + self.left) / 2
+
+
+@dataclass(frozen=True)
+class Held(Generic[Array]):
+    """What is between the pads of N candidates. xy: (N, 2) m, the middle between the contacts.
+    label: (N,) the object. left, right: (N,) labels just inside the contacts. arms: (N,) m to its
+    centre of mass across, along and up."""
+
+    xy: Array
+    label: Array
+    left: Array
+    right: Array
+    arms: tuple[Array, Array, Array]
 
 
 def turn_onto_faces(
@@ -58,121 +121,200 @@ def measure(
 ) -> Candidates:
     """The candidates posed on the map, centred between their contacts, and scored.
 
-    The pads are flat: a pad stops where the first of the lines across it meets matter. The slope of
-    the contacts across the pad gives the angle to the face, their shift with height its tilt.
     depths: how many times the same places and angles follow each other, at other heights of the
     fingertips.
     """
-    N, tip = len(candidates), candidates.tip
+    tip = candidates.tip
+    lines = _lines(candidates, heights, gripper, settings, depths)
+    contacts = _contacts(candidates, lines, heights.cell, settings)
+    held = _held(candidates, contacts, heights, gripper)
+    some = _graspable(candidates, lines, contacts, held, heights, gripper, settings)
+    opening, offset = _room(some, candidates, lines, contacts, held, heights, gripper, settings)
+    some = some[opening[some] > 0]
+    covered = _covered(some, opening, offset, tip, lines, contacts, heights, gripper, settings)
+
+    engagement = contacts.top - tip
+    beside = (opening - contacts.width) / 2 - np.abs(offset)  # on the side of the nearer finger
+    # The steeper face counts: of a thin sloping wall the other one, which is hidden, is as steep.
+    tilt = np.maximum(contacts.tilt_left, contacts.tilt_right)
+    together = held.left == held.right
+    on_top = np.column_stack([held.xy, np.where(contacts.touched, contacts.top, 0.0)])
+    score = grip_score(
+        np, settings, wedge=contacts.wedge, turn=contacts.turn,
+        tilt=np.where(contacts.touched, tilt, np.pi / 2), arms=held.arms, cover=contacts.cover,
+        engagement=engagement, roomy=np.interp(beside, (0.003, 0.008), (0.4, 1.0)),
+        covered=covered, together=together, over_table=heights.rise(on_top),
+    )  # fmt: skip
+    feasible = np.zeros(len(candidates), bool)
+    feasible[some] = True
+    facts = np.column_stack([
+        contacts.wedge, contacts.tilt_left, contacts.tilt_right, contacts.cover, *held.arms,
+        engagement, covered, beside, together,
+    ])  # fmt: skip
+    facts = np.nan_to_num(facts, posinf=np.pi, neginf=-np.pi)  # of what touches nothing
+    most = np.pi / settings.angles
+    return Candidates(
+        held.xy, candidates.angle, tip, contacts.width, opening, offset,
+        np.clip(contacts.turn, -most, most), held.label, score * feasible, facts,
+    )  # fmt: skip
+
+
+def _lines(
+    candidates: Candidates,
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+    depths: int,
+) -> Lines[np.ndarray]:
     along, across = candidates.axes()
     reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
     reach += np.abs(settings.offsets).max()
     most = np.ceil(reach / heights.cell)
     u = np.arange(-most, most + 1) * heights.cell
     v = np.linspace(-1, 1, LINES) * gripper.finger_half_width
-    once = N // depths
-    where = cells_around(
-        candidates.xy[:once], along[:once], across[:once], u, v, heights
-    )  # (N, V, U)
+    once = len(candidates) // depths
+    where = cells_around(candidates.xy[:once], along[:once], across[:once], u, v, heights)
     height = heights.height.take(where)
-    highest = height.max(axis=1)  # across the pads
+    highest = height.max(axis=1)
     if depths > 1:
         where, height = (np.tile(part, (depths, 1, 1)) for part in (where, height))
         highest = np.tile(highest, (depths, 1))
+    return Lines(u, v, where, height, highest)
 
-    # Contacts, searched a little beyond the width that the candidate claims.
+
+def _contacts(
+    candidates: Candidates, lines: Lines[np.ndarray], cell: float, settings: SearchSettings
+) -> Contacts[np.ndarray]:
+    """A pad stops where the first of the lines across it meets matter. The slope of the contacts
+    across the pad gives the angle to the face, their shift with height its tilt."""
+    tip, u = candidates.tip, lines.u
+    # Searched a little beyond the width that the candidate claims.
     window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
-    top = np.where(window, highest, -np.inf).max(axis=1)
-    engagement = top - tip
-    lower, upper = contact_levels(tip, engagement)
-    low = (height > lower[:, None, None]) & window[:, None]
-    low_left, low_right = _first_contacts(low, u, heights.cell)
-    high = (highest > upper[:, None]) & window
-    high_left, high_right = _first_contacts(high, u, heights.cell)
+    top = np.where(window, lines.highest, -np.inf).max(axis=1)
+    lower, upper = contact_levels(tip, top - tip)
+    low = (lines.height > lower[:, None, None]) & window[:, None]
+    low_left, low_right = _first_contacts(low, u, cell)
+    high = (lines.highest > upper[:, None]) & window
+    high_left, high_right = _first_contacts(high, u, cell)
     left, right = low_left.min(axis=1), low_right.max(axis=1)
     touched = np.isfinite(left) & np.isfinite(high_left)
     left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
-    width, shift = right - left, (right + left) / 2
-    turn, wedge, cover = fit_faces(low_left - left[:, None], right[:, None] - low_right, v)
+    turn, wedge, cover = fit_faces(low_left - left[:, None], right[:, None] - low_right, lines.v)
     rise = upper - tip - 0.001
-    tilt_left = np.arctan2(np.maximum(high_left - left, 0), rise)
-    tilt_right = np.arctan2(np.maximum(right - high_right, 0), rise)
-    # The steeper face counts: of a thin sloping wall the other one, which is hidden, is as steep.
-    tilt = np.where(touched, np.maximum(tilt_left, tilt_right), np.pi / 2)
+    return Contacts(
+        left, right, touched, top, low_right - low_left, turn, wedge, cover,
+        np.arctan2(np.maximum(high_left - left, 0), rise),
+        np.arctan2(np.maximum(right - high_right, 0), rise),
+    )  # fmt: skip
 
-    # The object between the fingers, and the lever arms to its centre of mass.
-    xy = candidates.xy + shift[:, None] * along
-    inner = np.minimum(0.003, width / 3)
-    ends = [
+
+def _held(
+    candidates: Candidates,
+    contacts: Contacts[np.ndarray],
+    heights: HeightMap,
+    gripper: GripperGeometry,
+) -> Held[np.ndarray]:
+    along, across = candidates.axes()
+    xy = candidates.xy + contacts.shift[:, None] * along
+    inner = np.minimum(0.003, contacts.width / 3)
+    left, right = (
         heights.label[heights.index(candidates.xy + (end[:, None] * along))]
-        for end in (left + inner, right - inner)
-    ]
-    label = np.maximum(*ends)
+        for end in (contacts.left + inner, contacts.right - inner)
+    )
+    label = np.maximum(left, right)
     centre = heights.centres[np.maximum(label, 0)]  # walls and table have none
-    arm_across = np.abs(((centre[:, :2] - xy) * across).sum(axis=1))
-    arm_along = np.abs(((centre[:, :2] - xy) * along).sum(axis=1))
-    arm_up = np.abs(centre[:, 2] - tip - gripper.pad_height / 2)
+    arms = (
+        np.abs(((centre[:, :2] - xy) * across).sum(axis=1)),
+        np.abs(((centre[:, :2] - xy) * along).sum(axis=1)),
+        np.abs(centre[:, 2] - candidates.tip - gripper.pad_height / 2),
+    )
+    return Held(xy, label, left, right, arms)
 
-    # Clearance of fingers and palm on a straight descent, for candidates that are feasible so far.
-    left_over = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
-    left_over &= np.minimum(*ends) > WALL_LABEL
+
+def _graspable(
+    candidates: Candidates,
+    lines: Lines[np.ndarray],
+    contacts: Contacts[np.ndarray],
+    held: Held[np.ndarray],
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> np.ndarray:
+    """(M,) numbers of the candidates whose pads close on one object that may be grasped."""
+    tip, width = candidates.tip, contacts.width
+    good = contacts.touched & (contacts.wedge < settings.max_wedge)
+    good &= contacts.top - tip >= settings.min_engagement
+    good &= (np.minimum(held.left, held.right) > WALL_LABEL) & (held.label >= 0) & (width > 0)
     if heights.beyond is not None:
-        left_over &= ~heights.beyond[heights.index(xy)]
+        good &= ~heights.beyond[heights.index(held.xy)]
     if gripper.least_held:
-        thickness = _thickness(low_left, low_right, along, heights.cell)
-        left_over &= thickness > gripper.least_held + UNSURE
+        thickness = _thickness(contacts.chords, candidates.axes()[0], heights.cell)
+        good &= thickness > gripper.least_held + UNSURE
     if heights.fixed is not None:  # a fixture under an object that leans over it
-        between = (u > left[:, None]) & (u < right[:, None])
-        fixed = heights.fixed.take(where).max(axis=1)
+        between = (lines.u > contacts.left[:, None]) & (lines.u < contacts.right[:, None])
+        fixed = heights.fixed.take(lines.where).max(axis=1)
         under = (tip - settings.clearance)[:, None]
-        left_over &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
-    left_over = np.nonzero(left_over & (label >= 0) & (width > 0))[0]
+        good &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
+    some = np.nonzero(good)[0]
     other = heights.label == OTHER_LABEL
     if other.any():
-        between = np.abs(u - shift[left_over, None]) < width[left_over, None] / 2
-        mixed = other.take(where[left_over]) & (height[left_over] > tip[left_over, None, None])
-        mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (len(v) * between.sum(axis=1))
-        left_over = left_over[mixed <= settings.most_other]
-    offset, opening, covered = np.zeros(N), np.zeros(N), np.zeros(N)
+        between = np.abs(lines.u - contacts.shift[some, None]) < width[some, None] / 2
+        mixed = other.take(lines.where[some]) & (lines.height[some] > tip[some, None, None])
+        mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (LINES * between.sum(axis=1))
+        some = some[mixed <= settings.most_other]
+    return some
+
+
+def _room(
+    some: np.ndarray,
+    candidates: Candidates,
+    lines: Lines[np.ndarray],
+    contacts: Contacts[np.ndarray],
+    held: Held[np.ndarray],
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) widest opening of the candidates `some` (M,) that leaves fingers and palm clearance on a
+    straight descent, and (N,) the hand's offset there; 0 of what has no room, and of others."""
+    tip, (along, across) = candidates.tip, candidates.axes()
+    offset, opening = np.zeros(len(tip)), np.zeros(len(tip))
     obstacles = heights.highest_around("height", 1, cv2.MORPH_RECT)
     for away in settings.offsets:
-        waiting = left_over[opening[left_over] == 0]
+        waiting = some[opening[some] == 0]
         room = _widest_opening(
-            obstacles.take(where[waiting]).max(axis=1), u - shift[waiting, None], away,
-            tip[waiting], width[waiting], gripper, settings,
+            obstacles.take(lines.where[waiting]).max(axis=1),
+            lines.u - contacts.shift[waiting, None], away,
+            tip[waiting], contacts.width[waiting], gripper, settings,
         )  # fmt: skip
         waiting, room = waiting[room > 0], room[room > 0]
-        middle = xy[waiting] + away * along[waiting]
+        middle = held.xy[waiting] + away * along[waiting]
         gap = _palm_gap(middle, along[waiting], across[waiting], heights, gripper)
         fits = gap >= settings.clearance - tip[waiting]
         opening[waiting[fits]], offset[waiting[fits]] = room[fits], away
-    left_over = left_over[opening[left_over] > 0]
-    beside = opening[left_over]
-    if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
-        beside = np.minimum(beside, width[left_over] + 2 * settings.rooms[-1])
-    near = np.abs(u - (shift + offset)[left_over, None])
-    under = gripper.finger_underside(near - beside[:, None] / 2)
-    over = heights.ceiling.take(where[left_over]) - under[:, None]
-    covered[left_over] = (over > tip[left_over, None, None]).mean(axis=(1, 2))
+    return opening, offset
 
-    room_beside = (opening - width) / 2 - np.abs(offset)  # on the side of the nearer finger
-    score = grip_score(
-        np, settings, wedge=wedge, turn=turn, tilt=tilt, arms=(arm_across, arm_along, arm_up),
-        cover=cover, engagement=engagement,
-        roomy=np.interp(room_beside, (0.003, 0.008), (0.4, 1.0)),
-        covered=covered, together=ends[0] == ends[1],
-        over_table=heights.rise(np.column_stack([xy, np.where(touched, top, 0.0)])),
-    )  # fmt: skip
-    feasible = np.zeros(N, bool)
-    feasible[left_over] = True
-    turn = np.clip(turn, -np.pi / settings.angles, np.pi / settings.angles)
-    facts = np.column_stack([
-        wedge, tilt_left, tilt_right, cover, arm_across, arm_along, arm_up, engagement, covered,
-        room_beside, ends[0] == ends[1],
-    ])  # fmt: skip
-    facts = np.nan_to_num(facts, posinf=np.pi, neginf=-np.pi)  # of what touches nothing
-    score *= feasible
-    return Candidates(xy, candidates.angle, tip, width, opening, offset, turn, label, score, facts)
+
+def _covered(
+    some: np.ndarray,
+    opening: np.ndarray,
+    offset: np.ndarray,
+    tip: np.ndarray,
+    lines: Lines[np.ndarray],
+    contacts: Contacts[np.ndarray],
+    heights: HeightMap,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> np.ndarray:
+    """(N,) share of the hand under which matter may be hidden; 0 but of the candidates `some`."""
+    covered, beside = np.zeros(len(tip)), opening[some]
+    if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
+        beside = np.minimum(beside, contacts.width[some] + 2 * settings.rooms[-1])
+    near = np.abs(lines.u - (contacts.shift + offset)[some, None])
+    under = gripper.finger_underside(near - beside[:, None] / 2)
+    over = heights.ceiling.take(lines.where[some]) - under[:, None]
+    covered[some] = (over > tip[some, None, None]).mean(axis=(1, 2))
+    return covered
 
 
 def without_bumps(found: Candidates, heights: HeightMap, gripper: GripperGeometry) -> Candidates:
@@ -228,16 +370,16 @@ def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.
     return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
 
 
-def _thickness(left: np.ndarray, right: np.ndarray, along: np.ndarray, cell: float) -> np.ndarray:
+def _thickness(chords: np.ndarray, along: np.ndarray, cell: float) -> np.ndarray:
     """(N,) metres between the flat pads once they have turned what they hold onto its faces; -inf
     where few lines meet matter.
 
-    left, right: (N, V) first contacts of the lines across the pads. along: (N, 2) closing lines.
+    chords: (N, V) m between the first contacts of each line. along: (N, 2) closing lines.
     The longest third of the chords counts: those of a board are alike, however it is turned. A cell
     has matter if any point lies in it, so that a shape is wider by a cell's extent along the line.
     """
-    chords = np.sort(right - left, axis=1)[:, -(left.shape[1] // 3) :]
-    return chords.mean(axis=1) - cell * np.abs(along).sum(axis=1)
+    longest = np.sort(chords, axis=1)[:, -(chords.shape[1] // 3) :]
+    return longest.mean(axis=1) - cell * np.abs(along).sum(axis=1)
 
 
 def _widest_opening(
