@@ -25,6 +25,9 @@ from models.planner_measure import (
     PALM_STEP,
     REACH,
     UNSURE,
+    Contacts,
+    Held,
+    Lines,
     least_engagement,
 )
 from utils.depth_correction import bump_height
@@ -193,99 +196,149 @@ def _measured(
     candidates: FanCandidates, maps: _Maps, gripper: GripperGeometry, settings: SearchSettings
 ) -> FanCandidates:
     """See `measure`."""
-    views, beside, under_palm = maps
-    device, cell, tip = views.height.device, views.cell, candidates.tip
-    view, width, (along, across) = candidates.view, candidates.width, candidates.axes()
-    most = np.ceil((gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH) / cell)
-    u = torch.arange(-most, most + 1, dtype=torch.float64, device=device) * cell
-    v = torch.linspace(-1, 1, LINES, dtype=torch.float64, device=device)
-    v = v * gripper.finger_half_width
-    where = cells_around(candidates.xy, view, along, across, u, v, views)  # (N, V, U)
-    height = views.height.flatten()[where]
-    highest = height.amax(dim=1)
+    views, tip = maps.views, candidates.tip
+    lines = _lines(candidates, views, gripper)
+    contacts = _contacts(candidates, lines, views.cell, settings)
+    held = _held(candidates, contacts, views, gripper)
+    good = _graspable(candidates, lines, contacts, held, views, gripper, settings)
+    near = (lines.u - contacts.shift[:, None]).abs()
+    obstacles = maps.beside.flatten()[lines.where].amax(dim=1)
+    opening = _widest_opening(obstacles, near, tip, contacts.width, gripper, settings)
+    good &= opening > 0
+    good &= _palm_gap(candidates, held, maps, gripper) >= settings.clearance - tip
+    covered = _covered(opening, near, tip, lines, contacts, views, gripper, settings)
+    opening, covered = torch.where(good, opening, 0.0), torch.where(good, covered, 0.0)
 
-    window = u.abs() <= width[:, None] / 2 + settings.rooms[0]
-    top = torch.where(window, highest, -torch.inf).amax(dim=1)
-    engagement = top - tip
-    lower, upper = contact_levels(tip, engagement)
-    low = (height > lower[:, None, None]) & window[:, None]
+    engagement, room = contacts.top - tip, (opening - contacts.width) / 2
+    tilt = torch.maximum(contacts.tilt_left, contacts.tilt_right)
+    together = held.left == held.right
+    on_top = torch.where(contacts.touched, contacts.top, 0.0)
+    score = grip_score(
+        torch, settings, wedge=contacts.wedge, turn=contacts.turn,
+        tilt=torch.where(contacts.touched, tilt, np.pi / 2), arms=held.arms, cover=contacts.cover,
+        engagement=engagement, roomy=0.4 + 0.6 * ((room - 0.003) / 0.005).clamp(0, 1),
+        covered=covered, together=together,
+        over_table=views.rise(candidates.view, torch.cat([held.xy, on_top[:, None]], dim=1)),
+    )  # fmt: skip
+    columns = (
+        contacts.wedge, contacts.tilt_left, contacts.tilt_right, contacts.cover, *held.arms,
+        engagement, covered, room, together.double(),
+    )  # fmt: skip
+    facts = torch.stack(columns, dim=1).nan_to_num(nan=0.0, posinf=np.pi, neginf=-np.pi)
+    most = np.pi / settings.angles
+    return FanCandidates(
+        candidates.view, held.xy, candidates.angle, tip, contacts.width, opening,
+        contacts.turn.clamp(-most, most), held.label, torch.where(good, score, 0.0), facts,
+        candidates.value,
+    )  # fmt: skip
+
+
+def _lines(
+    candidates: FanCandidates, views: FanViews, gripper: GripperGeometry
+) -> Lines[torch.Tensor]:
+    exact = {"dtype": torch.float64, "device": views.height.device}
+    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
+    most = np.ceil(reach / views.cell)
+    u = torch.arange(-most, most + 1, **exact) * views.cell
+    v = torch.linspace(-1, 1, LINES, **exact) * gripper.finger_half_width
+    where = cells_around(candidates.xy, candidates.view, *candidates.axes(), u, v, views)
+    height = views.height.flatten()[where]
+    return Lines(u, v, where, height, height.amax(dim=1))
+
+
+def _contacts(
+    candidates: FanCandidates, lines: Lines[torch.Tensor], cell: float, settings: SearchSettings
+) -> Contacts[torch.Tensor]:
+    tip, u = candidates.tip, lines.u
+    window = u.abs() <= candidates.width[:, None] / 2 + settings.rooms[0]
+    top = torch.where(window, lines.highest, -torch.inf).amax(dim=1)
+    lower, upper = contact_levels(tip, top - tip)
+    low = (lines.height > lower[:, None, None]) & window[:, None]
     low_left, low_right = _first_contacts(low, u, cell)
-    high = (highest > upper[:, None]) & window
+    high = (lines.highest > upper[:, None]) & window
     high_left, high_right = _first_contacts(high, u, cell)
     left, right = low_left.amin(dim=1), low_right.amax(dim=1)
     touched = left.isfinite() & high_left.isfinite()
     left, right = torch.where(touched, left, 0.0), torch.where(touched, right, 0.0)
-    width, shift = right - left, (right + left) / 2
-    turn, wedge, cover = _fit_faces(low_left - left[:, None], right[:, None] - low_right, v)
+    turn, wedge, cover = _fit_faces(low_left - left[:, None], right[:, None] - low_right, lines.v)
     rise = upper - tip - 0.001
-    tilt_left = torch.atan2((high_left - left).clamp(min=0), rise)
-    tilt_right = torch.atan2((right - high_right).clamp(min=0), rise)
-    tilt = torch.where(touched, torch.maximum(tilt_left, tilt_right), np.pi / 2)
+    return Contacts(
+        left, right, touched, top, low_right - low_left, turn, wedge, cover,
+        torch.atan2((high_left - left).clamp(min=0), rise),
+        torch.atan2((right - high_right).clamp(min=0), rise),
+    )  # fmt: skip
 
-    xy = candidates.xy + shift[:, None] * along
-    inner = (width / 3).clamp(max=0.003)
-    ends = [
+
+def _held(
+    candidates: FanCandidates,
+    contacts: Contacts[torch.Tensor],
+    views: FanViews,
+    gripper: GripperGeometry,
+) -> Held[torch.Tensor]:
+    view, (along, across) = candidates.view, candidates.axes()
+    xy = candidates.xy + contacts.shift[:, None] * along
+    inner = (contacts.width / 3).clamp(max=0.003)
+    left, right = (
         views.label.flatten()[views.cells(view, candidates.xy + end[:, None] * along)]
-        for end in (left + inner, right - inner)
-    ]
-    label = torch.maximum(*ends)
+        for end in (contacts.left + inner, contacts.right - inner)
+    )
+    label = torch.maximum(left, right)
     centre = views.centres[view, label.clamp(min=0)]
     arms = (
         ((centre[:, :2] - xy) * across).sum(dim=1).abs(),
         ((centre[:, :2] - xy) * along).sum(dim=1).abs(),
-        (centre[:, 2] - tip - gripper.pad_height / 2).abs(),
+        (centre[:, 2] - candidates.tip - gripper.pad_height / 2).abs(),
     )
+    return Held(xy, label, left, right, arms)
 
-    good = touched & (wedge < settings.max_wedge) & (engagement >= settings.min_engagement)
-    good &= (torch.minimum(*ends) > WALL_LABEL) & (label >= 0) & (width > 0)
+
+def _graspable(
+    candidates: FanCandidates,
+    lines: Lines[torch.Tensor],
+    contacts: Contacts[torch.Tensor],
+    held: Held[torch.Tensor],
+    views: FanViews,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> torch.Tensor:
+    """(N,) bool, whose pads close on one object that may be grasped."""
+    tip, width = candidates.tip, contacts.width
+    good = contacts.touched & (contacts.wedge < settings.max_wedge)
+    good &= contacts.top - tip >= settings.min_engagement
+    good &= (torch.minimum(held.left, held.right) > WALL_LABEL) & (held.label >= 0) & (width > 0)
     if views.beyond is not None:
-        good &= ~views.beyond.flatten()[views.cells(view, xy)]
+        good &= ~views.beyond.flatten()[views.cells(candidates.view, held.xy)]
     if gripper.least_held:
-        chords = (low_right - low_left).sort(dim=1).values[:, -(LINES // 3) :]
-        thickness = chords.mean(dim=1) - cell * along.abs().sum(dim=1)
+        longest = contacts.chords.sort(dim=1).values[:, -(LINES // 3) :]
+        thickness = longest.mean(dim=1) - views.cell * candidates.axes()[0].abs().sum(dim=1)
         good &= thickness > gripper.least_held + UNSURE
     if views.others:
-        between = (u - shift[:, None]).abs() < width[:, None] / 2
+        between = (lines.u - contacts.shift[:, None]).abs() < width[:, None] / 2
         mixed = (
-            (views.label.flatten()[where] == OTHER_LABEL)
-            & (height > tip[:, None, None])
+            (views.label.flatten()[lines.where] == OTHER_LABEL)
+            & (lines.height > tip[:, None, None])
             & between[:, None]
         )
         good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
-    near = (u - shift[:, None]).abs()
-    around = beside.flatten()[where].amax(dim=1)
-    opening = _widest_opening(around, near, tip, width, gripper, settings)
-    good &= opening > 0
-    gap = _palm_gap(xy, view, along, across, views, under_palm, gripper)
-    good &= gap >= settings.clearance - tip
-    open_wide = opening
-    if gripper.opens_fully:
-        open_wide = torch.minimum(opening, width + 2 * settings.rooms[-1])
-    under = _outline(gripper.finger_outline, near - open_wide[:, None] / 2)
-    over = views.ceiling.flatten()[where] - under[:, None]
-    covered = (over > tip[:, None, None]).double().mean(dim=(1, 2))
-    opening, covered = torch.where(good, opening, 0.0), torch.where(good, covered, 0.0)
+    return good
 
-    room, together = (opening - width) / 2, ends[0] == ends[1]
-    on_top = torch.where(touched, top, 0.0)
-    score = grip_score(
-        torch, settings, wedge=wedge, turn=turn, tilt=tilt, arms=arms, cover=cover,
-        engagement=engagement, roomy=0.4 + 0.6 * ((room - 0.003) / 0.005).clamp(0, 1),
-        covered=covered, together=together,
-        over_table=views.rise(view, torch.cat([xy, on_top[:, None]], dim=1)),
-    )  # fmt: skip
-    turn = turn.clamp(-np.pi / settings.angles, np.pi / settings.angles)
-    facts = torch.stack(
-        [
-            wedge, tilt_left, tilt_right, cover, *arms, engagement, covered, room,
-            together.double(),
-        ],
-        dim=1,
-    )  # fmt: skip
-    facts = facts.nan_to_num(nan=0.0, posinf=np.pi, neginf=-np.pi)
-    score = torch.where(good, score, 0.0)
-    columns = (width, opening, turn, label, score, facts, candidates.value)
-    return FanCandidates(view, xy, candidates.angle, tip, *columns)
+
+def _covered(
+    opening: torch.Tensor,
+    near: torch.Tensor,
+    tip: torch.Tensor,
+    lines: Lines[torch.Tensor],
+    contacts: Contacts[torch.Tensor],
+    views: FanViews,
+    gripper: GripperGeometry,
+    settings: SearchSettings,
+) -> torch.Tensor:
+    """(N,) share of the hand under which matter may be hidden. near: (N, U) m from its middle."""
+    if gripper.opens_fully:
+        opening = torch.minimum(opening, contacts.width + 2 * settings.rooms[-1])
+    under = _outline(gripper.finger_outline, near - opening[:, None] / 2)
+    over = views.ceiling.flatten()[lines.where] - under[:, None]
+    return (over > tip[:, None, None]).double().mean(dim=(1, 2))
 
 
 def cells_around(xy, view, along, across, u, v, views: FanViews) -> torch.Tensor:
@@ -346,16 +399,16 @@ def _widest_opening(
 
 
 def _palm_gap(
-    xy, view, along, across, views: FanViews, under_palm: torch.Tensor, gripper: GripperGeometry
+    candidates: FanCandidates, held: Held[torch.Tensor], maps: _Maps, gripper: GripperGeometry
 ) -> torch.Tensor:
     """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
+    exact = {"dtype": torch.float64, "device": held.xy.device}
     u, v = (
-        torch.linspace(
-            -end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, dtype=torch.float64, device=xy.device
-        )
+        torch.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, **exact)
         for end in (gripper.palm_half_length, gripper.palm_outline[-1][0])
     )
-    nearby = under_palm.flatten()[cells_around(xy, view, along, across, u, v, views)].amax(dim=2)
+    where = cells_around(held.xy, candidates.view, *candidates.axes(), u, v, maps.views)
+    nearby = maps.under_palm.flatten()[where].amax(dim=2)
     return (_outline(gripper.palm_outline, v.abs()) - nearby).amin(dim=1)
 
 
