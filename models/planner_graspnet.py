@@ -61,7 +61,7 @@ def loaded(checkpoint: Path) -> SavedGraspNet:
     return _loaded(checkpoint, checkpoint.stat().st_mtime if checkpoint.exists() else 0.0)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=4)  # a training replaces its file at every better score
 def _loaded(path: Path, changed: float) -> SavedGraspNet:
     saved = load_graspnet(path)
     return saved._replace(model=for_inference(saved.model, fastest_dtype()))
