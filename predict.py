@@ -52,7 +52,6 @@ from pathlib import Path
 
 import numpy as np
 
-from models.graspnet import check_rgbd
 from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
@@ -61,6 +60,7 @@ from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.atomic_files import check_writable, write_atomic
 from utils.calibration import unlikely_ones
+from utils.depth import check_rgbd
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain, scene_as_plain
@@ -169,14 +169,15 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--count", type=int, metavar="N", help="largest number of grasps; 20")
     parser.add_argument("--export", type=Path, metavar="FILE.onnx", help="write the network")
     options = parser.parse_args(argv)
-    image = [options.rgb, options.depth, options.intrinsics]
+    image = {name: getattr(options, name) for name in ("rgb", "depth", "intrinsics")}
     others = [options.depth_scale, options.camera_pose, options.table_height, options.out]
-    others += [*image, options.count, options.planner, options.workspace]
+    others += [*image.values(), options.count, options.planner, options.workspace]
     others += [options.point, options.box, options.mask]
     if options.export is not None and any(part is not None for part in others):
         raise UserError("--export writes the network and takes only --checkpoint beside it")
-    if options.export is None and any(part is None for part in image):
-        raise UserError("--rgb, --depth and --intrinsics are needed (or --export FILE.onnx)")
+    if options.export is None and (missing := [k for k, part in image.items() if part is None]):
+        lacking = ", ".join(f"--{name}" for name in missing)
+        raise UserError(f"missing: {lacking}; an image takes --rgb, --depth and --intrinsics")
     options.planner = options.planner or PLANNERS[0]
     if options.planner not in PLANNERS:
         raise unknown_choice("--planner", options.planner, PLANNERS)

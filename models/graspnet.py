@@ -18,17 +18,16 @@ from torch import nn
 
 from models.graspnet_backbones import BACKBONES
 from models.graspnet_decoding import decode_grasps
-from utils.depth import fill_holes
+from utils.depth import check_rgbd, fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry
-from utils.transforms import check_images, known_depth
+from utils.transforms import known_depth
 
 PANDA_HAND = GripperGeometry()
 
 # --- From an image to the input ------------------------------------------------------------
 
 INPUT_CHANNELS = 4  # red, green, blue, depth
-PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
 DEPTH_UNIT = 0.1  # metres of depth that count 1 in the input: objects are about that high
 OFFSET_UNIT = 10.0  # pixels to a centre of mass that count 1 in the last layer
 DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is clipped
@@ -53,29 +52,6 @@ def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
     image[:3] -= 0.5
     image[3] = centred
     return torch.from_numpy(image)
-
-
-def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
-    """Return the median of the known depths, in metres.
-
-    Raises UserError for wrong shapes or types, for an image without known depth, and for a median
-    outside `PLAUSIBLE_DEPTH`.
-    """
-    check_images(rgb, depth)
-    known = depth[known_depth(depth)]
-    if len(known) == 0:
-        raise UserError("depth: no pixel is known; all are zero, negative or NaN")
-    typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
-    if not low <= typical <= high:
-        hint = (
-            "; are these millimetres? Divide by 1000 (predict.py: --depth-scale 0.001)"
-            if typical > high
-            else ""
-        )
-        raise UserError(
-            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
-        )
-    return typical
 
 
 # --- The network ---------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from models.graspnet import INPUT_CHANNELS, GraspNet, check_rgbd, to_input
+from models.graspnet import INPUT_CHANNELS, GraspNet, to_input
 from models.graspnet_decoding import (
     LABELS,
     Peaks,
@@ -20,7 +20,7 @@ from models.graspnet_decoding import (
     find_peaks,
     surface_grasps,
 )
-from utils.depth import fill_holes
+from utils.depth import check_rgbd, fill_holes
 from utils.errors import UserError
 from utils.geometry import GripperGeometry
 from utils.grasp_labels import grasp_below_surface

@@ -79,6 +79,15 @@ def test_an_empty_table_is_searched_where_the_camera_looks() -> None:
     assert workspace.size == SMALLEST
 
 
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [(0.0, "no pixel is known"), (np.nan, "no pixel is known"), (800.0, "median is 800 m.*millim")],
+)
+def test_depths_that_mean_nothing_are_refused(depth, message) -> None:
+    with pytest.raises(UserError, match=message):
+        workspace_of(replace(scene(), depth=np.full((SIDE, SIDE), depth, np.float32)), 0.0)
+
+
 def test_of_a_scene_that_is_too_large_the_middle_or_the_place_of_the_target_is_searched() -> None:
     frame = scene((-0.8, 0.0, 0.1), (0.0, 0.1, 0.1), (0.8, 0.0, 0.1))
     workspace, remarks = workspace_of(frame, 0.0)

@@ -34,11 +34,13 @@ from scipy.special import ndtri
 from utils.errors import UserError, unknown_choice
 from utils.plugins import is_import_path, load_plugin
 from utils.random_streams import Stream
-from utils.transforms import RGBDFrame, known_depth, ray_component
+from utils.transforms import RGBDFrame, check_images, known_depth, ray_component
 
 # (H, W) float32 metres and a generator for the draws, and (H, W, 3) uint8 colours for noises that
 # have `sees_colours` -> (H, W) float32 metres, 0 where unknown.
 DepthNoise = Callable[..., np.ndarray]
+
+PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
 
 _PATTERN_SEED = 1975  # the projector's pattern never changes; any number would do
 _DOT_CELL = 3  # sensor pixels: the pattern has one dot in each square of this side
@@ -539,6 +541,29 @@ def sampled(values: np.ndarray, most: int = 10_000) -> np.ndarray:
     if len(values) <= most:
         return values
     return values[np.linspace(0, len(values) - 1, most).astype(int)]
+
+
+def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
+    """Return the median of the known depths, in metres.
+
+    Raises UserError for wrong shapes or types, for an image without known depth, and for a median
+    outside `PLAUSIBLE_DEPTH`.
+    """
+    check_images(rgb, depth)
+    known = depth[known_depth(depth)]
+    if len(known) == 0:
+        raise UserError("depth: no pixel is known; all are zero, negative or NaN")
+    typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
+    if not low <= typical <= high:
+        hint = (
+            "; are these millimetres? Divide by 1000 (predict.py: --depth-scale 0.001)"
+            if typical > high
+            else ""
+        )
+        raise UserError(
+            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
+        )
+    return typical
 
 
 def middle_depth(frame: RGBDFrame) -> float:

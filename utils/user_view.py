@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from utils.depth import depth_of_plane
+from utils.depth import check_rgbd, depth_of_plane
 from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
 from utils.errors import UserError
 from utils.geometry import Workspace
@@ -40,8 +40,9 @@ def workspace_of(
     A square of SMALLEST at least; around where the optical axis meets the table where no matter is
     seen. Where the matter is spread over more than LARGEST, the square has that side and lies
     around the pixels that the user has `marked` (H, W), else around the optical axis, and a remark
-    says so.
+    says so. Raises UserError as `check_rgbd` does: without known depths, or for other units.
     """
+    check_rgbd(frame.rgb, frame.depth)
     points = frame.points()
     raised = np.isfinite(points[..., 2]) & (points[..., 2] > table_height + LOWEST)
     middle, place = _looked_at(frame, table_height), "in the middle of the view"
