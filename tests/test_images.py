@@ -160,6 +160,9 @@ def test_intrinsics_from_numbers_and_from_a_file_are_the_same(tmp_path):
         ('{"fx": "a", "fy": 600, "cx": 160, "cy": 120}', "fx is 'a', expected a number"),
         ('{"fx": 600, "fy": 600, "cx": 160, "cy": 120, "width": 640, "height": 480}',
          "of an image of 640x480 pixels, the image has 320x240"),
+        ('{"fx": 600, "fy": 600, "cx": 320, "cy": 120}',
+         r"point \(320, 120\) lies outside the image of 320x240 pixels.*scale them"),
+        ('{"fx": 600, "fy": 600, "cx": 160, "cy": -1}', "lies outside the image"),
         ("no json", "cannot be read as JSON"),
         (None, "no such file"),
     ],
@@ -168,6 +171,15 @@ def test_an_intrinsics_file_that_does_not_fit_is_refused(tmp_path, text, message
     if text is not None:
         (tmp_path / "k.json").write_text(text)
     with pytest.raises(UserError, match=message):
+        read_intrinsics([str(tmp_path / "k.json")], 320, 240)
+
+
+def test_the_point_may_lie_beside_an_image_whose_size_the_intrinsics_name(tmp_path):
+    values = {"fx": 600, "fy": 600, "cx": 330, "cy": 120, "width": 320, "height": 240}
+    (tmp_path / "k.json").write_text(json.dumps(values))
+    assert read_intrinsics([str(tmp_path / "k.json")], 320, 240)[0, 2] == 330
+    (tmp_path / "k.json").write_text(json.dumps(values | {"cx": 481}))
+    with pytest.raises(UserError, match="far outside"):
         read_intrinsics([str(tmp_path / "k.json")], 320, 240)
 
 

@@ -242,7 +242,8 @@ def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray
                 f"{path}: intrinsics of an image of {size[0]}x{size[1]} pixels, the image has "
                 f"{width}x{height}"
             )
-        return intrinsics_matrix([values[key] for key in INTRINSICS], width, height)
+        of_this_image = "width" in values and "height" in values
+        return intrinsics_matrix([values[key] for key in INTRINSICS], width, height, of_this_image)
     try:
         numbers = [float(text) for text in given]
     except ValueError:
@@ -269,10 +270,14 @@ def _intrinsics_in(path: Path) -> dict[str, float]:
     return values
 
 
-def intrinsics_matrix(numbers: Sequence[float], width: int, height: int) -> np.ndarray:
+def intrinsics_matrix(
+    numbers: Sequence[float], width: int, height: int, of_this_image: bool = False
+) -> np.ndarray:
     """The (3, 3) K of [fx, fy, cx, cy] in pixels of an image of that size, once they are checked.
 
-    Integer coordinates lie at pixel centres, as in OpenCV and ROS.
+    Integer coordinates lie at pixel centres, as in OpenCV and ROS. of_this_image: the user says
+    that they belong to this size, so that the principal point may lie beside the image, as in a
+    part of a larger one.
     """
     if len(numbers) != 4:
         raise UserError(f"--intrinsics: got {len(numbers)} numbers, expected 4: fx fy cx cy")
@@ -290,6 +295,13 @@ def intrinsics_matrix(numbers: Sequence[float], width: int, height: int) -> np.n
         raise UserError(
             f"--intrinsics: the principal point ({cx:g}, {cy:g}) lies far outside the image of "
             f"{width}x{height} pixels; are these the intrinsics of another resolution?"
+        )
+    if not (of_this_image or (0 <= cx < width and 0 <= cy < height)):
+        raise UserError(
+            f"--intrinsics: the principal point ({cx:g}, {cy:g}) lies outside the image of "
+            f"{width}x{height} pixels, as in intrinsics of another resolution; scale them to this "
+            "one. If the image is a part of a larger one, give a JSON file with fx, fy, cx, cy and "
+            f'"width": {width}, "height": {height}'
         )
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
