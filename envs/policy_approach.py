@@ -150,7 +150,8 @@ def foreign_objects(name: str, object_sets: Sequence[str]) -> str:
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         return ""
-    trained = policy.config.get("env", {}).get("objects")
+    with reading(name):
+        trained = policy.config.get("env", {}).get("objects")
     others = [one for one in object_sets if one != trained]
     if trained is None or not others:
         return ""

@@ -20,7 +20,6 @@ from torch import nn
 
 from models.ppo import KIND, GraspPPO
 from models.ppo_observations import (
-    RENAMED_OBSERVATIONS,
     ObservationLayout,
     ObservationNormaliser,
     Observations,
@@ -32,7 +31,6 @@ from utils.checkpoint import (
     reading,
     save_checkpoint,
 )
-from utils.config import with_current_keys
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
 from utils.errors import UserError
@@ -442,18 +440,7 @@ def load_policy(path: Path | str) -> SavedPolicy:
         for name in ("image_channels", "state_dim", "privileged_dim"):
             if getattr(layout, name) != network.model_args[name]:
                 raise ValueError(f"{name} of its observations is not the network's")
-        return SavedPolicy(network, layout, extra, _current_config(checkpoint["config"]))
-
-
-def _current_config(stored: dict) -> dict:
-    """The config of a checkpoint, perhaps of an older version, in the words of this version."""
-    config = with_current_keys(stored)
-    for role in ("policy", "privileged", "estimated"):
-        key = f"{role}_observations"
-        names = config.get("rl", {}).get(key)
-        if names is not None:
-            config["rl"][key] = [RENAMED_OBSERVATIONS.get(name, name) for name in names]
-    return config
+        return SavedPolicy(network, layout, extra, checkpoint["config"])
 
 
 def save_policy(path: Path | str, policy: SavedPolicy) -> None:

@@ -22,8 +22,6 @@ from utils.distributed import ALONE, Team
 from utils.errors import UserError, unknown_choice
 
 ALL = "observation"  # the name of an observation that is no dict
-# Observations that checkpoints of older versions name differently.
-RENAMED_OBSERVATIONS = {"squeeze": "opening_error"}
 
 
 class Observations(NamedTuple):
@@ -201,13 +199,10 @@ class ObservationLayout:
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> ObservationLayout:
-        """The layout that `to_plain` stored, perhaps in an older version."""
+        """The layout that `to_plain` stored."""
         return cls(
             **{
-                name: tuple(
-                    Part(RENAMED_OBSERVATIONS.get(key, key), tuple(shape), dtype)
-                    for key, shape, dtype in parts
-                )
+                name: tuple(Part(key, tuple(shape), dtype) for key, shape, dtype in parts)
                 for name, parts in plain.items()
             }
         )

@@ -246,24 +246,6 @@ def test_unknown_choice():
     )
 
 
-@pytest.mark.parametrize(
-    "key, answer",
-    [
-        ("world=mujoco", "world: this key is now called simulator (command line)"),
-        ("grasp.gain=2", "grasp.gain: this key is now called closed_loop.gain (command line)"),
-        (
-            "randomization.adaptive.enabled=true",
-            "randomization.adaptive.enabled: this key was removed (command line); write the ranges",
-        ),
-        ("servo.seconds=5", "servo.seconds: this key was removed (command line); leave it out"),
-    ],
-)
-def test_an_old_key_is_answered_by_what_to_write_instead(key, answer):
-    with pytest.raises(ConfigError) as error:
-        load_config(None, [key])
-    assert str(error.value).startswith(answer)
-
-
 # --- Hostile files --------------------------------------------------------------------------------
 
 LAUGHS = "a: &a [x, x]\n" + "".join(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -314,19 +313,3 @@ def test_a_policy_that_cannot_be_continued_is_refused(continued, names, change, 
     space = spaces.Dict([(name, spaces.Box(-1, 1, (2,))) for name in names])
     with pytest.raises(UserError, match=message):
         continued(space, spaces.Box(-1.0, 1.0, (2,), np.float32), change)
-
-
-def test_a_checkpoint_of_an_older_version_speaks_today_s_names(tmp_path):
-    """It named an observation `squeeze`, a key `looks` and a section `world`."""
-    shipped = Path(__file__).resolve().parent.parent / "checkpoints" / "ppo_random_urdfs.pt"
-    today = load_policy(shipped)
-    stored = torch.load(shipped, weights_only=True)
-    config = stored["config"]
-    config["world"] = config.pop("simulator")
-    config["rl"]["looks"] = config["rl"].pop("pretraining_images")
-    assert config["rl"]["policy_observations"][-1] == "opening_error"
-    config["rl"]["policy_observations"][-1] = "squeeze"
-    stored["extra"]["layout"]["state"][-1][0] = "squeeze"
-    torch.save(stored, tmp_path / "old.pt")
-    policy = load_policy(tmp_path / "old.pt")
-    assert policy.layout == today.layout and policy.config == today.config

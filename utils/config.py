@@ -79,30 +79,11 @@ LARGEST_FILE = 1_000_000  # bytes of a config
 YAML_ERRORS = (yaml.YAMLError, ValueError, OverflowError, RecursionError)
 DEFAULTS = Path(__file__).resolve().parent.parent / "configs" / "default.yaml"
 
-# Old dotted keys and sections, and their new names.
-RENAMED_KEYS = {
-    "world": "simulator",
-    "grasp": "closed_loop",
-    "rl.looks": "rl.pretraining_images",
-    "rl.looks_lr": "rl.pretraining_lr",
-    "transfer.worlds": "transfer.columns",
-    "closed_loop.blind_seconds": "closed_loop.final_seconds",
-}
-
 # Keys of where a run computes, which change no result.
 COMPUTE_KEYS = ("compute.scheduler", "compute.timeout")
 
 # Keys that a file of data, such as a checkpoint, does not set: where to compute and to write.
 FOREIGN_KEYS = (*COMPUTE_KEYS, "cache_dir")
-
-# Removed dotted keys and sections, and what to do instead.
-REMOVED_KEYS = {
-    "randomization.adaptive": "write the ranges themselves under randomization.physics",
-    **dict.fromkeys(
-        ("servo.seconds", "servo.settled_distance", "servo.settled_angle", "servo.settled_frames"),
-        "leave it out, the section closed_loop says when an approach ends",
-    ),
-}
 
 
 class ConfigError(UserError):
@@ -174,32 +155,6 @@ def with_settings(config: Config, section: str, settings: Mapping[str, Any]) -> 
         return Config.model_validate(_merge(layers[0].values, layers[1].values))
     except ValidationError as error:
         raise ConfigError(explain(error, layers)) from error
-
-
-def with_current_keys(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """A config that a checkpoint of an older version stored, under the keys of this version: keys
-    that were renamed get their new names, keys that were removed are left out."""
-    current: dict[str, Any] = {}
-
-    def visit(values: Mapping[str, Any], prefix: str) -> None:
-        for name, value in values.items():
-            key = f"{prefix}{name}"
-            while (newer := new_name(key)) is not None:
-                key = newer
-            schema = schema_at(key)
-            if schema is None:
-                continue
-            if "properties" in schema:
-                visit(value, f"{prefix}{name}.")
-            else:
-                *sections, leaf = key.split(".")
-                place = current
-                for section in sections:
-                    place = place.setdefault(section, {})
-                place[leaf] = value
-
-    visit(stored, "")
-    return current
 
 
 def values_of(overrides: Sequence[str]) -> dict[str, Any]:
@@ -488,29 +443,7 @@ def explain(error: ValidationError, layers: Sequence[Layer]) -> str:
     return message + (f" (and {more} more problem{'s' * (more > 1)})" if more else "")
 
 
-def new_name(key: str) -> str | None:
-    """The new name of a key that was renamed, or whose section was; None for any other key."""
-    parts = key.split(".")
-    for length in range(len(parts), 0, -1):
-        name = RENAMED_KEYS.get(".".join(parts[:length]))
-        if name is not None:
-            return ".".join([name, *parts[length:]])
-    return None
-
-
-def _removed(key: str) -> str | None:
-    """What to do instead of setting a key that was removed; None for any other key."""
-    found = (REMOVED_KEYS[old] for old in REMOVED_KEYS if f"{key}.".startswith(f"{old}."))
-    return next(found, None)
-
-
 def unknown_key(key: str, source: str) -> str:
-    instead = _removed(key)
-    if instead is not None:
-        return f"{key}: this key was removed ({source}); {instead}"
-    renamed = new_name(key)
-    if renamed is not None:
-        return f"{key}: this key is now called {renamed} ({source}); use the new name"
     parent, _, leaf = key.rpartition(".")
     section = schema_at(parent) if parent else None
     if section and "properties" in section:  # a misspelt key in a known section
