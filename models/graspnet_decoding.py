@@ -72,18 +72,16 @@ def decode_grasps(
     return [grasp_below_surface(grasp, K, T_WC, table_height, gripper, labels) for grasp in found]
 
 
-def surface_grasps(
-    found: Peaks, depth: np.ndarray, gripper: GripperGeometry, radius: int = 1
-) -> list[ImageGrasp]:
+def surface_grasps(found: Peaks, depth: np.ndarray, gripper: GripperGeometry) -> list[ImageGrasp]:
     """Place peaks on the visible surface: the depth is the median around them, and the width is
-    limited to the gripper's opening. Peaks without known depth within `radius` pixels are left out.
+    limited to the gripper's opening. Peaks without known depth beside them are left out.
     """
     return [
         ImageGrasp(
             pixel, float(angle), surface, min(float(width), gripper.max_opening), float(quality)
         )
         for pixel, angle, width, quality, surface in zip(
-            *found, surface_depth(depth, found.pixel, radius).tolist()
+            *found, surface_depth(depth, found.pixel).tolist()
         )
         if not np.isnan(surface)
     ]

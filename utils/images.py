@@ -67,10 +67,6 @@ class PixelScaling:
         """Original places of scaled pixels (..., 2). Inverse of `pixels`."""
         return (np.asarray(pixels, float) + 0.5) / (self.u, self.v) - 0.5
 
-    def original_angles(self, angles: np.ndarray) -> np.ndarray:
-        """Original directions, in [0, pi), of lines at `angles` (...) in the scaled image."""
-        return np.mod(np.arctan2(np.sin(angles) / self.v, np.cos(angles) / self.u), np.pi)
-
     def image(self, image: np.ndarray) -> np.ndarray:
         """The scaled image of (H, W) or (H, W, C), float32 or uint8.
 
@@ -82,20 +78,6 @@ class PixelScaling:
             # Factors, not a size: a size would round them.
             image = cv2.resize(image, None, fx=along_u, fy=along_v, interpolation=method)
         return np.ascontiguousarray(image[:rows, :columns])
-
-    def original_map(self, values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-        """A scaled map (h, w) float32, linearly interpolated at the original's (H, W) pixels."""
-        # The matrix takes an original pixel to its scaled place, as WARP_INVERSE_MAP wants it.
-        matrix = np.array(
-            [[self.u, 0.0, (self.u - 1) / 2], [0.0, self.v, (self.v - 1) / 2]], dtype=float
-        )
-        return cv2.warpAffine(
-            values,
-            matrix,
-            (shape[1], shape[0]),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
 
 
 # --- A user's files -------------------------------------------------------------------------
