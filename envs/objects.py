@@ -35,6 +35,7 @@ from envs.object_primitives import (
 )
 from envs.pybullet_files import data_folder
 from models.graspable import is_graspable
+from utils.config_types import AUTO
 from utils.errors import UserError, did_you_mean, one_line
 from utils.executor import Workers, completed
 from utils.geometry import GripperGeometry
@@ -192,9 +193,11 @@ def check_object_set(name_or_path: str, where: str) -> None:
         if not (callable(found) or isinstance(found, ObjectSet) or _is_folder(found)):
             raise _no_objects(name_or_path, found, where)
         return
+    # A config's lists of sets know `auto`, too, which the config answers itself.
+    known = (AUTO, *OBJECT_SETS) if where.endswith(".object_sets") else tuple(OBJECT_SETS)
     raise ObjectError(
-        f"{where}: got {name_or_path!r}, expected one of {', '.join(OBJECT_SETS)}, an existing "
-        f"folder or an import path module:name{did_you_mean(name_or_path, OBJECT_SETS)}"
+        f"{where}: got {name_or_path!r}, expected one of {', '.join(known)}, an existing "
+        f"folder or an import path module:name{did_you_mean(name_or_path, known)}"
     )
 
 

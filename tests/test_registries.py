@@ -48,6 +48,8 @@ def test_the_defaults_comment_lists_every_entry(key):
         ("train.backbone=vgg", "train.backbone: got 'vgg', expected one of .*grconvnet"),
         ("env.reward=dens", "env.reward: got 'dens', .* did you mean dense?"),
         ("evaluate.object_sets=random_urdf", "an existing folder or .* did you mean random_urdfs?"),
+        ("evaluate.object_sets=primitive", "expected one of auto, box, primitives, "),
+        ("env.objects=primitive", "expected one of box, primitives, "),
         ("env.reward={succes: 1}", "env.reward, a term: got 'succes', .* did you mean success?"),
         ("env.control=eee", "env.control: got 'eee', expected one of ee, ee_planar, joint"),
         ("rl.activation=gelu", "rl.activation: got 'gelu', .*elu"),
