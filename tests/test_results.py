@@ -116,12 +116,22 @@ def test_a_closed_loop_is_a_policy_of_its_own():
 
 
 def test_failures_of_one_kind_are_counted_together():
-    assert stop_reasons(ROUNDS) == []
-    stops = stop_reasons([*ROUNDS, *STOPS])
+    stops = stop_reasons(STOPS)
     assert [(s.count, s.reason, s.sentence, s.seed) for s in stops] == [
         (2, "stopped", OLD.format(104), 7),
         (1, "collision", "stopped: contact with 12.0 N", 8),
     ]
+
+
+def test_a_plan_without_a_reason_had_no_grasps():
+    stops = stop_reasons(ROUNDS)
+    assert [(s.policy, s.count, s.reason, s.sentence, s.seed) for s in stops] == [
+        (policy, 1, "no_plan", "the planner returned no grasp", 1)
+        for policy in ("heuristic", "random")
+    ]
+    why = replace(attempt("no_plan"), detail="abstained: the best quality is 0.3, under 0.5")
+    (stop,) = stop_reasons([a_round("x", 2, 5, 0, [why], "no_plan")])
+    assert stop.sentence == why.detail
 
 
 def test_rounds_whose_last_objects_fell_off_are_told():

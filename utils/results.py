@@ -24,6 +24,7 @@ from utils.result_records import (
     ENDINGS,
     FAILURES,
     FELL_OFF,
+    NO_PLAN,
     OPEN_LOOP,
     RoundRecord,
     loose,
@@ -173,6 +174,7 @@ def stated_chances(rounds: Iterable[RoundRecord]) -> tuple[list[float], list[boo
 
 # --- Why attempts failed ------------------------------------------------------------------------
 
+NO_GRASPS = "the planner returned no grasp"
 _NUMBER = re.compile(r"-?\d+(\.\d+)?|\b(inf|nan)\b")
 
 
@@ -204,16 +206,17 @@ class StopReason:
 
 
 def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
-    """The failures that have a sentence, and the rounds whose last objects fell off the table, in
-    the order of the rounds; the most frequent first within one policy, scenario, object set and
-    depth noise."""
+    """The failures that have a sentence, the plans without one, which had no grasps at all, and the
+    rounds whose last objects fell off the table, in the order of the rounds; the most frequent
+    first within one policy, scenario, object set and depth noise."""
     kinds: dict[_Key, dict[tuple[str | None, str], list[tuple[str, int, str | None]]]] = {}
     for record in rounds:
         cell = kinds.setdefault((record.policy, *record.kind), {})
         for attempt in record.attempts:
-            if attempt.detail and not attempt.success:
-                kind = attempt.reason, _NUMBER.sub("#", attempt.detail)
-                cell.setdefault(kind, []).append((attempt.detail, record.seed, attempt.held))
+            detail = attempt.detail or (NO_GRASPS if attempt.reason == NO_PLAN else "")
+            if detail and not attempt.success:
+                kind = attempt.reason, _NUMBER.sub("#", detail)
+                cell.setdefault(kind, []).append((detail, record.seed, attempt.held))
         if record.ended == FELL_OFF:
             cell.setdefault((None, FELL_OFF), []).append((ENDINGS[FELL_OFF], record.seed, None))
     return [
