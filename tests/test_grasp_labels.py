@@ -320,6 +320,14 @@ def test_label_truth_of_seven_trials():
     np.testing.assert_equal(rates, [0.5, 1, np.nan, 1, 1, 0, 1])
 
 
+def test_label_truth_in_words_says_what_its_shares_are_of():
+    trials = [Trial(0.9, 1.0, True)] * 5 + [Trial(0.2, 20.0, True)]
+    assert label_truth(trials).describe() == (
+        "labels against physics: 6 executed, 100.0 % [56.6, 100.0] of the 5 positive ones succeed; "
+        "20 % of all grasps that would succeed are positive (labels are strict)"
+    )
+
+
 def test_label_truth_of_nothing_is_not_a_number():
     truth = label_truth([])
     assert truth.executed == truth.positives == 0

@@ -208,9 +208,10 @@ class LabelTruth:
         """Describe precision and recall in one line."""
         low, high = self.precision_ci95
         return (
-            f"labels against physics: {self.executed} executed, precision "
-            f"{100 * self.precision:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of "
-            f"{self.positives} positive ones, recall {100 * self.recall_weighted:.0f} %"
+            f"labels against physics: {self.executed} executed, {100 * self.precision:.1f} % "
+            f"[{100 * low:.1f}, {100 * high:.1f}] of the {self.positives} positive ones succeed; "
+            f"{100 * self.recall_weighted:.0f} % of all grasps that would succeed are positive "
+            "(labels are strict)"
         )
 
 
