@@ -456,7 +456,9 @@ def test_grasps_that_rather_fail_are_told_of() -> None:
     )
     assert unlikely_ones([likely, as_likely]) == unlikely_ones([]) == []
     (remark,) = unlikely_ones([likely, no, never])
-    assert remark.startswith("2 of the 3 grasps have a chance under 0.5")
+    assert remark.startswith("2 of the 3 grasps have a chance under 0.5, more likely to fail")
+    (remark,) = unlikely_ones([likely, no])
+    assert remark.startswith("1 of the 2 grasps has a chance under 0.5")
 
 
 def test_the_diagram_has_a_line_for_each_name() -> None:

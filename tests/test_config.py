@@ -158,7 +158,7 @@ def test_bad_override(override, parts):
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
-        ("evaluate: [1\n", ["not valid YAML", "line 2"]),
+        ("evaluate: [1\n", ["not valid YAML: while", "in line 2"]),
         ("- 1\n- 2\n", ["got a list", "'key: value'"]),
         ("just text\n", ["got a str"]),
         ("sede: 1\n", ["sede: unknown key", "did you mean seed?"]),

@@ -199,9 +199,10 @@ def unlikely_ones(grasps: Sequence[Grasp], named: str = "grasps") -> list[str]:
     count = sum(grasp.quality < LEAST_CHANCE for grasp in grasps)
     if count == 0:
         return []
+    have = "has" if count == 1 else "have"
     return [
-        f"{count} of the {len(grasps)} {named} have a chance under {LEAST_CHANCE:g}: they rather "
-        "fail than succeed"
+        f"{count} of the {len(grasps)} {named} {have} a chance under {LEAST_CHANCE:g}, more likely "
+        "to fail than to succeed"
     ]
 
 

@@ -168,6 +168,11 @@ def load_yaml(text: str) -> Any:
     return yaml.load(text, _Loader)  # a SafeLoader
 
 
+def yaml_problem(error: Exception) -> str:
+    """What one of YAML_ERRORS says, on one line: whoever names the file says where the text is."""
+    return one_line(error).replace('in "<unicode string>", line', "in line")
+
+
 def dump_config(config: Config) -> str:
     """The config as YAML that `load_config` reads back to an equal object."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
@@ -238,7 +243,7 @@ def read_config(path: Path) -> dict[str, Any]:
     except ConfigError:
         raise
     except YAML_ERRORS as error:
-        raise ConfigError(f"{path}: not valid YAML: {one_line(error)}") from error
+        raise ConfigError(f"{path}: not valid YAML: {yaml_problem(error)}") from error
     if values is None:  # an empty file changes nothing
         return {}
     if not isinstance(values, dict):
@@ -282,7 +287,7 @@ def _parse_override(text: str) -> dict[str, Any]:
             value = load_yaml(f"[{raw}]")
     except YAML_ERRORS as error:
         raise ConfigError(
-            f"{key}: cannot read {raw!r} as YAML: {one_line(error)}; expected {allowed(schema)}"
+            f"{key}: cannot read {raw!r} as YAML: {yaml_problem(error)}; expected {allowed(schema)}"
         ) from error
     named = value.items() if isinstance(value, dict) else ()
     if any(one is None and ":" in str(name) for name, one in named):
