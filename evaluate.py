@@ -33,7 +33,7 @@ from envs.objects import OBJECT_SETS
 from envs.registries import check_names
 from envs.transfer_plan import columns_of, evaluations_of, score_photographs, transfer_lines
 from models.photographs import photographs
-from utils.atomic_files import check_copies, resumption
+from utils.atomic_files import check_copies
 from utils.config import Config, load_foreign, values_of
 from utils.errors import UserError
 from utils.evaluation import (
@@ -43,6 +43,7 @@ from utils.evaluation import (
     check_rounds,
     depth_noises_of,
     describe_workers,
+    going_on,
     interruption,
     play,
     policies_of,
@@ -51,8 +52,7 @@ from utils.evaluation import (
 from utils.report import balanced, write_failures, write_report
 from utils.result_formats import (
     format_comparisons,
-    format_stop_reasons,
-    format_table,
+    format_scores,
     write_comparisons,
     write_csv,
     write_results,
@@ -86,14 +86,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int:
     """Play the rounds that are missing, and write table and report; returns the exit code."""
     announce(config, run)
-    outcome = play(config, run, work, resumption(run, copies(options)))
+    outcome = play(config, run, work, going_on(run, copies(options)))
     if outcome.error is not None and not outcome.rounds:
         raise outcome.error
 
     rows = summarise(outcome.rounds, config.seed)
     comparisons = compare(outcome.rounds, config.seed)
-    stops = format_stop_reasons(stop_reasons(outcome.rounds))
-    print(*filter(None, [format_table(rows), stops, format_comparisons(comparisons)]), sep="\n\n")
+    print(format_scores(rows, stop_reasons(outcome.rounds), comparisons))
     unfinished, device = interruption(len(outcome.rounds), config), describe_workers(config)
     results = rows, comparisons, config, device, unfinished is None
     write_results(run / "results.json", *results)
@@ -106,7 +105,7 @@ def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
     if unfinished is not None:
-        print(f"{unfinished}; go on with {resumption(run, copies(options))}")
+        print(f"{unfinished}; go on with {going_on(run, copies(options))}")
     # Last, so that the run's own files are there even where these cannot be written.
     if options.results is not None:
         write_results(options.results, *results)
@@ -223,7 +222,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
             folder = run / evaluation.column / evaluation.scenes.folder
             folder.mkdir(parents=True, exist_ok=True)
             announce(evaluation.config, folder)
-            outcome = play(evaluation.config, folder, work, resumption(run, copies(options)))
+            outcome = play(evaluation.config, folder, work, going_on(run, copies(options)))
             write_failures(folder / "failures.png", outcome.gallery)
             for row in evaluation.rows:
                 scores[row][evaluation.column] = score_of(outcome.rounds, row.planner)
@@ -240,7 +239,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
         write_transfer(run, lines, columns, config, device, complete, options.results)
         print(f"picture: {run / 'transfer.png'}")
         if not complete:
-            print(f"interrupted; go on with {resumption(run, copies(options))}")
+            print(f"interrupted; go on with {going_on(run, copies(options))}")
         if error is not None:
             raise error
         return 130 if interrupted else 0

@@ -64,13 +64,13 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
-from utils.atomic_files import cannot_write, check_writable, resumption
+from utils.atomic_files import cannot_write, check_writable
 from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
-from utils.runs import check_resume, parse_args, run_script, save_results
+from utils.runs import check_resume, parse_args, resume_command, run_script, save_results
 
 WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return cross_validate(config, options, processes)
         if photographs is not None:
             check_alone(processes)
-        data = make_data(config, processes)
+        data = make_data(config, processes, options.resume is not None)
         if photographs is not None:
             data = with_target(config, data, photographs)
         trainer = make_trainer(config, data, processes)
@@ -105,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if scores and not trainer.was_finished:
                     print(closing_words(scores, run / "graspnet.pt"))
                 if not finished:
-                    go_on = resumption(run, {"--weights": options.weights})
+                    go_on = resume_command("train_graspnet.py", run, {"--weights": options.weights})
                     print(f"stopped after {trainer.step} steps; go on with {go_on}")
     return 0 if finished else 130
 
@@ -123,13 +123,13 @@ def check_place(folder: Path) -> None:
         raise cannot_write(folder, error) from error
 
 
-def make_data(config: Config, processes: Team) -> TrainingData:
+def make_data(config: Config, processes: Team, resumed: bool) -> TrainingData:
     """Make the simulated images that are still missing, and open them. Raises UserError if they
     make no batch, or if the validation images show nothing graspable."""
     steps_per_epoch(config, config.data.frames)
     folder = generate(config, processes.rank, processes.ranks)
     processes.wait()
-    if (truth := label_truth(read_trials(folder))).positives and processes.is_main:
+    if processes.is_main and not resumed and (truth := label_truth(read_trials(folder))).positives:
         print(truth.describe())
     data = simulated_data(config, folder, float(camera_intrinsics(config.camera).K[0, 0]))
     check_graspable(data.validation)
@@ -230,7 +230,7 @@ def train_folds(
         history, finished = train(config, folder, fold.data, trainer)
         if not finished:
             if processes.is_main:
-                go_on = resumption(run, {"--weights": options.weights})
+                go_on = resume_command("train_graspnet.py", run, {"--weights": options.weights})
                 print(f"stopped in fold {fold.number}; go on with {go_on}")
             return 130
         if processes.is_main:

@@ -83,7 +83,7 @@ from utils.atomic_files import check_writable
 from utils.config import Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team
 from utils.errors import UserError
-from utils.runs import Stopwatch, check_resume, parse_args, run_script
+from utils.runs import Stopwatch, check_resume, parse_args, run_script, this_python
 
 FREE_TO_CHANGE = (
     "rl.name",
@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 # A policy that is half trained must not replace one that is not.
                 best = save_training(run, history, options.weights if finished else None)
                 print(f"best evaluation: {row_in_words(best)}; its policy: {run / 'best.pt'}")
-                print(f"curves: tensorboard --logdir {run / 'tensorboard'}")
+                print(f"curves: {this_python()} -m tensorboard.main --logdir {run / 'tensorboard'}")
                 if config.rl.env_id in OWN_ENVS:
                     print("its score on other scenes:")
                     print(f"  {scoring_command(config, run, ppo.layout, KNOWN_TO_A_ROBOT)}")

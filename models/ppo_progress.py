@@ -26,10 +26,9 @@ from models.ppo_rollouts import (
     derived_seeds,
     evaluate_policy,
 )
-from utils.atomic_files import resumption
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
-from utils.runs import Stopwatch, save_results, this_python
+from utils.runs import Stopwatch, resume_command, save_results, this_python
 
 ProgressRow = dict[str, Any]
 
@@ -160,7 +159,7 @@ def after_not_finite(run: Path) -> str:
 def after_worker_error(run: Path) -> str:
     """What to do after an environment has failed."""
     if (run / "last.pt").is_file():
-        return f"go on with --resume {run}"
+        return f"go on with {resume_command('train_rl.py', run)}"
     return "start a new run: nothing was saved before"
 
 
@@ -224,7 +223,7 @@ def stopped_in_words(
     run: Path, config: Config, updates: int, history: list[ProgressRow], weights: Path | None
 ) -> str:
     """What Ctrl-C has left after so many updates, and how to go on. weights: file of --weights."""
-    command = resumption(run, {"--weights": weights})
+    command = resume_command("train_rl.py", run, {"--weights": weights})
     done = updates * config.rl.envs * config.rl.rollout_steps
     # Where an evaluation is due, it has written a checkpoint, or was broken off with one.
     saved = done if evaluation_due(config, updates) else history[-1]["step"]

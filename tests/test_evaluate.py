@@ -30,6 +30,7 @@ from utils.evaluation import Outcome
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
 from utils.runs import run_script as end_like_a_script
+from utils.runs import this_python
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box",
@@ -428,7 +429,8 @@ def test_an_interrupted_evaluation_goes_on_with_the_files_of_its_options(
     files = ["--latex", "pairs.tex", "--csv", "pairs.csv", "--results", "copy.json"]
     assert evaluate.main([*arguments, *files]) == 130
     run = only_run(tmp_path).relative_to(tmp_path)
-    command = f"--resume {run} --results copy.json --csv pairs.csv --latex pairs.tex"
+    written = "--results copy.json --csv pairs.csv --latex pairs.tex"
+    command = f"{this_python()} evaluate.py --resume {run} {written}"
     assert told == [command]
     assert f"1 of 4 rounds; go on with {command}\n" in capsys.readouterr().out
 
@@ -447,7 +449,7 @@ def test_the_report_of_a_column_goes_on_with_that_of_the_whole_run(tmp_path, mon
                  "evaluate.depth_noises=null", "--results", "copy.json"]  # fmt: skip
     assert evaluate.main(arguments) == 130
     run = only_run(tmp_path).relative_to(tmp_path)
-    assert told == [f"--resume {run} --results copy.json"]
+    assert told == [f"{this_python()} evaluate.py --resume {run} --results copy.json"]
     assert f"interrupted; go on with {told[0]}\n" in capsys.readouterr().out
 
 

@@ -15,6 +15,7 @@ from utils.evaluation import (
     check_depth_noises,
     check_rounds,
     depth_noises_of,
+    describe_workers,
     in_order,
     interruption,
     planned_rounds,
@@ -222,3 +223,10 @@ def test_a_torn_journal_is_gone_on_with(tmp_path):
 def one_worker(*overrides):
     changes = [*changed_keys(CONFIG), "evaluate.workers=1", *overrides]
     return load_config(None, changes)
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "1 worker"), (3, "3 workers")])
+def test_one_worker_is_singular(count, words):
+    assert describe_workers(load_config(None, [f"evaluate.workers={count}"])).endswith(f", {words}")
+    cluster = load_config(None, ["compute.scheduler=tcp://a:1", f"evaluate.workers={count}"])
+    assert describe_workers(cluster) == f"the cluster of tcp://a:1, {words}"

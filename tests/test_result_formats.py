@@ -15,6 +15,7 @@ from utils.report import write_report
 from utils.result_formats import (
     TableColumn,
     format_comparisons,
+    format_scores,
     format_stop_reasons,
     format_table,
     write_comparisons_csv,
@@ -57,6 +58,16 @@ def test_results_json_is_strict_and_complete(tmp_path):
     with pytest.raises(ValueError):
         write_results(path, [bad], [], CONFIG, "CPU", complete=True)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_printed_explains_its_columns():
+    rows, pairs = summarise(ROUNDS, seed=0), compare(ROUNDS, seed=0)
+    table, why, differences = format_scores(rows, stop_reasons(ROUNDS), pairs).split("\n\n")
+    legend = table.splitlines()[-1]
+    for told in ("firm: ", "more than 15 degrees", "more than 1 cm", "plan ms: ", "picks/h: "):
+        assert told in legend
+    assert why.startswith("why") and differences.splitlines()[-1].endswith("-: undefined")
+    assert format_scores(rows, [], []) == table
 
 
 def test_csv(tmp_path):

@@ -1,5 +1,6 @@
 """Command lines, exit statuses, run folders, resumed runs, files written whole or not at all."""
 
+import io
 import json
 import os
 import re
@@ -8,12 +9,14 @@ import signal
 import subprocess
 import sys
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from tqdm import tqdm
 
 from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG
@@ -31,6 +34,7 @@ from utils.runs import (
     open_run,
     parse_args,
     plain_remarks,
+    resume_command,
     run_of_job,
     run_script,
     save_results,
@@ -46,6 +50,35 @@ def test_remarks_are_plain_lines_and_faults_keep_their_place(monkeypatch):
     assert remark == "note: 2 of 26 objects\n"
     fault = warnings.formatwarning(RuntimeWarning("nan"), RuntimeWarning, "a.py", 3)
     assert fault.startswith("a.py:3: RuntimeWarning: nan")
+
+
+@pytest.mark.parametrize("in_a_worker", [False, True])
+def test_in_a_file_a_remark_has_a_line_of_its_own_below_a_progress_bar(monkeypatch, in_a_worker):
+    for name in ("formatwarning", "showwarning"):
+        monkeypatch.setattr(warnings, name, getattr(warnings, name))
+    output = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", output)
+    with warnings.catch_warnings():
+        plain_remarks(in_a_worker)
+        warnings.simplefilter("always")
+        with nullcontext() if in_a_worker else tqdm(total=2, file=output):
+            warnings.warn("one file is left out", stacklevel=1)
+        if not in_a_worker:
+            warnings.warn("after the bar", stacklevel=1)
+    assert "note: one file is left out" in output.getvalue().split("\n")
+    assert in_a_worker or output.getvalue().endswith("\nnote: after the bar\n")
+    assert "\n\n" not in output.getvalue()
+
+
+def test_the_command_that_goes_on_can_be_copied(monkeypatch):
+    monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+    files = {"--csv": Path("a b.csv"), "--latex": None}
+    words = [sys.executable, "evaluate.py", "--resume", "run", "--csv", "a b.csv"]
+    monkeypatch.chdir("/")
+    assert shlex.split(resume_command("evaluate.py", Path("run"), files))[1:] == words[1:]
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    launch = "-m torch.distributed.run --nproc_per_node=2 train_rl.py --resume run"
+    assert resume_command("train_rl.py", Path("run")) == f"{this_python()} {launch}"
 
 
 def test_a_job_of_torchrun_finds_the_run_that_it_has_begun(tmp_path, monkeypatch):

@@ -25,6 +25,8 @@ from tests.helpers.trainings import SMALL
 from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
 from utils.grasp_data import shard_path
+from utils.grasp_labels import Trial, label_truth
+from utils.runs import this_python
 
 pytestmark = pytest.mark.slow  # all share one training, which takes most of a minute
 
@@ -123,7 +125,7 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
         interrupt_after(patch, Trainer, "train_step", lambda trainer: trainer.step == stop)
         assert train_graspnet.main([*arguments, f"--weights={shipped}"]) == 130
     (run,) = Path("runs/train_graspnet").iterdir()
-    command = f"--resume {run} --weights {shipped}\n"
+    command = f"{this_python()} train_graspnet.py --resume {run} --weights {shipped}\n"
     assert f"stopped after {stop} steps; go on with {command}" in capfd.readouterr().out
     assert load_checkpoint(run / "last.pt", KIND)["step"] == stop
     first_epoch_is_over = stop > 4
@@ -148,9 +150,12 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     monkeypatch.chdir(tmp_path)
+    sure = label_truth([Trial(1.0, 1.0, True)])
+    monkeypatch.setattr(train_graspnet, "label_truth", lambda trials: sure)
     assert train_graspnet.main(["--resume", str(copy)]) == 0
     printed = capsys.readouterr().out
     assert f"{copy} was finished before, after 3 epochs" in printed
+    assert "labels against physics" not in printed  # the run's beginning has told
     assert "best after epoch" not in printed and "evaluate.py" not in printed
     assert (copy / "last.pt").read_bytes() == (run / "last.pt").read_bytes()
     assert json.loads((copy / "results.json").read_text()) == json.loads(

@@ -214,9 +214,9 @@ def test_where_the_time_went_is_printed(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("stop", "saved", "words", "changes"),
     [
-        (3, 2, "stopped after 96 steps, but the last checkpoint is of 64: --resume {run} goes", []),
+        (3, 2, "stopped after 96 steps, but the last checkpoint is of 64: {go_on} goes", []),
         # The evaluation that is due is broken off, and no step is lost.
-        (4, 4, "128 steps, at a checkpoint; go on with --resume {run}\n", ["rl.parallel=true"]),
+        (4, 4, "128 steps, at a checkpoint; go on with {go_on}\n", ["rl.parallel=true"]),
     ],
 )
 def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
@@ -228,7 +228,8 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
         interrupt_after(patch, GraspPPO, "update", lambda ppo: ppo.updates == stop)
         assert train_rl.main(POINT) == 130
     (run,) = Path("runs/train_rl").iterdir()
-    assert words.format(run=run) in capfd.readouterr().out
+    go_on = f"{this_python()} train_rl.py --resume {run}"
+    assert words.format(go_on=go_on) in capfd.readouterr().out
     assert load_checkpoint(run / "last.pt", KIND)["step"] == saved
 
     assert train_rl.main(["--resume", str(run), *changes]) == 0
@@ -247,7 +248,7 @@ def test_ctrl_c_breaks_off_the_first_evaluation(finished, tmp_path, monkeypatch,
     (run,) = Path("runs/train_rl").iterdir()
     out, err = capfd.readouterr()
     assert err.count("interrupted: stopping") == 1 and "evaluating: 0 of 3 episodes" in err
-    command = f"--resume {run} --weights alone.pt"
+    command = f"{this_python()} train_rl.py --resume {run} --weights alone.pt"
     assert f"stopped after 0 steps, at a checkpoint; go on with {command}\n" in out
     assert "best evaluation" not in out and not Path("alone.pt").exists()
     assert train_rl.main(["--resume", str(run)]) == 0
@@ -277,7 +278,8 @@ def test_the_end_says_where_policy_and_curves_are(tmp_path, monkeypatch, capsys)
     (run,) = Path("runs/train_rl").iterdir()
     out = capsys.readouterr().out
     assert f"its policy: {run / 'best.pt'}\n" in out
-    assert f"tensorboard --logdir {run / 'tensorboard'}\n" in out
+    curves = f"{this_python()} -m tensorboard.main --logdir {run / 'tensorboard'}"
+    assert f"curves: {curves}\n" in out
     assert "evaluate.py" not in out, "which knows the project's own environments"
 
 
@@ -422,7 +424,7 @@ def test_lost_workers_end_a_run(tmp_path, monkeypatch, capsys, trouble, message)
                        f"rl.env_kwargs=trouble={trouble}"])  # fmt: skip
     assert time.monotonic() - before < 120
     (run,) = Path("runs/train_rl").iterdir()
-    assert f"go on with --resume {run}" in capsys.readouterr().err
+    assert f"go on with {this_python()} train_rl.py --resume {run}" in capsys.readouterr().err
     assert (run / "last.pt").exists()
 
 

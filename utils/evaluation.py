@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from utils.atomic_files import resumption, write_atomic
+from utils.atomic_files import write_atomic
 from utils.config import COMPUTE_KEYS, Config, load_config
 from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
@@ -35,7 +35,7 @@ from utils.result_records import (
     read_rounds,
     writing,
 )
-from utils.runs import usable_cpus
+from utils.runs import resume_command, usable_cpus
 
 # Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
 FREE_TO_CHANGE = (
@@ -256,8 +256,14 @@ def describe_workers(config: Config) -> str:
     """Where the rounds are played, such as 'x86_64 CPU, 8 workers'."""
     scheduler, count = config.compute.scheduler, config.evaluate.workers
     if scheduler is None:
-        return f"{platform.machine()} CPU, {count or usable_cpus()} workers"
-    return f"the cluster of {scheduler}, {count or 'all'} workers"
+        count = count or usable_cpus()
+    where = f"{platform.machine()} CPU" if scheduler is None else f"the cluster of {scheduler}"
+    return f"{where}, {count or 'all'} worker{'' if count == 1 else 's'}"
+
+
+def going_on(run: Path, files: Mapping[str, Path | None] | None = None) -> str:
+    """The command that goes on with an evaluation and writes the files of the same options."""
+    return resume_command("evaluate.py", run, files)
 
 
 def play(
@@ -268,15 +274,15 @@ def play(
 ) -> Outcome:
     """Play every round that rounds.jsonl in `run` does not hold yet, and add it there.
 
-    work: plays one task, in a worker process. resume: the arguments that go on, for messages; None
-    for those of `run` alone.
+    work: plays one task, in a worker process. resume: the command that goes on, for messages; None
+    for that of `run` alone.
     Ctrl-C, a scene that cannot be made and a task that no process survives end the work early; the
     tasks under way are finished after Ctrl-C, and the outcome holds everything that was played.
     Raises UserError where another process plays the same run, or has played a round twice.
     """
     journal = run / "rounds.jsonl"
     with writing(journal):
-        return _play(config, run, journal, work, resume or resumption(run, {}))
+        return _play(config, run, journal, work, resume or going_on(run))
 
 
 def _play(

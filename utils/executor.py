@@ -224,7 +224,7 @@ def _begin_process() -> None:
     """In a new process: leave signals to the main process, and end with it, even if it is killed;
     it would be waited for without an end."""
     leave_signals()
-    plain_remarks()
+    plain_remarks(in_a_worker=True)
     Thread(target=_end_with_parent, daemon=True).start()
 
 

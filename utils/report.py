@@ -35,7 +35,7 @@ from utils.result_formats import (
 )
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
 from utils.results import Comparison, Row, stated_chances, stop_reasons
-from utils.runs import git_state
+from utils.runs import git_state, this_python
 from utils.statistics import FEW_ROUNDS, Difference
 from utils.transforms import Grasp, RGBDFrame
 
@@ -106,7 +106,7 @@ def write_report(
         interruption=interruption,
         gallery=[(_png(item.image), item.caption, item.success) for item in gallery],
         videos=[(*_video(Path(file)), caption) for file, caption in videos],
-        command=shlex.join(["python", "evaluate.py", *changed_keys(config)]),
+        command=f"{this_python()} {shlex.join(['evaluate.py', *changed_keys(config)])}",
         seed=config.seed,
         commit=git.commit,
         dirty=git.dirty,

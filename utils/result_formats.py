@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 from utils.atomic_files import write_atomic
 from utils.config import Config
-from utils.result_records import CLEAN, FAILURES
+from utils.result_records import CLEAN, FAILURES, MOST_SLID, MOST_TURNED
 from utils.results import Comparison, Row, StopReason
 from utils.runs import save_results
 from utils.statistics import FEW_ROUNDS, Difference
@@ -81,10 +82,25 @@ def format_table(rows: Sequence[Row]) -> str:
     return aligned([column.title for column in columns], lines, to_the_right)
 
 
+TABLE_LEGEND = (
+    "firm: share of grasps that succeed and whose object neither turns by more than "
+    f"{math.degrees(MOST_TURNED):.0f} degrees nor slides by more than {100 * MOST_SLID:.0f} cm in "
+    "the hand; plan ms: median; picks/h: in simulated time"
+)
+
 _WHY = (
     "why attempts failed or rounds ended, where more is known than the table says; "
     "numbers and scene are the first one's"
 )
+
+
+def format_scores(
+    rows: Sequence[Row], stops: Iterable[StopReason], comparisons: Sequence[Comparison]
+) -> str:
+    """What evaluate.py prints: the table with its legend, why attempts failed, differences."""
+    table = f"{format_table(rows)}\n{TABLE_LEGEND}"
+    parts = [table, format_stop_reasons(stops), format_comparisons(comparisons)]
+    return "\n\n".join(filter(None, parts))
 
 
 def format_stop_reasons(stops: Iterable[StopReason]) -> str:
@@ -239,11 +255,18 @@ def columns_of(rows: Sequence[Row]) -> list[TableColumn]:
 # --- Comparisons --------------------------------------------------------------------------------
 
 
+_DIFFERENCE_LEGEND = (
+    "first - second on the same scenes, in percentage points with 95 % intervals; -: undefined"
+)
+
+
 def format_comparisons(comparisons: Sequence[Comparison]) -> str:
-    """Paired differences in percentage points as aligned text; an empty text if there are none."""
+    """Paired differences in percentage points as aligned text with a legend; an empty text if there
+    are none."""
     if not comparisons:
         return ""
-    return aligned(*_difference_cells(comparisons, "paired difference"))
+    table = aligned(*_difference_cells(comparisons, "paired difference"))
+    return f"{table}\n{_DIFFERENCE_LEGEND}"
 
 
 def _difference_cells(

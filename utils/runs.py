@@ -29,9 +29,11 @@ from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TextIO
 
-from utils.atomic_files import DISK_ERRORS, locked, write_atomic, write_json_atomic
+from tqdm import tqdm
+
+from utils.atomic_files import DISK_ERRORS, locked, resumption, write_atomic, write_json_atomic
 from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError, one_line
 from utils.plugins import is_import_path
@@ -130,8 +132,17 @@ def this_python() -> str:
     return shlex.quote(str(interpreter))
 
 
-def plain_remarks() -> None:
-    """Print this project's remarks, which are `UserWarning`s, as one plain line each."""
+def resume_command(script: str, run: Path, files: Mapping[str, Path | None] | None = None) -> str:
+    """The command that goes on with a run of 'SCRIPT.py' and writes the files of the same options:
+    '.venv/bin/python SCRIPT.py --resume RUN --csv FILE', by torchrun where that started this."""
+    ranks = os.environ.get("LOCAL_WORLD_SIZE", "1")
+    launch = "" if ranks == "1" else f"-m torch.distributed.run --nproc_per_node={ranks} "
+    return f"{this_python()} {launch}{script} {resumption(run, files or {})}"
+
+
+def plain_remarks(in_a_worker: bool = False) -> None:
+    """Print this project's remarks, which are `UserWarning`s, as one plain line each: above the
+    progress bars of a terminal, and in a file, or from a worker, below what they have written."""
     whole = warnings.formatwarning
 
     def plain(
@@ -145,7 +156,25 @@ def plain_remarks() -> None:
             return f"note: {' '.join(str(message).split())}\n"
         return whole(message, category, filename, lineno, line)
 
-    warnings.formatwarning = plain
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        stream = sys.stderr if file is None else file
+        if stream is None:  # as of a program without a console
+            return
+        text = warnings.formatwarning(message, category, filename, lineno, line)
+        bars = in_a_worker or bool(getattr(tqdm, "_instances", ()))
+        if stream.isatty() and not in_a_worker:
+            tqdm.write(text, file=stream, end="")
+        else:  # nothing wipes the bars out, and their line lacks its end
+            stream.write("\n" * bars + text)
+
+    warnings.formatwarning, warnings.showwarning = plain, show
 
 
 def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
