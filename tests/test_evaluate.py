@@ -129,8 +129,9 @@ def test_a_run_is_compared_with_another(finished, tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(tmp_path)
     files = ["--csv", "pairs.csv", "--latex", "pairs.tex", "--results", "pairs.json"]
     assert evaluate.main(["--compare", str(only_run(folder)), str(other), *files]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4 and all("+0.0 (under 20 rounds)  2" in line for line in lines[2:])
+    _, _, *pairs, legend = capsys.readouterr().out.splitlines()
+    assert len(pairs) == 2 and all("+0.0 (under 20 rounds)  2" in line for line in pairs)
+    assert legend.startswith("first - second on the same scenes")
     pairs = json.loads((tmp_path / "pairs.json").read_text())["comparisons"]
     assert [pair["first"][:9] for pair in pairs] == ["heuristic", "random (2"]
     assert pairs[0]["cleared"] == {"value": 0.0, "low": 0.0, "high": 0.0, "rounds": 2}
