@@ -196,17 +196,13 @@ def _measured(
     candidates: FanCandidates, maps: _Maps, gripper: GripperGeometry, settings: SearchSettings
 ) -> FanCandidates:
     """See `measure`."""
-    views, tip = maps.views, candidates.tip
-    lines = _lines(candidates, views, gripper)
-    contacts = _contacts(candidates, lines, views.cell, settings)
-    held = _held(candidates, contacts, views, gripper)
-    good = _graspable(candidates, lines, contacts, held, views, gripper, settings)
-    near = (lines.u - contacts.shift[:, None]).abs()
-    obstacles = maps.beside.flatten()[lines.where].amax(dim=1)
-    opening = _widest_opening(obstacles, near, tip, contacts.width, gripper, settings)
-    good &= opening > 0
-    good &= _palm_gap(candidates, held, maps, gripper) >= settings.clearance - tip
-    covered = _covered(opening, near, tip, lines, contacts, views, gripper, settings)
+    views = maps.views
+    posed = _Posed(candidates, maps, gripper, settings)
+    tip, contacts, held = posed.tip, posed.contacts, posed.held
+    opening = posed.widest_opening()
+    good = posed.graspable() & (opening > 0)
+    good &= posed.palm_gap() >= settings.clearance - tip
+    covered = posed.covered(opening)
     opening, covered = torch.where(good, opening, 0.0), torch.where(good, covered, 0.0)
 
     engagement, room = contacts.top - tip, (opening - contacts.width) / 2
@@ -233,112 +229,143 @@ def _measured(
     )  # fmt: skip
 
 
-def _lines(
-    candidates: FanCandidates, views: FanViews, gripper: GripperGeometry
-) -> Lines[torch.Tensor]:
-    exact = {"dtype": torch.float64, "device": views.height.device}
-    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
-    most = np.ceil(reach / views.cell)
-    u = torch.arange(-most, most + 1, **exact) * views.cell
-    v = torch.linspace(-1, 1, LINES, **exact) * gripper.finger_half_width
-    where = cells_around(candidates.xy, candidates.view, *candidates.axes(), u, v, views)
-    height = views.height.flatten()[where]
-    return Lines(u, v, where, height, height.amax(dim=1))
+class _Posed:
+    """Candidates on the maps of their views, their pads closed on what is between them."""
 
+    def __init__(
+        self,
+        candidates: FanCandidates,
+        maps: _Maps,
+        gripper: GripperGeometry,
+        settings: SearchSettings,
+    ):
+        self.maps, self.views, self.gripper, self.settings = maps, maps.views, gripper, settings
+        self.view, self.xy, self.tip = candidates.view, candidates.xy, candidates.tip
+        self.along, self.across = candidates.axes()
+        self.lines = self._lines()
+        self.contacts = self._contacts(candidates.width)
+        self.held = self._held()
 
-def _contacts(
-    candidates: FanCandidates, lines: Lines[torch.Tensor], cell: float, settings: SearchSettings
-) -> Contacts[torch.Tensor]:
-    tip, u = candidates.tip, lines.u
-    window = u.abs() <= candidates.width[:, None] / 2 + settings.rooms[0]
-    top = torch.where(window, lines.highest, -torch.inf).amax(dim=1)
-    lower, upper = contact_levels(tip, top - tip)
-    low = (lines.height > lower[:, None, None]) & window[:, None]
-    low_left, low_right = _first_contacts(low, u, cell)
-    high = (lines.highest > upper[:, None]) & window
-    high_left, high_right = _first_contacts(high, u, cell)
-    left, right = low_left.amin(dim=1), low_right.amax(dim=1)
-    touched = left.isfinite() & high_left.isfinite()
-    left, right = torch.where(touched, left, 0.0), torch.where(touched, right, 0.0)
-    turn, wedge, cover = _fit_faces(low_left - left[:, None], right[:, None] - low_right, lines.v)
-    rise = upper - tip - 0.001
-    return Contacts(
-        left, right, touched, top, low_right - low_left, turn, wedge, cover,
-        torch.atan2((high_left - left).clamp(min=0), rise),
-        torch.atan2((right - high_right).clamp(min=0), rise),
-    )  # fmt: skip
+    @property
+    def _exact(self) -> dict:
+        return {"dtype": torch.float64, "device": self.xy.device}
 
+    def _cells(self, xy: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        return cells_around(xy, self.view, self.along, self.across, u, v, self.views)
 
-def _held(
-    candidates: FanCandidates,
-    contacts: Contacts[torch.Tensor],
-    views: FanViews,
-    gripper: GripperGeometry,
-) -> Held[torch.Tensor]:
-    view, (along, across) = candidates.view, candidates.axes()
-    xy = candidates.xy + contacts.shift[:, None] * along
-    inner = (contacts.width / 3).clamp(max=0.003)
-    left, right = (
-        views.label.flatten()[views.cells(view, candidates.xy + end[:, None] * along)]
-        for end in (contacts.left + inner, contacts.right - inner)
-    )
-    label = torch.maximum(left, right)
-    centre = views.centres[view, label.clamp(min=0)]
-    arms = (
-        ((centre[:, :2] - xy) * across).sum(dim=1).abs(),
-        ((centre[:, :2] - xy) * along).sum(dim=1).abs(),
-        (centre[:, 2] - candidates.tip - gripper.pad_height / 2).abs(),
-    )
-    return Held(xy, label, left, right, arms)
+    def _lines(self) -> Lines[torch.Tensor]:
+        views, gripper = self.views, self.gripper
+        reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
+        most = np.ceil(reach / views.cell)
+        u = torch.arange(-most, most + 1, **self._exact) * views.cell
+        v = torch.linspace(-1, 1, LINES, **self._exact) * gripper.finger_half_width
+        where = self._cells(self.xy, u, v)
+        height = views.height.flatten()[where]
+        return Lines(u, v, where, height, height.amax(dim=1))
 
-
-def _graspable(
-    candidates: FanCandidates,
-    lines: Lines[torch.Tensor],
-    contacts: Contacts[torch.Tensor],
-    held: Held[torch.Tensor],
-    views: FanViews,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> torch.Tensor:
-    """(N,) bool, whose pads close on one object that may be grasped."""
-    tip, width = candidates.tip, contacts.width
-    good = contacts.touched & (contacts.wedge < settings.max_wedge)
-    good &= contacts.top - tip >= settings.min_engagement
-    good &= (torch.minimum(held.left, held.right) > WALL_LABEL) & (held.label >= 0) & (width > 0)
-    if views.beyond is not None:
-        good &= ~views.beyond.flatten()[views.cells(candidates.view, held.xy)]
-    if gripper.least_held:
-        longest = contacts.chords.sort(dim=1).values[:, -(LINES // 3) :]
-        thickness = longest.mean(dim=1) - views.cell * candidates.axes()[0].abs().sum(dim=1)
-        good &= thickness > gripper.least_held + UNSURE
-    if views.others:
-        between = (lines.u - contacts.shift[:, None]).abs() < width[:, None] / 2
-        mixed = (
-            (views.label.flatten()[lines.where] == OTHER_LABEL)
-            & (lines.height > tip[:, None, None])
-            & between[:, None]
+    def _contacts(self, claimed: torch.Tensor) -> Contacts[torch.Tensor]:
+        tip, lines, u, cell = self.tip, self.lines, self.lines.u, self.views.cell
+        window = u.abs() <= claimed[:, None] / 2 + self.settings.rooms[0]
+        top = torch.where(window, lines.highest, -torch.inf).amax(dim=1)
+        lower, upper = contact_levels(tip, top - tip)
+        low = (lines.height > lower[:, None, None]) & window[:, None]
+        low_left, low_right = _first_contacts(low, u, cell)
+        high = (lines.highest > upper[:, None]) & window
+        high_left, high_right = _first_contacts(high, u, cell)
+        left, right = low_left.amin(dim=1), low_right.amax(dim=1)
+        touched = left.isfinite() & high_left.isfinite()
+        left, right = torch.where(touched, left, 0.0), torch.where(touched, right, 0.0)
+        turn, wedge, cover = _fit_faces(
+            low_left - left[:, None], right[:, None] - low_right, lines.v
         )
-        good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
-    return good
+        rise = upper - tip - 0.001
+        return Contacts(
+            left, right, touched, top, low_right - low_left, turn, wedge, cover,
+            torch.atan2((high_left - left).clamp(min=0), rise),
+            torch.atan2((right - high_right).clamp(min=0), rise),
+        )  # fmt: skip
 
+    def _held(self) -> Held[torch.Tensor]:
+        contacts, views = self.contacts, self.views
+        xy = self.xy + contacts.shift[:, None] * self.along
+        inner = (contacts.width / 3).clamp(max=0.003)
+        left, right = (
+            views.label.flatten()[views.cells(self.view, self.xy + end[:, None] * self.along)]
+            for end in (contacts.left + inner, contacts.right - inner)
+        )
+        label = torch.maximum(left, right)
+        centre = views.centres[self.view, label.clamp(min=0)]
+        arms = (
+            ((centre[:, :2] - xy) * self.across).sum(dim=1).abs(),
+            ((centre[:, :2] - xy) * self.along).sum(dim=1).abs(),
+            (centre[:, 2] - self.tip - self.gripper.pad_height / 2).abs(),
+        )
+        return Held(xy, label, left, right, arms)
 
-def _covered(
-    opening: torch.Tensor,
-    near: torch.Tensor,
-    tip: torch.Tensor,
-    lines: Lines[torch.Tensor],
-    contacts: Contacts[torch.Tensor],
-    views: FanViews,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> torch.Tensor:
-    """(N,) share of the hand under which matter may be hidden. near: (N, U) m from its middle."""
-    if gripper.opens_fully:
-        opening = torch.minimum(opening, contacts.width + 2 * settings.rooms[-1])
-    under = _outline(gripper.finger_outline, near - opening[:, None] / 2)
-    over = views.ceiling.flatten()[lines.where] - under[:, None]
-    return (over > tip[:, None, None]).double().mean(dim=(1, 2))
+    def graspable(self) -> torch.Tensor:
+        """(N,) bool, whose pads close on one object that may be grasped."""
+        views, settings, lines = self.views, self.settings, self.lines
+        contacts, held, tip, width = self.contacts, self.held, self.tip, self.contacts.width
+        good = contacts.touched & (contacts.wedge < settings.max_wedge)
+        good &= contacts.top - tip >= settings.min_engagement
+        good &= torch.minimum(held.left, held.right) > WALL_LABEL
+        good &= (held.label >= 0) & (width > 0)
+        if views.beyond is not None:
+            good &= ~views.beyond.flatten()[views.cells(self.view, held.xy)]
+        if self.gripper.least_held:
+            longest = contacts.chords.sort(dim=1).values[:, -(LINES // 3) :]
+            thickness = longest.mean(dim=1) - views.cell * self.along.abs().sum(dim=1)
+            good &= thickness > self.gripper.least_held + UNSURE
+        if views.others:
+            between = (lines.u - contacts.shift[:, None]).abs() < width[:, None] / 2
+            mixed = (
+                (views.label.flatten()[lines.where] == OTHER_LABEL)
+                & (lines.height > tip[:, None, None])
+                & between[:, None]
+            )
+            good &= mixed.sum(dim=(1, 2)) / (LINES * between.sum(dim=1)) <= settings.most_other
+        return good
+
+    def widest_opening(self) -> torch.Tensor:
+        """(N,) widest opening of the fingers that is free on a straight descent; 0 where none
+        is."""
+        gripper, settings, width = self.gripper, self.settings, self.contacts.width
+        obstacles = self.maps.beside.flatten()[self.lines.where].amax(dim=1)
+        rooms = (np.inf,) if gripper.opens_fully else settings.rooms
+        half = torch.stack([width / 2 + room for room in rooms])  # (rooms, N)
+        half = half.clamp(max=gripper.max_opening / 2)
+        least = width / 2 + settings.rooms[0]
+        sill = torch.where(self._near > least[:, None], settings.clearance + 0.001, torch.inf)
+        outward = self._near - half[..., None]
+        below_finger = _outline(gripper.finger_outline, outward.clamp(min=0))
+        under = torch.where(outward < -settings.inner_margin, sill, below_finger)
+        fits = (obstacles - under).amax(dim=2) <= self.tip - settings.clearance
+        fits &= half >= least - 1e-9
+        return torch.where(fits, 2 * half, 0.0).amax(dim=0)
+
+    @property
+    def _near(self) -> torch.Tensor:
+        """(N, U) m along the closing lines, from the middle between the contacts."""
+        return (self.lines.u - self.contacts.shift[:, None]).abs()
+
+    def palm_gap(self) -> torch.Tensor:
+        """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below
+        it."""
+        ends = self.gripper.palm_half_length, self.gripper.palm_outline[-1][0]
+        u, v = (
+            torch.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, **self._exact)
+            for end in ends
+        )
+        nearby = self.maps.under_palm.flatten()[self._cells(self.held.xy, u, v)].amax(dim=2)
+        return (_outline(self.gripper.palm_outline, v.abs()) - nearby).amin(dim=1)
+
+    def covered(self, opening: torch.Tensor) -> torch.Tensor:
+        """(N,) share of the hand under which matter may be hidden. opening: (N,) m."""
+        if self.gripper.opens_fully:
+            opening = torch.minimum(opening, self.contacts.width + 2 * self.settings.rooms[-1])
+        under = _outline(self.gripper.finger_outline, self._near - opening[:, None] / 2)
+        over = self.views.ceiling.flatten()[self.lines.where] - under[:, None]
+        return (over > self.tip[:, None, None]).double().mean(dim=(1, 2))
 
 
 def cells_around(xy, view, along, across, u, v, views: FanViews) -> torch.Tensor:
@@ -374,42 +401,6 @@ def _fit_faces(
     slope = (spread * gap).sum(dim=-1) / torch.where(variance > 1e-9, variance, torch.inf)
     left, right = slope.atan()
     return -(left - right) / 2, (left + right).abs() / 2, cover
-
-
-def _widest_opening(
-    obstacles: torch.Tensor,
-    near: torch.Tensor,
-    tip: torch.Tensor,
-    width: torch.Tensor,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> torch.Tensor:
-    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is."""
-    rooms = (np.inf,) if gripper.opens_fully else settings.rooms
-    half = torch.stack([width / 2 + room for room in rooms])  # (rooms, N)
-    half = half.clamp(max=gripper.max_opening / 2)
-    least = width / 2 + settings.rooms[0]
-    sill = torch.where(near > least[:, None], settings.clearance + 0.001, torch.inf)
-    outward = near - half[..., None]
-    below_finger = _outline(gripper.finger_outline, outward.clamp(min=0))
-    under = torch.where(outward < -settings.inner_margin, sill, below_finger)
-    fits = (obstacles - under).amax(dim=2) <= tip - settings.clearance
-    fits &= half >= least - 1e-9
-    return torch.where(fits, 2 * half, 0.0).amax(dim=0)
-
-
-def _palm_gap(
-    candidates: FanCandidates, held: Held[torch.Tensor], maps: _Maps, gripper: GripperGeometry
-) -> torch.Tensor:
-    """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
-    exact = {"dtype": torch.float64, "device": held.xy.device}
-    u, v = (
-        torch.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1, **exact)
-        for end in (gripper.palm_half_length, gripper.palm_outline[-1][0])
-    )
-    where = cells_around(held.xy, candidates.view, *candidates.axes(), u, v, maps.views)
-    nearby = maps.under_palm.flatten()[where].amax(dim=2)
-    return (_outline(gripper.palm_outline, v.abs()) - nearby).amin(dim=1)
 
 
 def _outline(outline: Sequence[tuple[float, float]], outward: torch.Tensor) -> torch.Tensor:

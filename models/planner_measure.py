@@ -124,14 +124,12 @@ def measure(
     depths: how many times the same places and angles follow each other, at other heights of the
     fingertips.
     """
-    tip = candidates.tip
-    lines = _lines(candidates, heights, gripper, settings, depths)
-    contacts = _contacts(candidates, lines, heights.cell, settings)
-    held = _held(candidates, contacts, heights, gripper)
-    some = _graspable(candidates, lines, contacts, held, heights, gripper, settings)
-    opening, offset = _room(some, candidates, lines, contacts, held, heights, gripper, settings)
+    posed = _Posed(candidates, heights, gripper, settings, depths)
+    tip, contacts, held = posed.tip, posed.contacts, posed.held
+    some = posed.graspable()
+    opening, offset = posed.room(some)
     some = some[opening[some] > 0]
-    covered = _covered(some, opening, offset, tip, lines, contacts, heights, gripper, settings)
+    covered = posed.covered(some, opening, offset)
 
     engagement = contacts.top - tip
     beside = (opening - contacts.width) / 2 - np.abs(offset)  # on the side of the nearer finger
@@ -159,162 +157,179 @@ def measure(
     )  # fmt: skip
 
 
-def _lines(
-    candidates: Candidates,
-    heights: HeightMap,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-    depths: int,
-) -> Lines[np.ndarray]:
-    along, across = candidates.axes()
-    reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
-    reach += np.abs(settings.offsets).max()
-    most = np.ceil(reach / heights.cell)
-    u = np.arange(-most, most + 1) * heights.cell
-    v = np.linspace(-1, 1, LINES) * gripper.finger_half_width
-    once = len(candidates) // depths
-    where = cells_around(candidates.xy[:once], along[:once], across[:once], u, v, heights)
-    height = heights.height.take(where)
-    highest = height.max(axis=1)
-    if depths > 1:
-        where, height = (np.tile(part, (depths, 1, 1)) for part in (where, height))
-        highest = np.tile(highest, (depths, 1))
-    return Lines(u, v, where, height, highest)
+class _Posed:
+    """Candidates on a map, their pads closed on what is between them."""
 
+    def __init__(
+        self,
+        candidates: Candidates,
+        heights: HeightMap,
+        gripper: GripperGeometry,
+        settings: SearchSettings,
+        depths: int,
+    ):
+        self.heights, self.gripper, self.settings = heights, gripper, settings
+        self.xy, self.tip = candidates.xy, candidates.tip
+        self.along, self.across = candidates.axes()
+        self.lines = self._lines(depths)
+        self.contacts = self._contacts(candidates.width)
+        self.held = self._held()
 
-def _contacts(
-    candidates: Candidates, lines: Lines[np.ndarray], cell: float, settings: SearchSettings
-) -> Contacts[np.ndarray]:
-    """A pad stops where the first of the lines across it meets matter. The slope of the contacts
-    across the pad gives the angle to the face, their shift with height its tilt."""
-    tip, u = candidates.tip, lines.u
-    # Searched a little beyond the width that the candidate claims.
-    window = np.abs(u) <= candidates.width[:, None] / 2 + settings.rooms[0]
-    top = np.where(window, lines.highest, -np.inf).max(axis=1)
-    lower, upper = contact_levels(tip, top - tip)
-    low = (lines.height > lower[:, None, None]) & window[:, None]
-    low_left, low_right = _first_contacts(low, u, cell)
-    high = (lines.highest > upper[:, None]) & window
-    high_left, high_right = _first_contacts(high, u, cell)
-    left, right = low_left.min(axis=1), low_right.max(axis=1)
-    touched = np.isfinite(left) & np.isfinite(high_left)
-    left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
-    turn, wedge, cover = fit_faces(low_left - left[:, None], right[:, None] - low_right, lines.v)
-    rise = upper - tip - 0.001
-    return Contacts(
-        left, right, touched, top, low_right - low_left, turn, wedge, cover,
-        np.arctan2(np.maximum(high_left - left, 0), rise),
-        np.arctan2(np.maximum(right - high_right, 0), rise),
-    )  # fmt: skip
+    def _lines(self, depths: int) -> Lines[np.ndarray]:
+        heights, gripper = self.heights, self.gripper
+        reach = gripper.max_opening / 2 + gripper.finger_outline[-1][0] + REACH
+        reach += np.abs(self.settings.offsets).max()
+        most = np.ceil(reach / heights.cell)
+        u = np.arange(-most, most + 1) * heights.cell
+        v = np.linspace(-1, 1, LINES) * gripper.finger_half_width
+        xy, along, across = (
+            part[: len(part) // depths] for part in (self.xy, self.along, self.across)
+        )
+        where = cells_around(xy, along, across, u, v, heights)
+        height = heights.height.take(where)
+        highest = height.max(axis=1)
+        if depths > 1:
+            where, height = (np.tile(part, (depths, 1, 1)) for part in (where, height))
+            highest = np.tile(highest, (depths, 1))
+        return Lines(u, v, where, height, highest)
 
+    def _contacts(self, claimed: np.ndarray) -> Contacts[np.ndarray]:
+        """A pad stops where the first of the lines across it meets matter. The slope of the
+        contacts across the pad gives the angle to the face, their shift with height its tilt.
 
-def _held(
-    candidates: Candidates,
-    contacts: Contacts[np.ndarray],
-    heights: HeightMap,
-    gripper: GripperGeometry,
-) -> Held[np.ndarray]:
-    along, across = candidates.axes()
-    xy = candidates.xy + contacts.shift[:, None] * along
-    inner = np.minimum(0.003, contacts.width / 3)
-    left, right = (
-        heights.label[heights.index(candidates.xy + (end[:, None] * along))]
-        for end in (contacts.left + inner, contacts.right - inner)
-    )
-    label = np.maximum(left, right)
-    centre = heights.centres[np.maximum(label, 0)]  # walls and table have none
-    arms = (
-        np.abs(((centre[:, :2] - xy) * across).sum(axis=1)),
-        np.abs(((centre[:, :2] - xy) * along).sum(axis=1)),
-        np.abs(centre[:, 2] - candidates.tip - gripper.pad_height / 2),
-    )
-    return Held(xy, label, left, right, arms)
-
-
-def _graspable(
-    candidates: Candidates,
-    lines: Lines[np.ndarray],
-    contacts: Contacts[np.ndarray],
-    held: Held[np.ndarray],
-    heights: HeightMap,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> np.ndarray:
-    """(M,) numbers of the candidates whose pads close on one object that may be grasped."""
-    tip, width = candidates.tip, contacts.width
-    good = contacts.touched & (contacts.wedge < settings.max_wedge)
-    good &= contacts.top - tip >= settings.min_engagement
-    good &= (np.minimum(held.left, held.right) > WALL_LABEL) & (held.label >= 0) & (width > 0)
-    if heights.beyond is not None:
-        good &= ~heights.beyond[heights.index(held.xy)]
-    if gripper.least_held:
-        thickness = _thickness(contacts.chords, candidates.axes()[0], heights.cell)
-        good &= thickness > gripper.least_held + UNSURE
-    if heights.fixed is not None:  # a fixture under an object that leans over it
-        between = (lines.u > contacts.left[:, None]) & (lines.u < contacts.right[:, None])
-        fixed = heights.fixed.take(lines.where).max(axis=1)
-        under = (tip - settings.clearance)[:, None]
-        good &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
-    some = np.nonzero(good)[0]
-    other = heights.label == OTHER_LABEL
-    if other.any():
-        between = np.abs(lines.u - contacts.shift[some, None]) < width[some, None] / 2
-        mixed = other.take(lines.where[some]) & (lines.height[some] > tip[some, None, None])
-        mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (LINES * between.sum(axis=1))
-        some = some[mixed <= settings.most_other]
-    return some
-
-
-def _room(
-    some: np.ndarray,
-    candidates: Candidates,
-    lines: Lines[np.ndarray],
-    contacts: Contacts[np.ndarray],
-    held: Held[np.ndarray],
-    heights: HeightMap,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) widest opening of the candidates `some` (M,) that leaves fingers and palm clearance on a
-    straight descent, and (N,) the hand's offset there; 0 of what has no room, and of others."""
-    tip, (along, across) = candidates.tip, candidates.axes()
-    offset, opening = np.zeros(len(tip)), np.zeros(len(tip))
-    obstacles = heights.highest_around("height", 1, cv2.MORPH_RECT)
-    for away in settings.offsets:
-        waiting = some[opening[some] == 0]
-        room = _widest_opening(
-            obstacles.take(lines.where[waiting]).max(axis=1),
-            lines.u - contacts.shift[waiting, None], away,
-            tip[waiting], contacts.width[waiting], gripper, settings,
+        claimed: (N,) m, widths of the candidates. Contacts are searched a little beyond them.
+        """
+        tip, lines, u, cell = self.tip, self.lines, self.lines.u, self.heights.cell
+        window = np.abs(u) <= claimed[:, None] / 2 + self.settings.rooms[0]
+        top = np.where(window, lines.highest, -np.inf).max(axis=1)
+        lower, upper = contact_levels(tip, top - tip)
+        low = (lines.height > lower[:, None, None]) & window[:, None]
+        low_left, low_right = _first_contacts(low, u, cell)
+        high = (lines.highest > upper[:, None]) & window
+        high_left, high_right = _first_contacts(high, u, cell)
+        left, right = low_left.min(axis=1), low_right.max(axis=1)
+        touched = np.isfinite(left) & np.isfinite(high_left)
+        left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
+        turn, wedge, cover = fit_faces(
+            low_left - left[:, None], right[:, None] - low_right, lines.v
+        )
+        rise = upper - tip - 0.001
+        return Contacts(
+            left, right, touched, top, low_right - low_left, turn, wedge, cover,
+            np.arctan2(np.maximum(high_left - left, 0), rise),
+            np.arctan2(np.maximum(right - high_right, 0), rise),
         )  # fmt: skip
-        waiting, room = waiting[room > 0], room[room > 0]
-        middle = held.xy[waiting] + away * along[waiting]
-        gap = _palm_gap(middle, along[waiting], across[waiting], heights, gripper)
-        fits = gap >= settings.clearance - tip[waiting]
-        opening[waiting[fits]], offset[waiting[fits]] = room[fits], away
-    return opening, offset
 
+    def _held(self) -> Held[np.ndarray]:
+        contacts, heights = self.contacts, self.heights
+        xy = self.xy + contacts.shift[:, None] * self.along
+        inner = np.minimum(0.003, contacts.width / 3)
+        left, right = (
+            heights.label[heights.index(self.xy + (end[:, None] * self.along))]
+            for end in (contacts.left + inner, contacts.right - inner)
+        )
+        label = np.maximum(left, right)
+        centre = heights.centres[np.maximum(label, 0)]  # walls and table have none
+        arms = (
+            np.abs(((centre[:, :2] - xy) * self.across).sum(axis=1)),
+            np.abs(((centre[:, :2] - xy) * self.along).sum(axis=1)),
+            np.abs(centre[:, 2] - self.tip - self.gripper.pad_height / 2),
+        )
+        return Held(xy, label, left, right, arms)
 
-def _covered(
-    some: np.ndarray,
-    opening: np.ndarray,
-    offset: np.ndarray,
-    tip: np.ndarray,
-    lines: Lines[np.ndarray],
-    contacts: Contacts[np.ndarray],
-    heights: HeightMap,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> np.ndarray:
-    """(N,) share of the hand under which matter may be hidden; 0 but of the candidates `some`."""
-    covered, beside = np.zeros(len(tip)), opening[some]
-    if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
-        beside = np.minimum(beside, contacts.width[some] + 2 * settings.rooms[-1])
-    near = np.abs(lines.u - (contacts.shift + offset)[some, None])
-    under = gripper.finger_underside(near - beside[:, None] / 2)
-    over = heights.ceiling.take(lines.where[some]) - under[:, None]
-    covered[some] = (over > tip[some, None, None]).mean(axis=(1, 2))
-    return covered
+    def graspable(self) -> np.ndarray:
+        """(M,) numbers of the candidates whose pads close on one object that may be grasped."""
+        heights, settings, lines = self.heights, self.settings, self.lines
+        contacts, held, tip, width = self.contacts, self.held, self.tip, self.contacts.width
+        good = contacts.touched & (contacts.wedge < settings.max_wedge)
+        good &= contacts.top - tip >= settings.min_engagement
+        good &= (np.minimum(held.left, held.right) > WALL_LABEL) & (held.label >= 0) & (width > 0)
+        if heights.beyond is not None:
+            good &= ~heights.beyond[heights.index(held.xy)]
+        if self.gripper.least_held:
+            thickness = _thickness(contacts.chords, self.along, heights.cell)
+            good &= thickness > self.gripper.least_held + UNSURE
+        if heights.fixed is not None:  # a fixture under an object that leans over it
+            between = (lines.u > contacts.left[:, None]) & (lines.u < contacts.right[:, None])
+            fixed = heights.fixed.take(lines.where).max(axis=1)
+            under = (tip - settings.clearance)[:, None]
+            good &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
+        some = np.nonzero(good)[0]
+        other = heights.label == OTHER_LABEL
+        if other.any():
+            between = np.abs(lines.u - contacts.shift[some, None]) < width[some, None] / 2
+            mixed = other.take(lines.where[some]) & (lines.height[some] > tip[some, None, None])
+            mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (LINES * between.sum(axis=1))
+            some = some[mixed <= settings.most_other]
+        return some
+
+    def room(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) widest opening of the candidates `some` (M,) that leaves fingers and palm clearance
+        on a straight descent, and (N,) the hand's offset there; 0 of what has no room, and of
+        others."""
+        offset, opening = np.zeros(len(self.tip)), np.zeros(len(self.tip))
+        for away in self.settings.offsets:
+            waiting = some[opening[some] == 0]
+            room = self._widest_opening(waiting, away)
+            waiting, room = waiting[room > 0], room[room > 0]
+            fits = self._palm_gap(waiting, away) >= self.settings.clearance - self.tip[waiting]
+            opening[waiting[fits]], offset[waiting[fits]] = room[fits], away
+        return opening, offset
+
+    def _widest_opening(self, some: np.ndarray, offset: float) -> np.ndarray:
+        """(M,) widest opening of the fingers of the candidates `some` that is free on a straight
+        descent; 0 where none is. Of a gripper that opens fully only the widest of all counts.
+
+        offset: m along the closing line, of the hand's middle from that of the contacts.
+        """
+        gripper, settings, contacts = self.gripper, self.settings, self.contacts
+        tip, width = self.tip[some], contacts.width[some]
+        obstacles = self.heights.highest_around("height", 1, cv2.MORPH_RECT)
+        obstacles = obstacles.take(self.lines.where[some]).max(axis=1)
+        beside = self.lines.u - contacts.shift[some, None]
+        # Between contact and finger only the closing pads pass, over all that is below the tips.
+        closing = np.abs(beside) > width[:, None] / 2 + settings.rooms[0]
+        sill = np.where(closing, settings.clearance + 0.001, np.inf)
+        near, half_width = np.abs(beside - offset), width / 2 + abs(offset)
+        opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
+        for room in (np.inf,) if gripper.opens_fully else reversed(settings.rooms):
+            half = np.minimum(half_width[open_yet] + room, gripper.max_opening / 2)
+            outward = near[open_yet] - half[:, None]
+            below_finger = gripper.finger_underside(np.maximum(outward, 0))
+            under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
+            fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
+            fits &= half >= half_width[open_yet] + settings.rooms[0] - 1e-9
+            opening[open_yet[fits]] = 2 * half[fits]
+            open_yet = open_yet[~fits]
+        return opening
+
+    def _palm_gap(self, some: np.ndarray, offset: float) -> np.ndarray:
+        """(M,) smallest gap between the palm's underside, fingertips at 0, and the matter below
+        it, of the candidates `some`. offset: as in `_widest_opening`."""
+        heights, gripper = self.heights, self.gripper
+        along, across = self.along[some], self.across[some]
+        # Samples lie PALM_STEP apart, so each must stand for the highest cell within
+        # PALM_STEP / sqrt(2); one more cell for rounding to the grid.
+        radius = int(np.ceil(PALM_STEP / np.sqrt(2) / heights.cell)) + 1
+        scene = heights.highest_around("ceiling", radius, cv2.MORPH_ELLIPSE)
+        ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
+        u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1) for end in ends)
+        middle = self.held.xy[some] + offset * along
+        nearby = scene.take(cells_around(middle, along, across, u, v, heights)).max(axis=2)
+        return (gripper.palm_underside(v) - nearby).min(axis=1)
+
+    def covered(self, some: np.ndarray, opening: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """(N,) share of the hand under which matter may be hidden; 0 but of the candidates
+        `some`. opening, offset: (N,) m."""
+        gripper, lines, contacts = self.gripper, self.lines, self.contacts
+        covered, beside = np.zeros(len(self.tip)), opening[some]
+        if gripper.opens_fully:  # what may be hidden beside the contacts counts all the same
+            beside = np.minimum(beside, contacts.width[some] + 2 * self.settings.rooms[-1])
+        near = np.abs(lines.u - (contacts.shift + offset)[some, None])
+        under = gripper.finger_underside(near - beside[:, None] / 2)
+        over = self.heights.ceiling.take(lines.where[some]) - under[:, None]
+        covered[some] = (over > self.tip[some, None, None]).mean(axis=(1, 2))
+        return covered
 
 
 def without_bumps(found: Candidates, heights: HeightMap, gripper: GripperGeometry) -> Candidates:
@@ -380,50 +395,3 @@ def _thickness(chords: np.ndarray, along: np.ndarray, cell: float) -> np.ndarray
     """
     longest = np.sort(chords, axis=1)[:, -(chords.shape[1] // 3) :]
     return longest.mean(axis=1) - cell * np.abs(along).sum(axis=1)
-
-
-def _widest_opening(
-    obstacles: np.ndarray,
-    beside: np.ndarray,
-    offset: float,
-    tip: np.ndarray,
-    width: np.ndarray,
-    gripper: GripperGeometry,
-    settings: SearchSettings,
-) -> np.ndarray:
-    """(N,) widest opening of the fingers that is free on a straight descent; 0 where none is. Of a
-    gripper that opens fully only the widest of all counts.
-
-    obstacles, beside: (N, U) heights along the closing line and where they are, from the middle of
-    the contacts. offset: of the hand's middle from there.
-    """
-    # Between contact and finger only the closing pads pass, over all that is below the tips.
-    sill = np.where(
-        np.abs(beside) > width[:, None] / 2 + settings.rooms[0], settings.clearance + 0.001, np.inf
-    )
-    near, half_width = np.abs(beside - offset), width / 2 + abs(offset)
-    opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
-    for room in (np.inf,) if gripper.opens_fully else reversed(settings.rooms):
-        half = np.minimum(half_width[open_yet] + room, gripper.max_opening / 2)
-        outward = near[open_yet] - half[:, None]
-        below_finger = gripper.finger_underside(np.maximum(outward, 0))
-        under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
-        fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
-        fits &= half >= half_width[open_yet] + settings.rooms[0] - 1e-9
-        opening[open_yet[fits]] = 2 * half[fits]
-        open_yet = open_yet[~fits]
-    return opening
-
-
-def _palm_gap(
-    xy, along, across, heights: HeightMap, gripper: GripperGeometry, step: float = PALM_STEP
-) -> np.ndarray:
-    """(N,) smallest gap between the palm's underside, fingertips at 0, and the matter below it."""
-    # Samples lie `step` apart, so each must stand for the highest cell within step / sqrt(2); one
-    # more cell for rounding to the grid.
-    radius = int(np.ceil(step / np.sqrt(2) / heights.cell)) + 1
-    scene = heights.highest_around("ceiling", radius, cv2.MORPH_ELLIPSE)
-    ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
-    u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / step)) + 1) for end in ends)
-    nearby = scene.take(cells_around(xy, along, across, u, v, heights)).max(axis=2)
-    return (gripper.palm_underside(v) - nearby).min(axis=1)
