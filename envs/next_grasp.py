@@ -33,7 +33,7 @@ ROOM_OVER_TOUCH = 0.004  # m above the height of a contact
 class Failures:
     """The grasps that failed: in a row, with the places (3,), m in W, of the hand where its palm
     met something, None elsewhere; and in the round, where nothing was picked since. slipped:
-    whether the last of them lost what it had gripped, as empty fingers tell."""
+    whether the judge found that the last of them had lost what it had gripped."""
 
     in_a_row: list[Grasp] = field(default_factory=list)
     palm_stops: list[np.ndarray | None] = field(default_factory=list)
