@@ -60,7 +60,7 @@ from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.atomic_files import check_writable, write_atomic
 from utils.calibration import unlikely_ones
-from utils.depth import check_rgbd
+from utils.depth_holes import check_rgbd
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain, scene_as_plain

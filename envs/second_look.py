@@ -27,8 +27,9 @@ from envs.robot_kinematics import (
 )
 from envs.robot_motion import Trajectory
 from envs.robot_safety import ArmStoppedError
-from utils.depth import seeded_noise, surfaces_in_holes, table_in_holes
+from utils.depth import seeded_noise
 from utils.depth_correction import corrected
+from utils.depth_holes import surfaces_in_holes, table_in_holes
 from utils.geometry import Workspace
 from utils.height_map import HeightMap, height_map_from_frame
 from utils.next_view import OpenSpace, dome

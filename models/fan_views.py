@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from utils.depth import depth_of_plane
+from utils.depth_holes import depth_of_plane
 from utils.height_map import LABEL_FLOOR, OTHER_LABEL, RIM, HeightMap
 from utils.seen_heights import (
     BORROWED_WITHIN,

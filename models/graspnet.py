@@ -18,7 +18,7 @@ from torch import nn
 
 from models.graspnet_backbones import BACKBONES
 from models.graspnet_decoding import decode_grasps
-from utils.depth import check_rgbd, fill_holes
+from utils.depth_holes import check_rgbd, fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry
 from utils.transforms import known_depth

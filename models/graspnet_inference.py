@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from models.graspnet import INPUT_CHANNELS, GraspNet, to_input
-from utils.depth import check_rgbd, fill_holes
+from utils.depth_holes import check_rgbd, fill_holes
 from utils.errors import UserError
 from utils.images import PixelScaling
 from utils.transforms import RGBDFrame

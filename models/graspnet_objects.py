@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from utils.depth import nearest_values
+from utils.depth_holes import nearest_values
 from utils.height_map import HeightMap, base_heights, local_maxima
 from utils.images import PixelScaling
 from utils.seen_heights import hides

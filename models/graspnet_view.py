@@ -21,7 +21,7 @@ from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_objects import labelled_by_centres
 from models.planner_candidates import Candidates
-from utils.depth import (
+from utils.depth_holes import (
     TABLE_FLATNESS,
     depth_of_plane,
     reach_in_pixels,

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers.box_frames import CORNERS, boxes_frame
-from utils.depth import GammaNoise, make_depth_noise, measure, table_in_holes
+from utils.depth import GammaNoise, make_depth_noise, measure
 from utils.depth_correction import (
     COLOUR_NOISE,
     SMOOTHING_RADIUS,
@@ -20,6 +20,7 @@ from utils.depth_correction import (
     smoothed_by_colour,
     table_roughness,
 )
+from utils.depth_holes import table_in_holes
 from utils.geometry import ConvexSolid, Workspace, intersect_lines
 from utils.height_map import height_map_from_frame
 from utils.transforms import RGBDFrame, deproject, look_at

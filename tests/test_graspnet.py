@@ -14,7 +14,7 @@ from models.graspnet import (
 )
 from models.graspnet_backbones import BACKBONES, GGCNNBackbone, GRConvNetBackbone
 from utils.checkpoint import load_checkpoint, load_weights, save_checkpoint
-from utils.depth import fill_holes
+from utils.depth_holes import fill_holes
 from utils.errors import UserError
 
 BINS = 18

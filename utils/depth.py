@@ -1,4 +1,4 @@
-"""Depth images: the noise that real cameras add, and what unmeasured pixels may show.
+"""The noise that real cameras add to depth images.
 
 A depth noise is a callable `noise(depth, rng) -> depth` that turns a clean depth image into a
 measured one; one with `sees_colours = True` is called with the colours too, `noise(depth, rng,
@@ -14,15 +14,14 @@ classification" (ICRA 2014), whose window of projected dots makes the holes. `Re
 active stereo camera, `GammaNoise` the noise with which Dex-Net 2.0 and GIGA were trained,
 `GaussianNoise` that of the Edge Grasp Network's tests.
 
-Holes (pixels without a depth) lie at the edges of whatever stands up, in its shadow, and cover thin
-parts. `near_side`, `table_in_holes`, `surfaces_in_holes` and `fill_holes` fill them, each for
-another purpose. This module knows no simulator, no network and no grasps.
+What the holes may show that they leave is the subject of `utils.depth_holes`. This module knows no
+simulator, no network and no grasps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,13 +33,11 @@ from scipy.special import ndtri
 from utils.errors import UserError, unknown_choice
 from utils.plugins import is_import_path, load_plugin
 from utils.random_streams import Stream
-from utils.transforms import RGBDFrame, check_images, known_depth, ray_component
+from utils.transforms import known_depth
 
 # (H, W) float32 metres and a generator for the draws, and (H, W, 3) uint8 colours for noises that
 # have `sees_colours` -> (H, W) float32 metres, 0 where unknown.
 DepthNoise = Callable[..., np.ndarray]
-
-PLAUSIBLE_DEPTH = (0.05, 10.0)  # metres; millimetres read as metres lie far above, from 50 up
 
 _PATTERN_SEED = 1975  # the projector's pattern never changes; any number would do
 _DOT_CELL = 3  # sensor pixels: the pattern has one dot in each square of this side
@@ -170,7 +167,7 @@ class KinectNoise:
         matched = np.zeros_like(disparity)
         flat, stride = matched.reshape(-1), matched.shape[1]
         index, value = rows * stride + cols, disparity[rows, cols]
-        for dv, du in _farthest_first(matching.reach):  # the nearest is written last
+        for dv, du in farthest_first(matching.reach):  # the nearest is written last
             flat[index + (dv * stride + du)] = value
         return matched
 
@@ -212,7 +209,7 @@ def _whole_windows(
 
 
 @lru_cache(maxsize=32)
-def _farthest_first(reach: int) -> tuple[tuple[int, int], ...]:
+def farthest_first(reach: int) -> tuple[tuple[int, int], ...]:
     """Offsets (dv, du) of a disc's pixels; among equally far ones in reading order."""
     across = range(-reach, reach + 1)
     disc = [(dv, du) for dv in across for du in across if dv**2 + du**2 <= reach**2]
@@ -463,188 +460,3 @@ def seeded_noise(
         return lambda depth, rgb: depth
     rng = np.random.default_rng([seed, frame, stream])
     return lambda depth, rgb: measure(noise, depth, rng, rgb)
-
-
-# --- Holes ----------------------------------------------------------------------------------
-
-HOLE_REACH = 0.03  # m from a hole's rim to its middle, up to which it can be filled
-TABLE_FLATNESS = 0.006  # m over the table, up to which a measured point is the table
-SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
-# What differs from the table's colour by less than LIKE_TABLE (three channels, 0..255) may be it; a
-# hole is, if its colour differs UNLIKE_OBJECT times as much from the nearest object's.
-LIKE_TABLE = 30.0
-UNLIKE_OBJECT = 2.0
-# A hole is at an edge where measured depths within EDGE_REACH pixels differ by EDGE_STEP metres. In
-# other holes may stand a thin part that was lost whole.
-EDGE_REACH = 3
-EDGE_STEP = 0.012
-SURFACE_REACH = 0.012  # m around a hole's pixel in which a surface of its colour is looked for
-LIKE_SURFACE = 20.0  # by less than this differ the colours of one surface, three channels together
-
-
-def fill_holes(depth: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth whose unknown pixels take the value of the nearest known one."""
-    depth = np.asarray(depth, np.float32)
-    known = known_depth(depth)
-    return depth if known.all() or not known.any() else nearest_values(depth, known)
-
-
-def nearest_values(values: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(H, W, ...) at each pixel the value of the nearest pixel in the mask `of` (H, W) bool.
-
-    The mask has to hold at least one pixel.
-    """
-    _, label = cv2.distanceTransformWithLabels(
-        (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    value = np.zeros((label.max() + 1, *values.shape[2:]), values.dtype)
-    value[label[of]] = values[of]
-    return value[label]
-
-
-def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
-    """(H, W) depth whose unknown pixels take the nearest surface around their hole, up to `reach`
-    pixels away through the hole.
-
-    Depth cameras lose pixels at the edges of whatever stands up, and thin parts whole; a finger
-    that took such a hole for table would collide with them. Wider holes, whose middle is out of
-    reach, stay 0: a black object may fill them.
-    """
-    unknown = ~known_depth(depth)
-    if not unknown.any():
-        return depth
-    far = np.float32(np.finfo(np.float32).max)
-    known = nearest = np.where(unknown, far, depth).astype(np.float32)
-    for _ in range(reach):
-        nearest = np.where(unknown, cv2.erode(nearest, np.ones((3, 3), np.uint8)), known)
-    return np.where((nearest < far) & ~_wide(unknown, reach), nearest, np.float32(0))
-
-
-def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
-    """(H, W) bool: holes that hold a square of 2 reach + 1 pixels."""
-    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
-
-
-def at_edges(depth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels of a depth image (H, W), m, within EDGE_REACH pixels of measured depths
-    that differ by more than EDGE_STEP."""
-    known = known_depth(depth)
-    square = np.ones((2 * EDGE_REACH + 1, 2 * EDGE_REACH + 1), np.uint8)
-    farthest = cv2.dilate(np.where(known, depth, 0).astype(np.float32), square)
-    nearest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), square)
-    return farthest - nearest > EDGE_STEP
-
-
-def sampled(values: np.ndarray, most: int = 10_000) -> np.ndarray:
-    """At most so many of values (N, ...), evenly spread: enough for statistics, and quicker."""
-    if len(values) <= most:
-        return values
-    return values[np.linspace(0, len(values) - 1, most).astype(int)]
-
-
-def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
-    """Return the median of the known depths, in metres.
-
-    Raises UserError for wrong shapes or types, for an image without known depth, and for a median
-    outside `PLAUSIBLE_DEPTH`.
-    """
-    check_images(rgb, depth)
-    known = depth[known_depth(depth)]
-    if len(known) == 0:
-        raise UserError("depth: no pixel is known; all are zero, negative or NaN")
-    typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
-    if not low <= typical <= high:
-        hint = (
-            "; are these millimetres? Divide by 1000 (predict.py: --depth-scale 0.001)"
-            if typical > high
-            else ""
-        )
-        raise UserError(
-            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
-        )
-    return typical
-
-
-def middle_depth(frame: RGBDFrame) -> float:
-    """The median known depth, m, of a sample of the pixels; infinite where none is known."""
-    known = sampled(frame.depth[known_depth(frame.depth)])
-    return float(np.median(known)) if len(known) else np.inf
-
-
-def reach_in_pixels(frame: RGBDFrame, metres: float) -> int:
-    """The number of pixels that span `metres` at the median known depth; at least 1."""
-    return max(1, round(metres * (frame.K[0, 0] + frame.K[1, 1]) / 2 / middle_depth(frame)))
-
-
-def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The frame with the table's depth in those holes that have its colour.
-
-    A hole beside an object is its shadow or a part of it: depth alone cannot tell, colour often
-    can. A pixel that has the colour of the table beside it and not that of the nearest object
-    becomes table. All others stay unknown, and so do wide holes, which an object of the table's
-    colour, or of glass, may fill.
-    """
-    known = known_depth(frame.depth)
-    if known.all() or not known.any():
-        return frame
-    high = known & (frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS))
-    # Smeared pixels have the colour of what lies behind.
-    inside = _eroded(high, reach_in_pixels(frame, SMEAR))
-    smooth = cv2.medianBlur(frame.rgb, 3)
-    holes = ~known & ~_wide(~known, reach_in_pixels(frame, HOLE_REACH))
-    colours = frame.rgb[holes].astype(float)
-    table, item = (
-        np.linalg.norm(colours - nearest_values(smooth, of)[holes], axis=-1) if of.any() else np.inf
-        for of in (known & ~high, inside)
-    )
-    depth = frame.depth.copy()
-    like_table = (table < LIKE_TABLE) & (UNLIKE_OBJECT * table < item)
-    depth[holes] = np.where(like_table, depth_of_plane(frame, table_height)[holes], depth[holes])
-    return replace(frame, depth=depth)
-
-
-def surfaces_in_holes(frame: RGBDFrame) -> RGBDFrame:
-    """The frame with the depth of the surfaces beside them in those holes that have their colour.
-
-    The lost rim of an object has the object's colour, and the shadow beside it that of what lies
-    below. Each pixel takes the depth of the nearest measured pixel within SURFACE_REACH whose
-    colour differs by less than LIKE_SURFACE; where there is none it stays unknown. So do holes
-    that are not `at_edges`.
-    """
-    known = known_depth(frame.depth)
-    if known.all() or not known.any():
-        return frame
-    reach = reach_in_pixels(frame, SURFACE_REACH)
-    width = known.shape[1] + 2 * reach
-    measured = np.pad(np.where(known, frame.depth, 0), reach).ravel()
-    colours = np.pad(frame.rgb.astype(np.int32), ((reach, reach), (reach, reach), (0, 0)))
-    colours = colours.reshape(-1, 3)
-    filled = measured.copy()
-    left = np.flatnonzero(np.pad(~known & at_edges(frame.depth), reach))
-    for down, right in reversed(_farthest_first(reach)):
-        beside = left + down * width + right
-        difference = ((colours[beside] - colours[left]) ** 2).sum(axis=1)
-        alike = (measured[beside] > 0) & (difference < LIKE_SURFACE**2)
-        filled[left[alike]] = measured[beside[alike]]
-        left = left[~alike]
-    depth = filled.reshape(-1, width)[reach:-reach, reach:-reach]
-    return replace(frame, depth=np.where(known, frame.depth, depth).astype(frame.depth.dtype))
-
-
-def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:
-    """A mask (H, W) without its rim; pieces that would vanish stay whole."""
-    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    inside = cv2.erode(mask.astype(np.uint8), window) > 0
-    count, piece = cv2.connectedComponents(mask.astype(np.uint8))
-    left = np.zeros(count, bool)
-    left[piece[inside]] = True
-    return inside | (mask & ~left[piece])
-
-
-def depth_of_plane(frame: RGBDFrame, height: float) -> np.ndarray:
-    """(H, W) depth at which each pixel's ray meets the plane z = height in W; infinite or negative
-    where it does not."""
-    down = ray_component(2, frame.depth.shape, frame.K, frame.T_WC)
-    with np.errstate(divide="ignore"):
-        return (height - frame.T_WC[2, 3]) / down

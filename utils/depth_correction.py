@@ -4,7 +4,7 @@ The table's height is known. So the table shows by which factor the camera measu
 near, and how rough a flat surface appears. `corrected` takes both errors out of a frame: the first
 by a factor, the second by a filter whose guide is the colour image, so that edges of objects stay,
 and by the table's own depth where the colour is the table's.
-Holes are the subject of `utils.depth`. This module knows no simulator and no network.
+Holes are the subject of `utils.depth_holes`. This module knows no simulator and no network.
 """
 
 from __future__ import annotations
@@ -14,7 +14,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from utils.depth import LIKE_TABLE, depth_of_plane, middle_depth, reach_in_pixels, sampled
+from utils.depth_holes import (
+    LIKE_TABLE,
+    depth_of_plane,
+    middle_depth,
+    reach_in_pixels,
+    sampled,
+)
 from utils.transforms import RGBDFrame, inverse_pose, known_depth, transform_points
 
 TRUSTED_SCALE = 0.002  # errors of the scale below this are left alone: 1.6 mm at 0.8 m

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from utils.depth import nearest_values
+from utils.depth_holes import nearest_values
 from utils.geometry import ConvexSolid, SceneGeometry, Workspace, intersect_lines
 from utils.seen_heights import (
     FARTHEST,

@@ -23,7 +23,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from utils.config import YAML_ERRORS, load_yaml
-from utils.depth import nearest_values
+from utils.depth_holes import nearest_values
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth, look_at, project

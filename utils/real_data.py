@@ -192,9 +192,9 @@ def fill_depth_holes(depth: np.ndarray) -> np.ndarray:
 
     A hole is NaN, infinite, or outside MIN_DEPTH..MAX_DEPTH: the 0 or -1 of sensors, and the foot
     of the ramp that inpainting left at the border of Cornell's images. Nearest means Euclidean
-    distance in the image, exactly (`utils.depth.fill_holes` is faster and approximates it); unlike
-    inpainting this never invents a depth that was not measured. Raises ValueError if no pixel was
-    measured.
+    distance in the image, exactly (`utils.depth_holes.fill_holes` is faster and approximates it);
+    unlike inpainting this never invents a depth that was not measured. Raises ValueError if no
+    pixel was measured.
     """
     depth = np.asarray(depth, dtype=np.float32)
     hole = ~((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH))  # comparisons with NaN are False

@@ -16,7 +16,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from utils.depth import HOLE_REACH, at_edges, depth_of_plane, near_side, reach_in_pixels
+from utils.depth_holes import (
+    HOLE_REACH,
+    at_edges,
+    depth_of_plane,
+    near_side,
+    reach_in_pixels,
+)
 from utils.geometry import Workspace
 from utils.transforms import (
     RGBDFrame,

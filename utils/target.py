@@ -14,7 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from utils.depth import nearest_values
+from utils.depth_holes import nearest_values
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import HUNG, OTHER_LABEL, HeightMap

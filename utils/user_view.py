@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from utils.depth import check_rgbd, depth_of_plane
 from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
+from utils.depth_holes import check_rgbd, depth_of_plane
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import LABEL_FLOOR
