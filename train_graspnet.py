@@ -150,8 +150,8 @@ def train(
     config: Config, run: Path, data: TrainingData, trainer: Trainer
 ) -> tuple[list[dict[str, float]], bool]:
     """Train from the folder's last.pt, if it is there, to the end of the schedule or to Ctrl-C.
-    Returns the history, with a row of mean losses and scores for every epoch, and whether the end
-    was reached."""
+    Returns the history, with a row of mean losses (of this process's examples) and scores for every
+    epoch, and whether the end was reached."""
     processes, steps = trainer.team, steps_per_epoch(config, len(data.train))
     history, losses = trainer.resume(run / "last.pt")  # losses: of steps after history's last row
     save = partial(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from envs.policy_approach import check_learned, is_learned
-from models.photographs import judge_as_taken, judge_photographs
+from models.photographs import HAND, judge_as_taken, judge_photographs
 from models.rectangle_examples import JudgedRectangle, draw_rectangles
 from utils.config import Config, TransferPolicy, with_settings
 from utils.errors import UserError, unknown_choice
@@ -60,10 +60,16 @@ COLUMNS: dict[str, SimulatedColumn | PhotographColumn] = {
 
 
 def columns_of(config: Config) -> dict[str, SimulatedColumn | PhotographColumn]:
-    """The report's columns by their names. Raises UserError for an unknown name."""
+    """The report's columns by their names. Raises UserError for an unknown name, and
+    for photographs if the hand is not the default one."""
     for name in config.transfer.columns:
         if name not in COLUMNS:
             raise unknown_choice("transfer.columns", name, COLUMNS)
+        if isinstance(COLUMNS[name], PhotographColumn) and config.gripper.geometry != HAND:
+            raise UserError(
+                f"transfer.columns: {name} judges photographs for the default hand alone; leave "
+                "gripper.* as it is, or the column out"
+            )
     return {name: COLUMNS[name] for name in config.transfer.columns}
 
 

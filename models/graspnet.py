@@ -21,6 +21,7 @@ from models.graspnet_decoding import decode_grasps
 from utils.depth_holes import check_rgbd, fill_holes
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry
+from utils.grasp_labels import ANGLE_BINS
 from utils.transforms import known_depth
 
 PANDA_HAND = GripperGeometry()
@@ -30,22 +31,26 @@ PANDA_HAND = GripperGeometry()
 INPUT_CHANNELS = 4  # red, green, blue, depth
 DEPTH_UNIT = 0.1  # metres of depth that count 1 in the input: objects are about that high
 OFFSET_UNIT = 10.0  # pixels to a centre of mass that count 1 in the last layer
-DEPTH_LIMIT = 0.3  # metres from the median beyond which depth is clipped
+DEPTH_LIMIT = 0.3  # metres from the level beyond which depth is clipped
 
 
-def to_input(rgb: np.ndarray, depth: np.ndarray) -> torch.Tensor:
+def to_input(rgb: np.ndarray, depth: np.ndarray, level: float | None = None) -> torch.Tensor:
     """Return the network's input (4, H, W) float32 of one image; the one place of normalisation.
 
     rgb: (H, W, 3) uint8. depth: (H, W) metres; 0, negative or not finite means unknown.
-    Colours become -0.5..0.5. Depth is filled from the nearest known pixel, centred by its median
-    (so that the camera's distance does not matter) and clipped to +-0.3 m, which become +-3.
-    Raises UserError as `check_rgbd` does.
+    level: m, the depth that becomes 0; None: the median, which is the table's in most images.
+    Colours become -0.5..0.5. Depth is filled from the nearest known pixel, centred (so that the
+    camera's distance does not matter) and clipped to +-0.3 m, which become +-3. Raises UserError
+    as `check_rgbd` does.
     """
     median = check_rgbd(rgb, depth)
     filled = fill_holes(depth)
     if not known_depth(depth).all():
         median = float(np.median(filled))
-    centred = np.clip(filled - median, -DEPTH_LIMIT, DEPTH_LIMIT) / DEPTH_UNIT
+    centred = (
+        np.clip(filled - (median if level is None else level), -DEPTH_LIMIT, DEPTH_LIMIT)
+        / DEPTH_UNIT
+    )
     image = np.empty((INPUT_CHANNELS, *depth.shape), np.float32)
     image[:3] = np.moveaxis(rgb, -1, 0)
     image[:3] /= 255
@@ -71,7 +76,7 @@ class GraspNet(nn.Module):
     def __init__(
         self,
         input_channels: int = INPUT_CHANNELS,
-        num_angle_bins: int = 18,
+        num_angle_bins: int = ANGLE_BINS,
         max_width: float = 0.15,
         backbone: str = "tutorial",
         centre_head: bool = False,
@@ -177,7 +182,7 @@ class GraspNet(nn.Module):
 
 def create_model(
     input_channels: int = INPUT_CHANNELS,
-    num_angle_bins: int = 18,
+    num_angle_bins: int = ANGLE_BINS,
     *,
     name: str = "tutorial",
     max_width: float = 0.15,

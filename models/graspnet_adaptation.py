@@ -53,7 +53,8 @@ from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 
 STATE = "adaptation"  # the entry of a checkpoint's `extra` that a resumed training needs
 # The photographs change in the same ways as the simulated training images, so that no change
-# reveals the domain.
+# reveals the domain, but for two: beyond its border a simulated image is black where a photograph
+# repeats its edge, and it turns by whole bins.
 AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
 STANDS_OUT = (0.01, 0.15)  # m above the table: heights of the points that crops are laid around
 MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge

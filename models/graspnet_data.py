@@ -154,8 +154,9 @@ def steps_per_epoch(config: Config, images: int) -> int:
     batch = config.train.batch_size
     if images < batch:
         raise UserError(
-            f"train.batch_size is {batch}, but there are only {images} images; raise data.frames "
-            "or lower train.batch_size"
+            f"train.batch_size is {batch}, but there are only {images} images; raise "
+            f"{'data.frames' if config.data.kind == 'simulated' else 'data.repeats'} or lower "
+            "train.batch_size"
         )
     return images // batch
 

@@ -40,11 +40,15 @@ def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
 
 @torch.no_grad()
 def run_network(
-    model: GraspNet, frame: RGBDFrame, scaling: PixelScaling, centres: bool = False
+    model: GraspNet,
+    frame: RGBDFrame,
+    scaling: PixelScaling,
+    centres: bool = False,
+    level: float | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Return GraspNet's three maps of the scaled image, with `centres` four, on the CPU.
 
-    Raises UserError for a network that takes other images.
+    level: as of `to_input`. Raises UserError for a network that takes other images.
     """
     if model.input_channels != INPUT_CHANNELS:
         raise UserError(
@@ -52,7 +56,7 @@ def run_network(
             f"{INPUT_CHANNELS}"
         )
     depth = scaling.image(fill_holes(frame.depth))
-    image = to_input(scaling.image(frame.rgb), depth)
+    image = to_input(scaling.image(frame.rgb), depth, level)
     device = next(model.parameters()).device
     if model.training:  # eval() walks through all modules
         model.eval()

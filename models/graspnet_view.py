@@ -124,7 +124,9 @@ class _Prediction:
         self.frame = surfaces_in_holes(table_in_holes(frame, table))
         model = network.model
         self._device = next(model.parameters()).device
-        self.maps = run_network(model, self.frame, self.scaling, model.centre_head is not None)
+        level = None if mostly_table(frame, table) else np.median(depth_of_plane(frame, table))
+        centres = model.centre_head is not None
+        self.maps = run_network(model, self.frame, self.scaling, centres, level)
 
     def quality(self, ends: np.ndarray) -> np.ndarray:
         """(N,) quality of closing along the lines between points (2, N, 3) in W."""
@@ -160,6 +162,13 @@ class _Prediction:
     def _blurred(self) -> np.ndarray:
         """(H, W) the quality."""
         return cv2.GaussianBlur(self.maps[0][0, 0].numpy(), (0, 0), BLUR)
+
+
+def mostly_table(frame: RGBDFrame, table_height: float) -> bool:
+    """Whether the median depth of a frame is the table's, as it is where networks have learned."""
+    known = frame.depth[known_depth(frame.depth)]
+    table = depth_of_plane(frame, table_height + TABLE_FLATNESS)[known_depth(frame.depth)]
+    return bool((known >= table).mean() >= 0.5)
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:

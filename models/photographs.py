@@ -75,7 +75,8 @@ def judge_photographs(
     """Score the best grasp of a planner, or of a network alone, on every photograph.
 
     An entry is None where the planner finds no grasp. The result is None for a planner with an
-    attribute `needs_truth` that is true: a photograph has no true scene.
+    attribute `needs_truth` that is true, as a photograph has no true scene, and for one whose
+    grasps may lean, which a rectangle cannot tell.
     """
     planned = make_planner(planner, HAND, WORKSPACE, seed, "transfer.policies")
     if needs_truth(planned) or tilts(planned):

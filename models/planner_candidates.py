@@ -100,12 +100,7 @@ class Candidates:
         dx, dy = (along[:, None] - along for along in self.xy.T)
         apart = np.sqrt(dx * dx + dy * dy) >= distance
         apart |= angle_difference(self.angle[:, None], self.angle) >= angle
-        kept, free = [], np.ones(len(self), bool)
-        while free.any() and len(kept) < count:
-            kept.append(int(free.argmax()))
-            free &= apart[kept[-1]]
-            free[kept[-1]] = False
-        return self.take(kept)
+        return self.take(suppressed(~apart, count))
 
     def grasps(self, gripper: GripperGeometry) -> list[Grasp]:
         """The candidates as grasps, in the same order."""
@@ -200,3 +195,14 @@ def grip_score(
     score = score * xp.exp(-settings.covered_weight * covered)
     score = score * xp.where(together, 1.0, settings.split_factor)
     return score * (1 + 2 * over_table.clip(0, 0.15))  # prefers the top of a pile
+
+
+def suppressed(alike: np.ndarray, count: int) -> list[int]:
+    """Non-maximum suppression: the numbers of at most `count` of N, best first, of which no two are
+    alike (N, N) bool."""
+    kept, free = [], np.ones(len(alike), bool)
+    while free.any() and len(kept) < count:
+        kept.append(int(free.argmax()))
+        free &= ~alike[kept[-1]]
+        free[kept[-1]] = False
+    return kept

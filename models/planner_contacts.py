@@ -113,53 +113,26 @@ def _pad_contacts(
         + offset[:, None] * across[:, None]
         + height[:, None] * np.array((0, 0, 1.0))
     )
-    flat, directions = origins.reshape(-1, 3), np.repeat(along, L, axis=0)
-    limits = np.repeat([half - away, half + away], L, axis=1)  # from the centre to the pads
-    # Travel of each pad from its open position to the first matter on each line, left then right.
-    travel = np.full((2, N * L), np.inf)
-    owner = np.full((2, N * L), -1)
-    facing = np.zeros((2, N * L))
-    rising = np.zeros((2, N * L))  # sine of the angle by which the face looks up
-    bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
-    for number, solids in [*bodies, (-1, scene.walls)]:  # -1 is not an object to be held
-        for solid in solids:
-            middle = (solid.vertices.max(axis=0) + solid.vertices.min(axis=0)) / 2
-            radius = np.linalg.norm(solid.vertices - middle, axis=1).max()
-            offset_ = middle - flat
-            t = (offset_ * directions).sum(axis=1)
-            close = np.linalg.norm(offset_ - t[:, None] * directions, axis=1) < radius
-            lines = np.nonzero(close & (-limits[0] - radius < t) & (t < limits[1] + radius))[0]
-            if len(lines) == 0:
-                continue
-            hits = intersect_lines(solid, flat[lines], directions[lines])
-            # A solid that lies wholly behind a pad, outside, is not between the fingers.
-            between = hits.hit & (hits.leave > -limits[0, lines]) & (hits.enter < limits[1, lines])
-            for side, (distance, normal, sign) in enumerate(
-                ((hits.enter, hits.enter_normal, -1), (-hits.leave, hits.leave_normal, 1))
-            ):
-                distance = distance + limits[side, lines]
-                better = between & (distance < travel[side, lines])
-                chosen = lines[better]
-                travel[side, chosen] = distance[better]
-                owner[side, chosen] = number
-                facing[side, chosen] = sign * (normal[better] * directions[chosen]).sum(axis=1)
-                rising[side, chosen] = normal[better, 2]
-    travel, owner, facing, rising = (x.reshape(2, N, L) for x in (travel, owner, facing, rising))
+    first_hits = _first_hits(
+        scene, origins.reshape(-1, 3), np.repeat(along, L, axis=0),
+        np.repeat([half - away, half + away], L, axis=1),
+    )  # fmt: skip
+    travel, owner, facing, rising = (part.reshape(2, N, L) for part in first_hits)
 
     first = travel.min(axis=2, keepdims=True)
     touch = travel < first + 0.0015
     share = touch.mean(axis=2)
     count = np.maximum(touch.sum(axis=2), 1)
     angle = np.arccos(np.clip((facing * touch).sum(axis=2) / count, -1, 1))
-    held = np.take_along_axis(owner, travel.argmin(axis=2)[..., None], axis=2)
-    alone = np.where(touch, owner == held, True).all(axis=2)
+    met = np.take_along_axis(owner, travel.argmin(axis=2)[..., None], axis=2)
+    alone = np.where(touch, owner == met, True).all(axis=2)
     point = (
         np.stack([(touch * offset).sum(axis=2), (touch * height).sum(axis=2)], axis=-1)
         / count[..., None]
     )
-    good = (held[0] == held[1])[:, 0] & (held[0, :, 0] >= 0) & alone.all(axis=0)
+    held = met[0, :, 0]
+    good = (met[0] == met[1])[:, 0] & (held >= 0) & alone.all(axis=0)
     good &= (first[..., 0] > 0.0005).all(axis=0)  # a pad that starts inside matter has hit it
-    held = held[0, :, 0]
     friction = np.array([item.friction for item in scene.objects])[held]
     cone = 0.9 * np.arctan(np.minimum(friction, 1.0))  # the fingers' own friction is 1
     slope = np.arcsin(np.clip((rising * touch).sum(axis=2) / count, -1, 1))
@@ -173,6 +146,48 @@ def _pad_contacts(
     )
     value = value * (0.3 + 0.7 * np.minimum(share.min(axis=0) / 0.5, 1)) * good * (worst < cone)
     return value, slips
+
+
+def _first_hits(
+    scene: SceneGeometry, origins: np.ndarray, directions: np.ndarray, limits: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What pads that close along M lines first meet, the left one and the right one, (2, M) each:
+    m that a pad travels, infinite where it meets nothing; the number of the object, -1 for walls
+    and nothing; the cosine between the face's normal and the pad's, and the sine of the angle by
+    which the face looks up.
+
+    origins, directions: (M, 3) of the lines. limits: (2, M) m from the origins to the open pads.
+    """
+    # Travel of each pad from its open position to the first matter on each line, left then right.
+    travel = np.full(limits.shape, np.inf)
+    owner = np.full(limits.shape, -1)
+    facing = np.zeros(limits.shape)
+    rising = np.zeros(limits.shape)  # sine of the angle by which the face looks up
+    bodies = [(number, item.solids) for number, item in enumerate(scene.objects)]
+    for number, solids in [*bodies, (-1, scene.walls)]:  # -1 is not an object to be held
+        for solid in solids:
+            middle = (solid.vertices.max(axis=0) + solid.vertices.min(axis=0)) / 2
+            radius = np.linalg.norm(solid.vertices - middle, axis=1).max()
+            to_middle = middle - origins
+            t = (to_middle * directions).sum(axis=1)
+            close = np.linalg.norm(to_middle - t[:, None] * directions, axis=1) < radius
+            lines = np.nonzero(close & (-limits[0] - radius < t) & (t < limits[1] + radius))[0]
+            if len(lines) == 0:
+                continue
+            hits = intersect_lines(solid, origins[lines], directions[lines])
+            # A solid that lies wholly behind a pad, outside, is not between the fingers.
+            between = hits.hit & (hits.leave > -limits[0, lines]) & (hits.enter < limits[1, lines])
+            for side, (distance, normal, sign) in enumerate(
+                ((hits.enter, hits.enter_normal, -1), (-hits.leave, hits.leave_normal, 1))
+            ):
+                distance = distance + limits[side, lines]
+                better = between & (distance < travel[side, lines])
+                chosen = lines[better]
+                travel[side, chosen] = distance[better]
+                owner[side, chosen] = number
+                facing[side, chosen] = sign * (normal[better] * directions[chosen]).sum(axis=1)
+                rising[side, chosen] = normal[better, 2]
+    return travel, owner, facing, rising
 
 
 def buried_share(scene: SceneGeometry, heights: HeightMap) -> np.ndarray:

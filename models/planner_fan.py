@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.planner_antipodal import SearchPlanner, search_once
-from models.planner_candidates import Candidates, SearchSettings, with_chances
+from models.planner_candidates import Candidates, SearchSettings, suppressed, with_chances
 from models.planner_contacts import buried_share, scored_by_contacts
 from utils.depth_correction import corrected
 from utils.geometry import ConvexSolid, GripperGeometry, Workspace
@@ -177,12 +177,7 @@ def distinct(poses: np.ndarray, fan: FanSettings) -> list[int]:
     place = poses[:, :3, 3]
     alike = np.linalg.norm(place[:, None] - place, axis=2) < fan.distinct_distance
     alike &= turns_between(poses) < fan.distinct_turn
-    kept, free = [], np.ones(len(poses), bool)
-    while free.any() and len(kept) < fan.returned:
-        kept.append(int(free.argmax()))
-        free &= ~alike[kept[-1]]
-        free[kept[-1]] = False
-    return kept
+    return suppressed(alike, fan.returned)
 
 
 def turns_between(poses: np.ndarray) -> np.ndarray:

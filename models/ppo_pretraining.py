@@ -1,6 +1,6 @@
 """Pretraining of the state estimator, before PPO begins.
 
-The environments show the beginnings of episodes that no policy plays. From each image the network
+The environments show states that episodes may reach; no policy plays. From each image the network
 learns to estimate the observations of `rl.estimated_observations`, which only a simulator knows.
 """
 

@@ -470,6 +470,19 @@ def test_the_diagram_has_a_line_for_each_name() -> None:
     assert len(risks.lines) == 2
 
 
+@pytest.mark.parametrize("text, message", [
+    (None, "does not exist: .*make calibration"),
+    ("{", "holds no chances of success"),
+    ('{"planner": {}}', "holds no chances of success"),
+])  # fmt: skip
+def test_chances_that_cannot_be_read_are_no_scores(text, message, tmp_path):
+    file = tmp_path / "fits.json"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(UserError, match=message):
+        load_calibrations(file)
+
+
 def test_all_five_numbers_of_a_calibration_are_read(tmp_path):
     file = tmp_path / "fits.json"
     fits = {"a": {"slope": 2.0, "offset": 0.3, "penalty": 40.0, "doubt": 0.7, "upper": 0.5}}

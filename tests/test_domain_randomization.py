@@ -227,7 +227,7 @@ def test_samples_of_another_scene_or_version_are_refused(cell):
     "change, words",
     [
         (5, "got 5, expected a dict"),
-        ({"version": 2}, "seed: Field required"),
+        ({"version": 3}, "seed: Field required"),
         ({"seed": -1}, "seed: Input should be greater"),
         ({"textures": 5}, "textures: Input should be a valid list"),
         ({"textures": [{"kind": "grain"}] * 6}, "not those of a draw"),

@@ -334,16 +334,22 @@ def test_label_truth_of_nothing_is_not_a_number():
     assert np.isnan([truth.precision, truth.precision_weighted, truth.recall_weighted]).all()
 
 
-def test_pairs_are_drawn_from_every_stratum_with_weights_that_count_them_all():
-    """A surface 5 cm above the table in the left half of the image; table in the right half."""
+@pytest.mark.parametrize("table", [0.0, 0.1])
+def test_pairs_are_drawn_from_every_stratum_with_weights_that_count_them_all(table):
+    """A surface 5 cm above the table in the left half of the image; 1 mm of the same object in the
+    right half."""
+    T_WC = OVERHEAD.copy()
+    T_WC[2, 3] += table
     height, width = 20, 30
     depth = np.full((height, width), 0.8, np.float32)
     segmentation = np.full((height, width), -1, np.int32)
     depth[:, :15], segmentation[:, :15] = 0.75, 0
+    depth[:5, 15:], segmentation[:5, 15:] = 0.799, 0
     K = np.array([[60.0, 0, 14.5], [0, 60.0, 9.5], [0, 0, 1]])
     frame = RGBDFrame(
-        np.zeros((height, width, 3), np.uint8), depth, K, OVERHEAD, segmentation, SceneGeometry(())
-    )
+        np.zeros((height, width, 3), np.uint8), depth, K, T_WC, segmentation,
+        SceneGeometry((), table),
+    )  # fmt: skip
     quality = np.zeros((18, height, width), np.float32)
     quality[3, 0, :2] = 0.4  # fewer than are asked for
     quality[7, 1, :10] = 0.65
@@ -361,7 +367,7 @@ def test_pairs_are_drawn_from_every_stratum_with_weights_that_count_them_all():
     for grasp, q, _ in pairs:
         assert grasp.width == pytest.approx(0.03 if q else GripperGeometry().max_opening)
         tips = grasp.position[2] - GripperGeometry().tip_below_centre
-        assert tips == pytest.approx(0.05 - LabelSettings().depth, abs=1e-6)
+        assert tips == pytest.approx(table + 0.05 - LabelSettings().depth, abs=1e-6)
     angles = {round(np.degrees(g.angle)) for g, q, _ in pairs if q > 0.6}
     # Bin 7 is 70 degrees on the image; +u is -y and +v is -x of this camera: -90 - 70, modulo 180.
     assert angles == {20}

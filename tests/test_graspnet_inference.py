@@ -7,10 +7,12 @@ import pytest
 
 from envs.cell import Intrinsics
 from models import graspnet_inference
+from models.graspnet import to_input
 from models.graspnet_decoding import PeakSettings
 from models.graspnet_io import SavedGraspNet, metres_per_pixel
 from models.graspnet_view import NetworkView
 from models.planner_graspnet import GraspNetPlanner
+from tests.helpers.box_frames import boxes_frame
 from tests.helpers.hand_made import CUBES, FOCAL, OVERHEAD, PIXEL, cell_of_cubes, hand_made
 from utils.geometry import GripperGeometry, Workspace
 from utils.images import PixelScaling
@@ -74,3 +76,23 @@ def test_pixels_that_are_not_square(cell):
 
 def test_metres_per_pixel():
     assert metres_per_pixel(np.diag([FOCAL, FOCAL, 1]), 0.8) == pytest.approx(PIXEL)
+
+
+@pytest.mark.parametrize("slab", [None, (0.36, 0.36, 0.05)])
+def test_the_table_enters_as_0_however_much_of_it_is_covered(slab, monkeypatch):
+    """0.1 is 1 cm; a box of 8 cm on the table, alone or in a slab 5 cm high that fills more than
+    half of the part that is looked at."""
+    seen = []
+
+    def recorded(*arguments):
+        seen.append(to_input(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(graspnet_inference, "to_input", recorded)
+    boxes = [((0.04, 0.03, 0.08), 0.0, (0.5, 0.0))]
+    frame = boxes_frame(boxes + ([] if slab is None else [(slab, 0.0, (0.5, 0.0))]))
+    NetworkView(SavedGraspNet(hand_made(), PIXEL, {}, {}), frame, Workspace(), crop=True)
+    heights = -seen[0][3]
+    assert heights.min() == pytest.approx(0, abs=2e-3)
+    assert heights.max() == pytest.approx(0.8, abs=2e-3)
+    assert (heights.median() > 0.4) == (slab is not None)

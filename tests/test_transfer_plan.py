@@ -121,6 +121,13 @@ def test_an_unknown_column_is_answered_by_the_known_ones():
         evaluations_of(config)
 
 
+def test_photographs_are_judged_for_the_default_hand_alone():
+    config = load_config(REPORT, ["transfer.columns=[pybullet,cornell]", "gripper.max_opening=0.1"])
+    with pytest.raises(UserError, match="transfer.columns: cornell judges .* leave gripper"):
+        columns_of(config)
+    columns_of(load_config(REPORT, ["transfer.columns=[pybullet]", "gripper.max_opening=0.1"]))
+
+
 def test_a_new_column_is_an_entry_of_the_registry(monkeypatch):
     noisy = SimulatedColumn("MuJoCo again", simulation="mujoco", simulator="mujoco")
     monkeypatch.setitem(COLUMNS, "again", noisy)

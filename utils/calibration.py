@@ -28,6 +28,8 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit, logit
 
+from utils.errors import UserError
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -178,10 +180,16 @@ def _high(scores: ArrayLike) -> np.ndarray:
 
 
 def load_calibrations(path: Path) -> dict[str, Calibration]:
-    """Those of a file by planner; none where there is no file."""
-    if not path.exists():
-        return {}
-    planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
+    """Those of a file by planner. Raises UserError for a file that is missing or is none."""
+    try:
+        planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
+    except FileNotFoundError:
+        raise UserError(
+            f"{path} does not exist: without it no planner states chances of success; "
+            "git checkout it, or fit them anew with `make calibration`"
+        ) from None
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UserError(f"{path} holds no chances of success by planner: {error!r}") from None
     return {
         name: Calibration(
             one["slope"],

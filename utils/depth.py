@@ -60,7 +60,8 @@ class KinectNoise:
     (Of a pixel, it would be 3 mm at 0.8 m, three times what Khoshelham and Elberink, Sensors 2012,
     measured.) Their 0.5 undoes a truncation that this code does not make.
     window: pixels, odd; side of the square in which dots are matched. tolerance: pixels, by which a
-    dot one pixel from the centre may differ from the window's mean. support: share of the window's
+    dot at the centre may differ from the window's mean, others by up to 1.44 r^2 times as much, r
+    pixels away. support: share of the window's
     dots that a match has to exceed.
     """
 

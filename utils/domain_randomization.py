@@ -31,8 +31,9 @@ from utils.random_view import RandomView, TextureRandomizer, random_colour
 
 __all__ = ["DomainRandomizer", "Randomizable", "RandomizableCell", "TextureRandomizer"]
 
-_VERSION = 2  # of a sample
-_PHYSICS_STREAM, _VISION_STREAM, _ACTION_STREAM = 0, 1, 3
+_VERSION = 3  # of a sample
+# [seed, 0, 0] would be the key of the sample itself (`utils.random_streams`).
+_PHYSICS_STREAM, _VISION_STREAM, _ACTION_STREAM = 5, 1, 3
 _EACH_AXIS = ("light_colour", "camera_shift", "camera_turn", "white_balance")  # three values
 _LONGEST_ACTION = 8  # entries
 

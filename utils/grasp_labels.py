@@ -167,7 +167,8 @@ def draw_pairs(
     """
     settings = LabelSettings()
     lowest = settings.table_clearance + settings.min_engagement
-    on_object = labels.valid & (frame.segmentation >= 0) & (frame.points()[..., 2] > lowest)
+    rise = frame.points()[..., 2] - frame.truth.table_height
+    on_object = labels.valid & (frame.segmentation >= 0) & (rise > lowest)
     quality = np.where(on_object, labels.quality, -1)
     for low, high in zip(STRATA, STRATA[1:]):
         members = np.flatnonzero((quality >= low) & (quality < high))

@@ -18,10 +18,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from utils.grasp_labels import ANGLE_BINS
 from utils.table_plane import robust_fit
 from utils.transforms import angle_difference, wrap_to_pi_range
 
-NUM_ANGLE_BINS = 18  # bin k is centred at k x 10 degrees
 MATCH_IOU = 0.25  # Jiang, Moseson, Saxena, "Efficient grasping from RGBD images", ICRA 2011
 MATCH_ANGLE = np.pi / 6
 _ROUNDING = 1e-9  # margin: a difference of exactly the limit does not pass by a rounding error
@@ -162,8 +162,8 @@ class DenseTargets(NamedTuple):
 def rasterise(
     rectangles: Sequence[GraspRectangle],
     shape: tuple[int, int],
-    num_bins: int = NUM_ANGLE_BINS,
-    falloff: float = np.pi / NUM_ANGLE_BINS,
+    num_bins: int = ANGLE_BINS,
+    falloff: float = np.pi / ANGLE_BINS,
 ) -> DenseTargets:
     """Draw rectangles as dense targets of an image of shape (H, W).
 

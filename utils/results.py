@@ -307,8 +307,8 @@ def _difference(
 # --- Two runs -----------------------------------------------------------------------------------
 
 # Sections and keys of the config that a scene is made from (`envs.cell_scenes.make_scene`): objects
-# come to rest in PyBullet, so that the steps of the physics count, and some layouts choose what the
-# hand can span.
+# come to rest in a simulator, so that the steps of the physics count, and some layouts choose what
+# the hand can span.
 SCENE_KEYS = (
     "scene", "objects", "workspace", "gripper.max_opening", "sim.frequency",
     "sim.solver_iterations",
