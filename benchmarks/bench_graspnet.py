@@ -198,7 +198,7 @@ def label_metrics(model: GraspNet, count: int) -> list[Metric]:
         load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
         for name in ("random_urdfs", "primitives")
     ]
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     images = []
     with make_cell(config) as cell:
         for number in range(count):

@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser.parse_args(argv)
     cv2.setNumThreads(1)
     config = load_config(None, ["sim.renderer=tiny", "objects.split=train"])
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     count = 2 if options.quick else options.scenes
     with make_cell(config) as cell:
         scenes = training_scenes(config, count, options.seed)

@@ -20,7 +20,6 @@ from envs.simulators import make_cell
 from models.planner_graspnet import GraspNetFanPlanner
 from models.planners import Planner
 from utils.config import Config, load_config
-from utils.geometry import Workspace
 from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
@@ -69,7 +68,7 @@ def frames_of(config: Config, count: int, object_set: str = "random_urdfs") -> l
 
 def planner_of(name: str, config: Config) -> Planner:
     if name == FAN:
-        workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+        workspace = config.workspace.geometry
         return GraspNetFanPlanner(config.gripper.geometry, workspace, config.seed, likely=np.inf)
     return new_planner(name, config)
 

@@ -25,7 +25,7 @@ from envs.simulators import make_cell
 from models.planners import make_planner
 from utils.config import load_config
 from utils.errors import TargetLostError
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import GripperGeometry
 from utils.object_tracking import TemplateMatcher, grasp_frame, make_template
 from utils.random_streams import Stream
 from utils.runs import run_script
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Errors]:
     """Errors by height over the grasp, on `scenes` scenes of an object set."""
     config = cell.config
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     chosen = load_object_set(objects, cache_dir=config.cache_folder, **config.objects.model_dump())
     errors = {height: Errors() for height in HEIGHTS}
     for seed in range(config.seed * 100_000, config.seed * 100_000 + scenes):

@@ -27,7 +27,7 @@ from models.planners import make_planner
 from utils.atomic_files import check_writable
 from utils.config import load_config
 from utils.errors import unknown_choice
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import GripperGeometry
 from utils.image_overlay import write_picture
 from utils.runs import run_script
 from utils.transforms import inverse_pose, transform_points
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     objects = load_object_set(
         "random_urdfs", cache_dir=config.cache_folder, **config.objects.model_dump()
     )
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
     with make_cell(config) as cell:
         conditions = SCENARIOS[scenario]

@@ -82,7 +82,8 @@ class Appearance:
 
 
 def draw_camera(rng: np.random.Generator, camera: CameraConfig) -> tuple[Intrinsics, np.ndarray]:
-    """Intrinsics and pose (4, 4) T_WC near the configured overhead camera's, now and then far.
+    """Intrinsics and pose (4, 4) T_WC near those of a camera straight above what the configured one
+    looks at, at its distance; now and then far.
 
     Near: within 2 cm, 3 degrees and 8 % of the focal length, of every roll. Far: up to 25 degrees
     oblique, though not over the robot, and 12 cm nearer or farther.

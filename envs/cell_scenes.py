@@ -37,7 +37,7 @@ from envs.simulators import make_layout_table
 from models.planner_contacts import buried_share
 from utils.config import Config
 from utils.errors import UserError
-from utils.geometry import SceneGeometry, SolidObject, Workspace
+from utils.geometry import SceneGeometry, SolidObject
 from utils.grasp_quality import RELAXED
 from utils.height_map import height_map_from_scene
 from utils.transforms import pose_matrix
@@ -140,7 +140,7 @@ def _covered(placements: tuple[Placement, ...], config: Config) -> int | None:
         for one in placements
     )  # fmt: skip
     scene = SceneGeometry(bodies)
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     heights = height_map_from_scene(scene, workspace)
     covered = buried_share(scene, heights)
     shown = np.bincount(heights.label[heights.label >= 0], minlength=len(placements))

@@ -131,12 +131,12 @@ class ClosedLoop:
         self.cell, self.controller, self.frame = cell, controller, frame
         self.T_EC, self.latency = calibration.T_EC, latency
         self.camera = camera or WristCamera(cell, latency)
-        grasp = cell.config.closed_loop
-        intrinsics = Intrinsics(grasp.width, grasp.height, grasp.fov_deg)
-        self.K, self.size = intrinsics.K, (grasp.width, grasp.height)
+        settings = cell.config.closed_loop
+        intrinsics = Intrinsics(settings.width, settings.height, settings.fov_deg)
+        self.K, self.size = intrinsics.K, (settings.width, settings.height)
         period = image_period(cell) * cell.dt
-        self.law = make_law(controller, self.K, self.T_EC, grasp.gain, period)
-        self.far_law = make_law("pbvs", self.K, self.T_EC, grasp.gain, period)
+        self.law = make_law(controller, self.K, self.T_EC, settings.gain, period)
+        self.far_law = make_law("pbvs", self.K, self.T_EC, settings.gain, period)
         # The goal of an image-based law is a view that the camera itself has shown.
         self.goal_T_CE = taught_T_CE if self.law.image_based else inverse_pose(self.T_EC)
         self.record = LoopRecord()

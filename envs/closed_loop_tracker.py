@@ -42,10 +42,10 @@ class WristCamera:
     """
 
     def __init__(self, cell: Cell, latency: float = 0.0):
-        camera, grasp = cell.config.camera, cell.config.closed_loop
+        camera, settings = cell.config.camera, cell.config.closed_loop
         self.cell, self.latency = cell, latency
         self.intrinsics = Intrinsics(
-            grasp.width, grasp.height, grasp.fov_deg, camera.near, camera.far
+            settings.width, settings.height, settings.fov_deg, camera.near, camera.far
         )
         self._coming: deque[WristImage] = deque()
         noise = camera.make_noise(float(self.intrinsics.K[0, 0]))
@@ -126,6 +126,11 @@ class ObjectTracker:
             accepted = self.motion.see(pose, covariance, image.seconds)
         if accepted:  # a false match counts as an image without the object
             self.T_WO, self.found_seconds = T_WO, image.seconds
+        elif image.seconds - self.found_seconds > self.lost_seconds:
+            raise TargetLostError(
+                f"what was found is too far from where the object was going, for "
+                f"{self.lost_seconds} s"
+            )
         self.spent = time.perf_counter() - start
         return True
 

@@ -21,6 +21,7 @@ import numpy as np
 from envs.cell import Cell, PhysicsError, camera_intrinsics
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
+from envs.data_generation import MOST_DRAWS
 from envs.floating_execution import attempt, clears_table, floating_hand
 from envs.objects import ObjectSet, load_object_set
 from envs.simulators import make_cell
@@ -38,7 +39,6 @@ from utils.config import Config, with_settings
 from utils.depth import make_depth_noise
 from utils.depth import measure as measured
 from utils.errors import UNREADABLE_NPZ, UserError
-from utils.geometry import Workspace
 from utils.height_map import HeightMap
 from utils.transforms import Grasp, RGBDFrame, look_at, position_quaternion
 from utils.worker_process import kept
@@ -209,7 +209,7 @@ def _planners_of(config: Config, as_vgn: bool) -> list[WithCritic]:
     """Those of the arm's hand, or of one that opens fully and counts as empty as VGN's does."""
     least_held = VGN_LEAST_HELD if as_vgn else 0.0
     gripper = replace(config.gripper.geometry, opens_fully=as_vgn, least_held=least_held)
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     return [  # in the order of PLANNERS; these critics are never asked
         GraspNetFanPlanner(gripper, workspace, critic=GraspCritic()),
         GraspNetPlanner(gripper, workspace, critic=GraspCritic()),
@@ -242,8 +242,9 @@ def _large(name: str) -> str:
 
 
 def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Generator) -> Scene:
-    """A scene of random layout, object set and number of objects."""
-    while True:
+    """A scene of random layout, object set and number of objects. Raises UserError if none of
+    MOST_DRAWS draws gives one."""
+    for _ in range(MOST_DRAWS):
         layout = str(rng.choice(list(_LAYOUTS), p=list(_LAYOUTS.values())))
         name = str(rng.choice(_OWN_SETS.get(layout, usual_sets(config))))
         if rng.random() < _LARGE_SHARE and _large(name) in sets:
@@ -255,6 +256,10 @@ def draw_scene(config: Config, sets: dict[str, ObjectSet], rng: np.random.Genera
             return make_scene(layout, sets[name], int(rng.integers(2**62)), crowd)
         except SceneError:  # too many for this layout: another draw, from the same generator
             continue
+    raise UserError(
+        f"none of {MOST_DRAWS} scenes drawn for the critic came to rest inside the workspace; use "
+        "smaller objects (objects.scale, objects.fit) or a larger workspace.size"
+    )
 
 
 def draw_frame(config: Config, cell: Cell, rng: np.random.Generator) -> RGBDFrame:

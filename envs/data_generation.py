@@ -31,7 +31,6 @@ from utils.config import Config, dump_config, load_config, with_settings
 from utils.config_types import changed, draw
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
-from utils.geometry import Workspace
 from utils.grasp_data import FORMAT_VERSION, LabelledFrame, shard_path, write_shard
 from utils.grasp_labels import LabelSettings, Trial, dense_labels, draw_pairs
 from utils.runs import named_files
@@ -51,6 +50,7 @@ _FIRST_SEED = {
 }  # of scenes; those of an evaluation with a seed below 10,000 are smaller
 
 
+_STRAIGHT = np.radians(5)  # off the vertical, of a camera whose pose may be varied (`draw_camera`)
 # `generate` refuses other views than the fixed one, and a hand without an arm.
 _SIDE_VIEW = ("view", "side_tilt_deg", "side_distance", "side_azimuth_deg")
 
@@ -135,6 +135,12 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
         raise UserError(
             f"camera.view={config.camera.view}: training images are taken around camera.position; "
             "set camera.view=fixed"
+        )
+    away = np.subtract(config.camera.position, config.camera.target)
+    if config.data.randomise and np.arctan2(np.hypot(*away[:2]), away[2]) > _STRAIGHT:
+        raise UserError(
+            "data.randomise=true: training images are then taken from around straight above; put "
+            "camera.position over camera.target, or set data.randomise=false"
         )
     folder = data_folder(config)
     missing = missing_shards(config, folder, rank, ranks)
@@ -301,7 +307,7 @@ def label_scene(
     """Yield labelled frames of a scene and of random parts of it, some with trials of their
     labels."""
     rng = np.random.default_rng([config.seed, scene.seed, 1])
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     configured = cell.config.camera
     for number in range(FRAMES_PER_SCENE):
         part = _part(scene, rng) if number else scene

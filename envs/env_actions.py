@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.env_rewards import GraspGoal
+from envs.env_rewards import LOWEST_TIP, GraspGoal
 from envs.robot import Robot
 from envs.robot_kinematics import (
     JOINT_LOWER,
@@ -38,7 +38,6 @@ ACTION_ENTRIES = {
 
 STARTS = ("home", "near", "pretraining")  # of an episode
 
-_LOWEST_TIP = 0.012  # m, E over the table: the fingertips reach 7 mm below E
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
 # How far the solution of inverse kinematics may miss a command before the command is refused.
@@ -72,7 +71,7 @@ class ActionDecoder:
         self._settings, self._max_opening = config.env, config.gripper.max_opening
         reach = config.workspace.size / 2 + _MARGIN
         x, y = config.workspace.center
-        self.lowest = (x - reach, y - reach, _LOWEST_TIP)
+        self.lowest = (x - reach, y - reach, LOWEST_TIP)
         self.highest = (x + reach, y + reach, _HIGHEST_TIP)
         self._speed = _FASTEST * _SPEED_HEADROOM * config.robot.velocity_scale
         self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency

@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace
-from utils.grasp_quality import LabelSettings, grasp_quality, undersides
+from utils.grasp_quality import LabelSettings, grasp_depth, grasp_quality, undersides
 from utils.height_map import height_map_from_scene
 from utils.plugins import is_import_path, load_plugin
 
@@ -47,7 +47,7 @@ def way_to_grasp(
 # --- The middle of an object --------------------------------------------------------------------
 
 DIRECTIONS = 36  # over half a turn, from the closing line on: every 5 degrees
-OUTLINE_WIDTHS = 8  # of these that an outline vector holds: about every 22.5 degrees
+OUTLINE_WIDTHS = 8  # of these that an outline vector holds: every 25 degrees
 
 _FINGERS = 0.035  # m, the hand would hit what reaches farther up between the fingers than this
 _SIDE_SLACK, _LENGTH_SLACK = 0.008, 0.015  # m off the middle from where the hand may come down
@@ -136,7 +136,7 @@ _AROUND = 0.12  # m of map around the object: half the palm, at any angle
 _ROOM = 0.005  # m between each open finger and the object
 _LEAST_ROOM = 0.003
 _DISTINCT, _DISTINCT_TURN = 0.006, math.radians(15)  # no two goals are both closer than this
-_LOWEST = 0.012  # m over the table that E should keep
+LOWEST_TIP = 0.012  # m over the table that E keeps: the fingertips reach 7 mm below E
 
 # What makes one goal nearer to the hand than another: metres sideways, and so many for a radian of
 # turning, for a quality of 0 instead of 1, and for each metre that the hand has to close for it.
@@ -205,7 +205,8 @@ class GraspGoals:
         up = T_WO[2]
         top = float((self._points @ up[:3]).max() + up[3])
         narrow, wide = float(self._narrow[best]), float(self._wide[best])
-        return GoalView(offset[best], float(turn[best]), narrow, wide, top, float(T_WE[2, 3]))
+        rise = float(T_WE[2, :3] @ offset[best])
+        return GoalView(offset[best], float(turn[best]), narrow, wide, top, float(T_WE[2, 3]), rise)
 
 
 class GoalView:
@@ -213,14 +214,16 @@ class GoalView:
 
     offset: (3,) m from E to the goal along E's axes. turn: rad in (-pi/2, pi/2] about E's z from
     the closing line to the goal's. narrow, wide: m, the openings between which the hand can come
-    down. top, hand: m, heights in W of the object's highest point and of E.
+    down. top, hand: m, heights in W of the object's highest point and of E. rise: m in W, of the
+    goal over E.
     """
 
     def __init__(
-        self, offset: np.ndarray, turn: float, narrow: float, wide: float, top: float, hand: float
-    ):
+        self, offset: np.ndarray, turn: float, narrow: float, wide: float, top: float, hand: float,
+        rise: float,
+    ):  # fmt: skip
         self.offset, self.turn, self.narrow, self.wide = offset, turn, narrow, wide
-        self.top, self.hand = top, hand
+        self.top, self.hand, self.rise = top, hand, rise
 
     def vector(self) -> np.ndarray:
         """(11,): the offset sideways in metres (2); the whole offset as tanh(metres / 0.03), which
@@ -230,7 +233,7 @@ class GoalView:
         depend on the hand."""
         near = np.tanh(self.offset / 0.03)
         turn = math.sin(2 * self.turn), math.cos(2 * self.turn)
-        height = self.hand - self.offset[2]
+        height = self.hand + self.rise
         return np.array([*self.offset[:2], *near, *turn, self.narrow, self.wide, height, self.top])
 
     def way(self, opening: float) -> float:
@@ -245,7 +248,7 @@ class GoalView:
         )
         return way_to_grasp(
             x, y,
-            down=-float(self.offset[2]),
+            down=self.rise,
             over=self.top - self.hand + _OVER,
             blocked=min(max(blocked, 0.0), 1.0),
             turn=_TURN * abs(self.turn),
@@ -285,11 +288,9 @@ def _search(scene: SceneGeometry, settings: LabelSettings, gripper: GripperGeome
         narrow = np.minimum(narrow, wide)
         fits = narrow > 2 * (reach + _LEAST_ROOM)
         x, y = (surface[some, :2] + middle[:, None] * (math.cos(angle), math.sin(angle))).T
-        depth = np.minimum(
-            settings.depth, surface[some, 2] - scene.table_height - settings.table_clearance
-        )
+        depth = grasp_depth(surface[some, 2], scene.table_height, settings)
         z = surface[some, 2] - depth + gripper.tip_below_centre
-        z = np.maximum(z, scene.table_height + _LOWEST)
+        z = np.maximum(z, scene.table_height + LOWEST_TIP)
         quality = np.cbrt(judged.quality[some])
         found.append(
             np.column_stack([x, y, z, np.full(len(x), angle), quality, narrow, wide])[fits]
@@ -313,7 +314,7 @@ def _through_the_middle(scene: SceneGeometry, gripper: GripperGeometry) -> np.nd
     thing = scene.objects[0]
     corners = np.concatenate([solid.vertices for solid in thing.solids])
     x, y, z = thing.centre_of_mass
-    z = max(z, corners[:, 2].max() - 0.035, scene.table_height + _LOWEST)
+    z = max(z, corners[:, 2].max() - _FINGERS, scene.table_height + LOWEST_TIP)
     wide = gripper.max_opening
     return np.array([[x, y, z, _narrowest(corners[:, :2]), 0.0, wide, wide]])
 

@@ -36,7 +36,6 @@ from utils.config import Config
 from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
-from utils.geometry import Workspace
 from utils.report import picture, set_in_words
 from utils.result_formats import depth_in_words
 from utils.result_records import CLEAN, OPEN_LOOP, policy_name
@@ -107,7 +106,7 @@ def load_objects(name: str, config: Config) -> ObjectSet:
 
 
 def new_planner(name: str, config: Config, key: str = "evaluate.policies") -> Planner:
-    workspace = Workspace(tuple(config.workspace.center), config.workspace.size)
+    workspace = config.workspace.geometry
     return make_planner(name, config.gripper.geometry, workspace, config.seed, key)
 
 

@@ -76,9 +76,6 @@ def scene_spec(scene: Scene, gripper: GripperGeometry, arm: bool = True) -> mujo
         add_boxes(spec, f"tray{i}", [wall], TRAY_COLOUR)
     for i, placed in enumerate(scene.placements):
         add_object(spec, f"object{i}", placed.model, placed.position, placed.quaternion)
-    if arm:  # whose base stands on the table
-        exclude = spec.add_exclude()
-        exclude.bodyname1, exclude.bodyname2 = "table", "panda_link1"
     for geom in spec.geoms:
         geom.solref[0] = CONTACT_TIME
     bodies = [body for body in spec.bodies if not _OBJECT.fullmatch(body.name)]

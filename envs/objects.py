@@ -149,15 +149,16 @@ def load_object_set(
 
     name_or_path: a name, a folder, or an import path `module:name` of an `ObjectSet`, of a folder's
         path, or of a function that takes `SetSettings` and returns one of the two.
-    split: of `primitives` and `random_urdfs`; `box` and folders hold the same objects in each.
+    split: of the procedural sets and `random_urdfs`; `box` and folders hold the same objects in
+        each.
         sealed: others, for the published tables alone; of `random_urdfs` the test objects.
         unseen_families: 100 objects of `primitives` of four families that the others do not have.
     scale: factor on all lengths; None for 1, or 0.65 for `random_urdfs`. 0.1 to 10 for the other
         named sets.
     fit: in place of `scale`, rescale each object of `random_urdfs` or of a folder so that the
         second longest side of its oriented bounding box has this many metres.
-    density: kg/m3 of those objects of a folder whose file states no mass; `box` and `primitives`
-        have their own. No object weighs less than 0.02 kg.
+    density: kg/m3 of those objects of a folder whose file states no mass; `box` and the procedural
+        sets have their own. No object weighs less than 0.02 kg.
     max_opening: m, of the gripper; a warning names the first object of a folder that is far too
         large for it.
     cache_dir: where convex parts are kept.

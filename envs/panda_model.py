@@ -42,7 +42,8 @@ FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 CARRIAGE_BASE = "panda_carriage"
 _CARRIAGE_LINKS = ("panda_carriage_x", "panda_carriage_y")
 CARRIAGE_JOINTS = ("panda_carriage_joint1", "panda_carriage_joint2", "panda_carriage_joint3")
-CARRIAGE_REACH = 0.3  # m either way along each axis
+# m either way along each axis: a pregrasp, a lift and the way aside of a tilted hand (`attempt`).
+CARRIAGE_REACH = 0.6
 CARRIAGE_FORCE = 300.0  # N, of each of its motors: much more than objects on a table push back
 
 FINGER_FORCE = 70.0  # N, highest continuous grasping force in the Franka Hand's product manual

@@ -129,7 +129,8 @@ class PybulletCell(Cell):
             pybullet.stepSimulation(physicsClientId=client)
 
     def enable_sleeping(self) -> bool:
-        """Let objects at rest sleep; False, and nothing changes, where they do not come to rest.
+        """Let objects at rest sleep; False where they do not come to rest: physics has gone on,
+        uncounted, for as long as `settle` waits.
 
         A sleeping object lies still at no cost until something hits it. The solver stops a little
         earlier as well, which moves a free arm's joints by less than 0.5 mrad.

@@ -26,7 +26,7 @@ from utils.transforms import position_quaternion
 
 # Link numbers in the URDF of `envs.panda_urdf`; the hand is part of the last arm link.
 ARM = list(range(7))
-LEFT_FINGER, RIGHT_FINGER = FINGERS = [7, 8]
+FINGERS = [7, 8]
 CARRIAGE = list(range(3))  # of the hand without the arm, which is part of the last of these
 
 _URDF_FLAGS = (

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -118,50 +119,53 @@ def geometric_jacobian(q: np.ndarray) -> np.ndarray:
     return _chain(q)[1]
 
 
-def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """(N, 6) velocities of E in W, v then omega, of joint positions and velocities, each (N, 7)."""
+class _Link(NamedTuple):
+    """A link's frame, (N, 3) each: its axes in W once its joint has turned; before and after, m, in
+    front of the shift along its z axis and behind it."""
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+
+def _walk(q: np.ndarray) -> Iterator[_Link]:
+    """The links from the base to the flange, for joint positions q (N, 7)."""
     x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
-    p, axes, origins = np.zeros((len(q), 3)), [], []
+    after = np.zeros((len(q), 3))
     for (a, turn, d), angle in zip(_LINKS, q.T[:, :, None]):
-        p = p + a * x
+        before = after + a * x
         if turn:  # by a right angle about x
             y, z = turn * z, -turn * y
-        p = p + d * z
+        after = before + d * z
         x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-        axes.append(z)
-        origins.append(p)
-    turns = velocities.T[:, :, None] * np.array(axes)
-    arms = p + TOOL_LENGTH * z - np.array(origins)
+        yield _Link(x, y, z, before, after)
+
+
+def tip_twists(q: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    """(N, 6) velocities of E in W, v then omega, of joint positions and velocities, each (N, 7)."""
+    links = list(_walk(q))
+    turns = velocities.T[:, :, None] * np.array([link.z for link in links])
+    tip = links[-1].after + TOOL_LENGTH * links[-1].z
+    arms = tip - np.array([link.after for link in links])
     return np.hstack([np.cross(turns, arms).sum(axis=0), turns.sum(axis=0)])
 
 
 def link_poses(q: np.ndarray) -> np.ndarray:
     """(N, 7, 4, 4) poses in W of the frames of link 1 to 7, for joint positions q (N, 7)."""
-    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
-    p, poses = np.zeros((len(q), 3)), np.tile(np.eye(4), (len(q), 7, 1, 1))
-    for i, ((a, turn, d), angle) in enumerate(zip(_LINKS[:-1], q.T[:, :, None])):
-        p = p + a * x
-        if turn:  # by a right angle about x
-            y, z = turn * z, -turn * y
-        p = p + d * z
-        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-        poses[:, i, :3] = np.stack([x, y, z, p], axis=2)
+    poses = np.tile(np.eye(4), (len(q), 7, 1, 1))
+    for i, link in enumerate(_walk(q)):
+        poses[:, i, :3] = np.stack([link.x, link.y, link.z, link.after], axis=2)
     return poses
 
 
 def arm_points(q: np.ndarray, spacing: float = 0.05) -> np.ndarray:
     """(N, P, 3) points in W on the arm's links, at most `spacing` m apart, from the elbow to the
     flange, for joint positions q (N, 7)."""
-    x, y, z = (np.tile(axis, (len(q), 1)) for axis in np.eye(3))
-    p, corners = np.zeros((len(q), 3)), []
-    for (a, turn, d), angle in zip(_LINKS[:-1], q.T[:, :, None]):
-        p = p + a * x
-        if turn:  # by a right angle about x
-            y, z = turn * z, -turn * y
-        corners += [p, p + d * z]
-        p = corners[-1]
-        x, y = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-    corners = [*corners[_ELBOW:], p + FLANGE_LENGTH * z]
+    links = list(_walk(q))
+    corners = [corner for link in links for corner in (link.before, link.after)]
+    corners = [*corners[_ELBOW:], links[-1].after + FLANGE_LENGTH * links[-1].z]
     points = [corners[0]]
     for start, end in zip(corners, corners[1:]):
         count = int(np.ceil(np.linalg.norm(end[0] - start[0]) / spacing))

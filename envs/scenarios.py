@@ -247,9 +247,9 @@ class Scenario:
         """The calibration that the round assumes, the same in each of its attempts."""
         if not self.miscalibrated:
             return true_calibration(cell)
-        error = cell.config.closed_loop
-        rng = self._rng(cell, -1)
-        return wrong_calibration(cell, rng, error.camera_shift, np.radians(error.camera_turn_deg))
+        settings, rng = cell.config.closed_loop, self._rng(cell, -1)
+        turn = np.radians(settings.camera_turn_deg)
+        return wrong_calibration(cell, rng, settings.camera_shift, turn)
 
     def _rng(self, cell: Cell, attempt: int) -> np.random.Generator:
         return np.random.default_rng([cell.scene.seed, attempt + 1, Stream.MOTION])

@@ -111,8 +111,7 @@ def wrist_frame(cell: Cell) -> RGBDFrame:
 def way_to_look(cell: Cell, frame: RGBDFrame, least: float) -> Trajectory | None:
     """From home to the pose from which the wrist camera sees most of what a frame leaves open; None
     where no pose that the arm can take shows more than `least` m3 of it."""
-    camera, area = cell.config.camera, cell.config.workspace
-    workspace = Workspace(tuple(area.center), area.size)
+    camera, workspace = cell.config.camera, cell.config.workspace.geometry
     heights = known_heights(frame, workspace)
     space = OpenSpace(heights, workspace)
     if space.volume <= least:

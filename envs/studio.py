@@ -52,7 +52,8 @@ class Studio:
         self._T_WC = look_at(SCENIC_EYE, SCENIC_TARGET)
 
     def picture(self) -> np.ndarray:
-        """(H, W, 3) uint8 picture of the cell as it is now."""
+        """(H, W, 3) uint8 picture of the cell as it is now; a twin has the nominal colours, however
+        the cell's are randomised."""
         shown = self._cell
         if self._twin is not None:
             self._twin.mirror(self._cell)
@@ -187,8 +188,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     output = chosen.output or (chosen.rgbd or Path()) / SCENE
     check_files(None if with_image else output, chosen.rgbd)
     objects = load_object_set(
-        chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
-    )
+        chosen.objects, cache_dir=config.cache_folder, max_opening=config.gripper.max_opening,
+        **config.objects.model_dump(),
+    )  # fmt: skip
     command = None
     with make_cell(config) as cell:
         cell.load(make_scene(chosen.layout, objects, config.seed, config))

@@ -1,9 +1,9 @@
 """The environments of a training: copies of one Gymnasium environment, each in a worker process.
 
 `make_env` makes one from the config's section `rl`, `training_envs` all of them. A worker that
-raises, dies or hangs ends the call with an error that says what is known about it; no call waits
-for ever. Environments never reset on their own, so that no final observation is lost. This module
-knows no policy.
+raises, dies or hangs at a task ends the call with an error that says what is known about it: no
+task waits for ever. Environments never reset on their own, so that no final observation is lost.
+This module knows no policy.
 """
 
 from __future__ import annotations

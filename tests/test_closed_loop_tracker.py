@@ -13,6 +13,7 @@ from envs.robot_kinematics import forward_kinematics
 from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, loop
 from utils.config import load_config
+from utils.errors import TargetLostError
 from utils.transforms import inverse_pose, planar, planar_part
 
 
@@ -69,3 +70,25 @@ def test_the_uncertainty_of_a_sight_is_turned_into_the_world():
     assert pose == pytest.approx((0.5, 0.1, np.pi / 6)) and seconds == 1.0
     expected = [[3.25, 1.299, 0], [1.299, 1.75, 0], [0, 0, 9]]
     np.testing.assert_allclose(covariance, expected, atol=1e-3)
+
+
+def test_false_matches_alone_are_a_lost_object():
+    """Each lies too far from where the object was going; the object was last seen at 1 s."""
+    home = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+    T_WO = planar(0.5, 0.1, 0.0)
+    found = SimpleNamespace(
+        T_CO=inverse_pose(forward_kinematics(home)) @ T_WO, covariance=np.eye(3)
+    )
+    tracker = object.__new__(ObjectTracker)  # without a frame that its template is cut from
+    tracker.T_EC, tracker.T_WO, tracker.found_seconds, tracker.lost_seconds = (
+        np.eye(4),
+        T_WO,
+        1,
+        0.3,
+    )
+    tracker.matcher = SimpleNamespace(find=lambda *where: found, round=False)
+    tracker.motion = SimpleNamespace(at=lambda seconds: np.zeros(6), see=lambda *what: False)
+    assert tracker.update(SimpleNamespace(seconds=1.2, q=home, depth=None))
+    assert tracker.found_seconds == 1
+    with pytest.raises(TargetLostError, match="too far .* 0.3 s"):
+        tracker.update(SimpleNamespace(seconds=1.4, q=home, depth=None))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from envs import critic_examples
-from envs.cell_scenes import make_scene
+from envs.cell_scenes import SceneError, make_scene
 from envs.critic_examples import at_rest, examples_of, execute, worth_trying
 from envs.objects import load_object_set
 from envs.simulators import make_cell
 from models.grasp_critic import INPUTS, CriticInputs, GraspCritic
 from tests.helpers.executed_grasps import column
 from utils.config import load_config
+from utils.errors import UserError
 from utils.transforms import Grasp
 
 
@@ -73,6 +74,17 @@ def test_some_scenes_hold_larger_objects() -> None:
     pytest.importorskip("pybullet_data")  # which has random_urdfs
     usual, large = sets["random_urdfs"][0].extents, sets["random_urdfs, large"][0].extents
     np.testing.assert_allclose(np.divide(large, usual), 1 / 0.65, rtol=0.01)  # as their files say
+
+
+def test_scenes_that_cannot_be_made_are_refused(monkeypatch) -> None:
+    def none(*_):
+        raise SceneError("too many")
+
+    monkeypatch.setattr(critic_examples, "make_scene", none)
+    config = load_config(None, [])
+    sets = {name: name for name in critic_examples._sets_of(config)}
+    with pytest.raises(UserError, match="none of 100 .*workspace.size"):
+        critic_examples.draw_scene(config, sets, np.random.default_rng(0))  # type: ignore[arg-type]
 
 
 def test_a_third_of_the_scenes_of_a_set_hold_its_larger_objects(monkeypatch) -> None:

@@ -199,6 +199,13 @@ def test_an_error_in_a_worker_cancels_the_shards_not_begun(tmp_path, monkeypatch
     assert len(begun) < 5
 
 
+def test_an_oblique_camera_is_not_varied():
+    """Varied are cameras from straight above: others would silently be left out."""
+    oblique = ["camera.position=[0.5,-0.566,0.566]", "camera.up=[0,0,1]", "data.frames=960"]
+    with pytest.raises(UserError, match="camera.position over camera.target"):
+        generate(load_config(None, [*oblique, "data.randomise=true"]))
+
+
 def test_scenes_that_cannot_be_made_are_refused(config, monkeypatch):
     def none(*_):
         raise SceneError("too many")

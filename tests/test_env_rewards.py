@@ -167,12 +167,25 @@ def test_what_offers_no_good_grasp_is_taken_through_the_middle():
     assert len(goals) == 1 and view.wide == pytest.approx(0.08)
 
 
+@pytest.mark.parametrize("roll", [0.0, 0.5])
+def test_heights_are_those_in_the_world_however_the_hand_leans(roll):
+    """The middle of a beam of 10 x 2 x 3 cm is gripped 2 cm deep or to 8 mm over the table."""
+    beam = CORNERS * (0.05, 0.01, 0.015)
+    T_WO, T_WE = pose([0.5, 0.0, 0.015], 0.0), hand([0.52, 0.03, 0.2], 0.0)
+    T_WE[:3, :3] = Rotation.from_euler("x", roll).as_matrix() @ T_WE[:3, :3]
+    view = goals_of([beam], T_WO).seen_from(T_WO, T_WE)
+    height = (T_WE[:3, :3] @ view.offset + T_WE[:3, 3])[2]
+    *_, told, top = view.vector()
+    assert told == pytest.approx(height, abs=1e-9) and 0.012 <= height < 0.03
+    assert top == pytest.approx(0.03, abs=1e-9)
+
+
 def test_the_way_to_a_goal_by_hand():
     """A grasp of openings from 5 to 8 cm, at 3 cm over the table on an object of 5 cm."""
 
     def way(x=0.0, y=0.0, up=0.0, turn=0.0, opening=0.07, wide=0.08) -> float:
         offset = np.array([x, y, up])
-        return GoalView(offset, turn, 0.05, wide, 0.05, 0.03 + up).way(opening)
+        return GoalView(offset, turn, 0.05, wide, 0.05, 0.03 + up, -up).way(opening)
 
     assert way() == pytest.approx(0.0)
     assert way(up=0.1) == pytest.approx(0.1), "straight down"

@@ -75,6 +75,20 @@ def test_the_hand_stands_where_it_is_put_and_follows_a_line_at_its_speed(cell, b
     np.testing.assert_allclose(hand.tip_pose()[:3, :3], T[:3, :3], atol=1e-9)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_leaning_hand_reaches_as_far_as_it_has_to_carry(cell, box_set, side):
+    """Half a metre from a pregrasp, up and aside, along axes of its own that lean by 60 degrees."""
+    cell.load(cube_scene(box_set))
+    hand, grasp = floating_hand(cell), cube_grasp(0.0)
+    lean = np.array([0.0, side * np.sin(np.pi / 3), -np.cos(np.pi / 3)])
+    hand.put(replace(grasp, position=np.array([0.5, 0.0, 0.1]), approach=lean).pose, 0.05)
+    goal = hand.tip_pose()[:3, 3] + (0.0, -0.25, 0.43)
+    for one in zip(*hand.line(goal, 0.5)):
+        hand.command(*one)
+        cell.step()
+    np.testing.assert_allclose(hand.tip_pose()[:3, 3], goal, atol=3e-3)
+
+
 @pytest.mark.parametrize("approach", [DOWN, SIDE])
 def test_a_cube_is_gripped_and_removed(cell, box_set, approach):
     """A 6 cm cube, its faces level with the fingers, from above and from a side. 5 cm at 0.1 m/s,

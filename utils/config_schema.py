@@ -45,7 +45,7 @@ from utils.config_types import (
 )
 from utils.depth import DepthNoise, make_depth_noise
 from utils.errors import UserError
-from utils.geometry import GripperGeometry
+from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import look_at
 
 
@@ -137,6 +137,11 @@ class WorkspaceConfig(Section):
                 "the workspace must lie within 0.8 m of the robot and at least 0.2 m in front of it"
             )
         return self
+
+    @property
+    def geometry(self) -> Workspace:
+        """The square on the table, which is at z = 0."""
+        return Workspace(self.center, self.size)
 
 
 class ObjectsConfig(Section):
