@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import nn
@@ -47,15 +48,17 @@ from utils.checkpoint import load_weights
 from utils.config import AdaptationConfig, Config, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
+from utils.grasp_labels import ANGLE_BINS
 from utils.real_data import KEY, UnlabelledImages
 from utils.rectangles import RealSample, View
 from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
 
 STATE = "adaptation"  # the entry of a checkpoint's `extra` that a resumed training needs
 # The photographs change in the same ways as the simulated training images, so that no change
-# reveals the domain, but for two: beyond its border a simulated image is black where a photograph
-# repeats its edge, and it turns by whole bins.
-AUGMENTATION = Augmentation(max_shift=0.0, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0))
+# reveals the domain: also turned by whole bins, and black and of unknown depth beyond the image.
+AUGMENTATION = Augmentation(
+    max_shift=0.0, turn_step=np.pi / ANGLE_BINS, scale=(0.97, 1.03), colour=ColourJitter(hue=0.0)
+)
 STANDS_OUT = (0.01, 0.15)  # m above the table: heights of the points that crops are laid around
 MIDDLE = 0.25  # of the view's side, from its centre: farther out may be walls and the table's edge
 CHECKED = 12  # images of a folder, spread over it, whose distances are checked
@@ -291,7 +294,8 @@ class TargetPairs(Dataset):
         rng = np.random.default_rng([self.seed, *place, TARGET])
         sample = self.samples[rng.integers(len(self.samples))]
         shape = (self.view.size, self.view.size)
-        rgb, depth, _ = self.view.warp(sample, AUGMENTATION.draw(rng, shape).matrix(shape))
+        change = AUGMENTATION.draw(rng, shape).matrix(shape)
+        rgb, depth, _ = self.view.warp(sample, change, border=cv2.BORDER_CONSTANT)
         rgb = AUGMENTATION.colour(torch.from_numpy(np.moveaxis(rgb, -1, 0).copy()), rng)
         x = to_input(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), depth)
         height, width = source.image.shape[1:]

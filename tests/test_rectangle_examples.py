@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +19,7 @@ from models.rectangle_examples import (
 )
 from models.rectangle_folds import AUGMENTATION, real_folds
 from tests.helpers.real_images import SHAPE, VIEW, sample, write_cornell
-from utils.augmentation import Similarity
+from utils.augmentation import LabelledImage, Similarity, apply_similarity
 from utils.config import load_config
 from utils.real_data import FORMATS
 from utils.rectangles import GraspRectangle, View, rectangle_match
@@ -127,6 +128,20 @@ def test_the_border_goes_on_beside_the_image():
     wide = View(side=300, size=60, metres_per_pixel=0.004)
     rgb, depth, _ = wide.warp(sample(GraspRectangle([79.5, 59.5], 0.0, 24, 12)))
     assert rgb[0, 0].tolist() == [230] * 3 and depth[0, 0] == pytest.approx(1.2)
+
+
+def test_beyond_a_photograph_and_beyond_a_simulated_image_is_the_same():
+    """A network that adapts would else tell the domains by their corners."""
+    one, turn = sample(GraspRectangle([79.5, 59.5], 0.0, 24, 12)), Similarity(turn=np.pi / 4)
+    rgb, depth, _ = VIEW.warp(one, turn.matrix((50, 50)), border=cv2.BORDER_CONSTANT)
+    plain = [np.moveaxis(VIEW.warp(one)[0], -1, 0), VIEW.warp(one)[1]]
+    colours, known = (torch.from_numpy(np.ascontiguousarray(part)) for part in plain)
+    maps = torch.zeros(18, 50, 50)
+    image = LabelledImage(colours, known, maps, maps, torch.ones(50, 50, dtype=torch.bool))
+    simulated = apply_similarity(image, turn)
+    np.testing.assert_array_equal(depth == 0, simulated.depth == 0)
+    assert 0.1 < (depth == 0).mean() < 0.25, "four corners"
+    assert (rgb[depth == 0].max(axis=-1) < 230).all()
 
 
 def test_turned_rectangles_are_turned_exactly():

@@ -260,17 +260,20 @@ class View:
         return matrix
 
     def warp(
-        self, sample: RealSample, change: np.ndarray | None = None
+        self,
+        sample: RealSample,
+        change: np.ndarray | None = None,
+        border: int = cv2.BORDER_REPLICATE,
     ) -> tuple[np.ndarray, np.ndarray, list[GraspRectangle]]:
         """Return rgb (size, size, 3) uint8, depth (size, size) metres and the labelled rectangles
-        in the view, after a `change` (3, 3) of the view's pixels. The image's border is repeated
-        beyond it."""
+        in the view, after a `change` (3, 3) of the view's pixels. border: OpenCV's, of what lies
+        beyond the image; by default its edge is repeated."""
         matrix = self.matrix(sample.depth.shape)
         matrix = matrix if change is None else change @ matrix
         rgb, depth = (
             cv2.warpAffine(
                 image, matrix[:2], (self.size, self.size), flags=method,
-                borderMode=cv2.BORDER_REPLICATE,
+                borderMode=border,
             )
             for image, method in ((sample.rgb, cv2.INTER_LINEAR), (sample.depth, cv2.INTER_NEAREST))
         )  # fmt: skip
