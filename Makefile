@@ -87,8 +87,8 @@ results: $(VENV)/.installed-dev
 
 # Faults by the thousand: make soak PARTS=files,disk SCALE=0.1; writes docs/reliability.md.
 soak: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.soak --json docs/results/reliability.json $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
-	$(BIN)/python -m benchmarks.results --write
+	$(BIN)/python -m benchmarks.soak --json docs/results/reliability.json $(if $(PARTS),--parts $(PARTS)) $(if $(SCALE),--scale $(SCALE)) $(ARGS); \
+	status=$$?; $(BIN)/python -m benchmarks.results --write && exit $$status
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }

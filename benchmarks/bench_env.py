@@ -88,12 +88,12 @@ def bench_step(config: Config, repeats: int) -> list[Metric]:
         return seconds * STEPS / sum(physics_seconds)
 
     metrics = []
-    for env in (ours, peer):
-        env.action_space.seed(0)
     for name, held, our_begin, peer_begin in (
         ("step", False, begin_at_home, begin_at_home),
         ("held_step", True, begin_with_box_held, peer_with_box_held),
     ):
+        for env in (ours, peer):
+            env.action_space.seed(0)
         ratio = median_ratio(
             partial(seconds_per_step, peer, peer_begin, held),
             partial(seconds_per_step, ours, our_begin, held),

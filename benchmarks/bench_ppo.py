@@ -87,9 +87,9 @@ TASKS = {
 @dataclass(frozen=True)
 class Result:
     """Of one training. seconds: from the first step to the last update; cpu_seconds: in this time,
-    of the process and its workers, which a busy machine lengthens less; megabytes: the most that
-    the process and its workers held together; replay_seconds: of the same actions again, in all
-    environments at once, with no policy and nobody learning; None where that was not tried."""
+    of the process and its workers, which a busy machine lengthens less; megabytes: what the
+    process and its workers held together at the end; replay_seconds: of the same actions again, in
+    all environments at once, with no policy and nobody learning; None where that was not tried."""
 
     final_return: float
     steps: int

@@ -39,7 +39,7 @@ from utils.errors import UserError
 from utils.plugins import is_import_path
 from utils.result_formats import aligned
 from utils.result_records import RoundRecord, read_rounds
-from utils.runs import git_state, run_script
+from utils.runs import begun_with, run_script
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_writable("--output", options.output)
     played = {run.resolve(): rounds_of(run, options.output) for run in options.runs}
     rounds = [record for own in played.values() for record in own]
-    commit = git_state().commit
+    commit = None if options.output is None else commit_of(options.runs)
     lines, found = [], {}
     policies = list(dict.fromkeys(record.policy for record in rounds))
     names = [name for name in policies if states_chances(name)]
@@ -87,6 +87,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_json_atomic(options.output, {"planners": {**fits_of(options.output), **found}})
         print(f"wrote {options.output}")
     return 0
+
+
+def commit_of(runs: Sequence[Path]) -> str | None:
+    """The commit that the runs were played at. Raises UserError if they differ in it, or where its
+    files had been changed: chances belong to the code that the grasps were executed with."""
+    begun = {str(run): begun_with(run) for run in runs}
+    changed = [run for run, facts in begun.items() if facts.get("changes")]
+    if changed:
+        raise UserError(f"{changed[0]} was played with uncommitted code; play it anew")
+    commits = {facts.get("commit") for facts in begun.values()}
+    if len(commits) > 1:
+        raise UserError(f"the runs are of several commits ({', '.join(map(str, commits))}); play "
+                        "them anew with one")  # fmt: skip
+    return commits.pop()
 
 
 def states_chances(policy: str) -> bool:

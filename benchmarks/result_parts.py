@@ -60,13 +60,15 @@ class Command:
         parts = [f"python {start}"]
         if self.program.endswith(".py"):
             parts += [f"seed={self.seed}", f"objects.split={self.split}"]
-        parts += [self.arguments] if self.arguments else []
+        parts += [self.arguments.replace(f"seed={SEED}", f"seed={self.seed}")]
         if rounds is not None:
             parts.append(f"evaluate.rounds={rounds}")
         places = {
             name.upper(): shlex.quote(str(folders.get(name, f"path/to/{name}"))) for name in SOURCES
         }
-        return re.sub("|".join(places), lambda found: places[found[0]], " ".join(parts))
+        return re.sub(
+            "|".join(places), lambda found: places[found[0]], " ".join(filter(None, parts))
+        )
 
 
 @dataclass(frozen=True)

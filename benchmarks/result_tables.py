@@ -454,7 +454,8 @@ def reliability(say: Say, parts: Figures) -> str:
         if row["tried"]  # a part that was stopped did not come to all of them
     ]
     origins = [
-        f"<sub>`{part['command']}`: measured at commit `{part['commit'][:10]}` ({part['date']}), "
+        f"<sub>`{part['command']}`: measured at commit `{part['commit'][:10]}`"
+        f"{' with changes' if part.get('dirty') else ''} ({part['date']}), "
         f"seed {part['seed']}, {part['device']}, {part['minutes']:g} minutes</sub>"
         for part in parts.values()
     ]

@@ -85,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{name}: {PARTS[name].about}; about {minutes} minutes")
         return 0
     kept_in(options.json)  # a file that cannot be added to is found out now
+    lost = 0
     with stop_on_interrupt("stopping: what was tried until now counts") as stop:
         for name in names:
             if stop.is_set():
@@ -93,10 +94,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             for tally in PARTS[name].run(options.scale, SEED, stop):
                 tallies.append(tally)
             print(*map(in_words, tallies), sep="\n", flush=True)
+            lost += sum(tally.lost for tally in tallies)
             if options.json is not None:
                 minutes = round((time.perf_counter() - begun) / 60, 1)
                 keep(options.json, name, options.scale, minutes, tallies)
-    return 130 if stop.is_set() else 0
+    if stop.is_set():
+        return 130
+    return 1 if lost else 0
 
 
 def in_words(tally: Tally) -> str:
@@ -126,6 +130,7 @@ def keep(path: Path, part: str, scale: float, minutes: float, tallies: Sequence[
     kept[part] = {
         "command": f"python -m benchmarks.soak --parts {part} --scale {scale:g}",
         "commit": facts["commit"],
+        "dirty": facts["dirty"],
         "date": str(date.today()),
         "seed": SEED,
         "minutes": minutes,

@@ -229,7 +229,7 @@ def soak_stopped(scale: float, seed: int, stop: Event) -> Iterator[Tally]:
             for number, how in ((signal.SIGTERM, "SIGTERM"), (signal.SIGKILL, "SIGKILL")):
                 tally = Tally(f"{how}: {name}")
                 yield tally
-                stops = 0
+                stops = ended = 0
                 for turn in range(max(1, round(STOPS * scale))):
                     if stop.is_set():
                         break
@@ -237,9 +237,15 @@ def soak_stopped(scale: float, seed: int, stop: Event) -> Iterator[Tally]:
                     sound, lost, count = _stopped(
                         command, place, number, seconds, random, result, expected
                     )
+                    if count == 0 and sound and lost == 0:  # it ended before it was stopped
+                        ended += 1
+                        continue
                     tally.add(sound, lost)
                     stops += count
-                tally.note = f"stopped {stops} times in the middle, then gone on with --resume"
+                tally.note = (
+                    f"stopped {stops} times, then gone on with --resume, or begun anew where "
+                    f"nothing was kept yet; {ended} more runs ended before they were stopped"
+                )
 
 
 def _stopped(

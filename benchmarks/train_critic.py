@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     save_checkpoint(
         chosen.output, kind=KIND, model_args=critic.model_args, model=critic,
         config=config.model_dump(mode="json"),
-        extra={"scores": scores, "scenes": chosen.scenes, "commit": git_state().commit},
+        extra={"scores": scores, "scenes": chosen.scenes} | git_state()._asdict(),
     )  # fmt: skip
     print(f"wrote {chosen.output}")
     return 0

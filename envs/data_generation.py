@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
@@ -37,7 +38,7 @@ from utils.runs import named_files
 from utils.worker_process import kept
 
 SPLITS = ("train", "validation")
-HELD_OUT = 10  # every tenth training object is kept for validation
+HELD_OUT = 10  # one of so many training objects is kept for validation
 FRAMES_PER_SCENE = 4  # the whole scene, then parts of it, as in a round that clears it
 SCENES_PER_SHARD = 8
 MOST_DRAWS = 100  # for one scene; each draw tries several times to place its objects
@@ -90,7 +91,7 @@ def _content(config: Config) -> str:
         physics = everything["randomization"]["physics"]
         chosen["physics"] = {key: physics[key] for key in _PHYSICS}
     chosen["generation"] = {
-        "held_out": HELD_OUT,
+        "held_out": {"one_of": HELD_OUT, "drawn": "at random"},
         "frames_per_scene": FRAMES_PER_SCENE,
         "scenes_per_shard": SCENES_PER_SHARD,
         "layout_shares": _LAYOUT_SHARES,
@@ -261,9 +262,11 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
                 f"data.object_sets: {name} holds {len(whole)} object, but some have to be kept for "
                 "validation; give sets of two objects or more"
             )
-        held_out = set(range(0, len(whole), HELD_OUT))
-        parts[name, "validation"] = ObjectPart(whole, sorted(held_out))
-        parts[name, "train"] = ObjectPart(whole, sorted(set(range(len(whole))) - held_out))
+        # Drawn, because families of objects take turns: every tenth may be of one of ten families.
+        drawn = np.random.default_rng(len(whole)).permutation(len(whole))
+        count = math.ceil(len(whole) / HELD_OUT)
+        parts[name, "validation"] = ObjectPart(whole, sorted(drawn[:count].tolist()))
+        parts[name, "train"] = ObjectPart(whole, sorted(drawn[count:].tolist()))
     return parts
 
 

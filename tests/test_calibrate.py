@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.calibrate import ExecutedGrasps, fitted_chances, grasps_of, main
+from benchmarks.calibrate import ExecutedGrasps, commit_of, fitted_chances, grasps_of, main
 from models.planners import CALIBRATIONS
 from utils.calibration import Calibration, load_calibrations
 from utils.config import dump_config, load_config
@@ -207,3 +207,16 @@ def test_make_calibration_takes_its_own_runs_alone():
     assert fnmatch(own, f"{stamp}-calibration")
     for other in ("20261127-171555-my-calibration", f"{own}-household", f"{own}-flat"):
         assert not fnmatch(other, f"{stamp}-calibration")
+
+
+def test_chances_belong_to_the_code_that_the_grasps_were_executed_with(tmp_path):
+    runs = [tmp_path / "a", tmp_path / "b"]
+    for run, facts in zip(runs, ({"commit": "1" * 40}, {"commit": "2" * 40})):
+        run.mkdir()
+        (run / "environment.json").write_text(json.dumps(facts))
+    assert commit_of(runs[:1]) == "1" * 40
+    with pytest.raises(UserError, match="of several commits .1111.*2222.*play them anew"):
+        commit_of(runs)
+    (runs[1] / "environment.json").write_text(json.dumps({"commit": "2" * 40, "changes": "ab"}))
+    with pytest.raises(UserError, match="b was played with uncommitted code"):
+        commit_of(runs[1:])

@@ -253,19 +253,30 @@ def test_pixels_lie_around_the_centre_of_their_object(tiny_data):
     assert np.median(distances) < 1.0 and np.max(distances) < 5.0  # of 64, an object spans 8 to 20
 
 
-def test_validation_keeps_every_tenth_training_object_and_no_test_object(config):
+def test_validation_keeps_a_tenth_of_the_training_objects_and_no_test_object(config):
     given = load_config(None, ["data.object_sets=primitives", "objects.split=test"])
     parts = object_sets(given)
     assert {key: len(part) for key, part in parts.items()} == {
         ("primitives", "validation"): 90,
         ("primitives", "train"): 810,
     }
-    for split, kept in (("train", False), ("validation", True)):
+    used: dict[str, set[str]] = {"train": set(), "validation": set()}
+    for split, names in used.items():
         for seed in range(4):
             scene, _ = draw_scene(given, split, seed, parts)
-            for placed in scene.placements:
-                number = int(placed.model.name[-4:])  # 900 and above are for testing
-                assert number < 900 and (number % 10 == 0) is kept
+            names |= {placed.model.name for placed in scene.placements}
+    assert not used["train"] & used["validation"]
+    # 900 and above are for testing
+    assert all(int(name[-4:]) < 900 for names in used.values() for name in names)
+
+
+@pytest.mark.parametrize("name, families", [("thin", 4), ("household", 10), ("primitives", 11)])
+def test_every_family_is_learned_and_validated(name, families):
+    """Families take turns, so that a stride might meet some of them alone."""
+    parts = object_sets(load_config(None, [f"data.object_sets={name}"]))
+    for split in ("train", "validation"):
+        part = parts[name, split]
+        assert {one % families for one in part._indices} == set(range(families))
 
 
 # --- Appearance and physics ------------------------------------------------------------------

@@ -307,6 +307,9 @@ def test_scales_of_terms_are_a_value_of_the_config():
     assert config.env.reward == scales and hash(config)
     assert load_config(None, changed_keys(config)) == config
     assert with_settings(config, "env", {"reward": "sparse"}).env.reward == "sparse"
+    fewer = {"success": 2.0}  # scales are replaced as one: a term that is not named counts nothing
+    assert with_settings(config, "env", {"reward": fewer}).env.reward == fewer
+    assert load_config(None, [*chosen, "env.reward={success: 2}"]).env.reward == fewer
     for wrong in ("{}", "{success: a}", "[success]"):
         with pytest.raises(ConfigError, match="env.reward: got .*; expected one of dense, sparse"):
             load_config(None, [f"env.reward={wrong}"])

@@ -27,7 +27,7 @@ def parts(monkeypatch):
 
 def test_parts_are_kept_beside_each_other_and_drawn(parts, tmp_path, capsys):
     file = tmp_path / "reliability.json"
-    assert main(["--parts", "one", "--json", str(file)]) == 0
+    assert main(["--parts", "one", "--json", str(file)]) == 1, "something was lost"
     assert main(["--parts", "two", "--scale", "0.2", "--json", str(file)]) == 0
     assert "a fault: 10 tried, 5 survived, 1 lost (seed 2027)" in capsys.readouterr().out
     kept = json.loads(file.read_text())

@@ -183,7 +183,7 @@ def changed_keys(config: Config) -> list[str]:
 
     def changes(values: dict[str, Any], below: dict[str, Any], prefix: str) -> Iterator[str]:
         for name, value in values.items():
-            if "properties" in (schema_at(f"{prefix}{name}") or {}):  # a section
+            if _is_section(f"{prefix}{name}"):
                 yield from changes(value, below[name], f"{prefix}{name}.")
             elif value != below[name]:
                 yield f"{prefix}{name}={json.dumps(value, ensure_ascii=False)}"  # JSON is YAML
@@ -300,15 +300,20 @@ def _parse_override(text: str) -> dict[str, Any]:
     return nested
 
 
-def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
-    """`top` laid over `base`; mappings are merged, everything else is replaced."""
+def _merge(base: Mapping[str, Any], top: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """`top` laid over `base`, both of a section (with a dot at its end): sections are merged, all
+    else is replaced, also what maps names to numbers, such as the scales of env.reward."""
     merged = dict(base)
     for key, value in top.items():
-        below = merged.get(key)
-        if isinstance(below, dict) and isinstance(value, dict):
-            value = _merge(below, value)
+        below, name = merged.get(key), f"{section}{key}"
+        if isinstance(below, dict) and isinstance(value, dict) and _is_section(name):
+            value = _merge(below, value, f"{name}.")
         merged[key] = value
     return merged
+
+
+def _is_section(key: str) -> bool:
+    return "properties" in (schema_at(key) or {})
 
 
 def _merged(values: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
