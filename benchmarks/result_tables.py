@@ -83,6 +83,16 @@ OVERVIEW = {
     "vgn": "[VGN's protocol](vgn.md#figures)",
 }
 OVERVIEW_PLANNERS = "graspnet", "graspnet6d", "oracle6d"
+# Success, and cleared where it has an aim of its own, by part and scenario: set before measuring,
+# those of VGN's protocol over the best that is published.
+AIMS: dict[tuple[str, ...], str] = {
+    ("six_dof", "packed"): "97", ("six_dof", "pile"): "97", ("six_dof", "bin"): "95, 95",
+    ("scenes", "tall"): "93", ("scenes", "wall"): "93", ("scenes", "shelf"): "93",
+    ("scenes", "flat"): "93", ("oblique", "pile"): "98", ("unseen", "pile"): "94",
+    ("ycb", "household"): "95", ("clutter", "pile"): "97", ("clutter", "packed"): "97",
+    ("vgn", "packed", "gaussian"): "98.5, 99", ("vgn", "pile", "gaussian"): "97.5, 98",
+    ("vgn", "packed", "gamma"): "97.5, 95", ("vgn", "pile", "gamma"): "88, 88",
+}  # fmt: skip
 
 _HEADLINE = (
     "**Result** on unseen objects{}: {} of GraspNet's grasps succeed in piles of 5 objects, {} in "
@@ -213,9 +223,10 @@ def overview(say: Say, *parts: Figures) -> str:
         page = OVERVIEW[part["part"]]
         for (scenario, objects, noise), of in cells.items():
             planners = (of.get(planner, "-") for planner in OVERVIEW_PLANNERS)
-            lines.append([scenario, f"`{objects}`", f"`{noise}`", *planners, page])
-    header = ["scenario", "objects", "depth", *(f"`{name}`" for name in OVERVIEW_PLANNERS), "table"]
-    return table(header, lines)
+            aim = AIMS.get((part["part"], scenario, noise), AIMS.get((part["part"], scenario), "-"))
+            lines.append([scenario, f"`{objects}`", f"`{noise}`", *planners, aim, page])
+    names = (f"`{name}`" for name in OVERVIEW_PLANNERS)
+    return table(["scenario", "objects", "depth", *names, "aim", "table"], lines)
 
 
 def scoreboard(say: Say, part: Figures) -> str:
