@@ -26,7 +26,7 @@ from typing import Any
 
 from benchmarks.soak_arm import soak_actions, soak_memory
 from benchmarks.soak_files import soak_files
-from benchmarks.soak_processes import soak_disk, soak_stopped, soak_workers
+from benchmarks.soak_processes import small_disk, soak_disk, soak_stopped, soak_workers
 from benchmarks.soak_tally import Tally
 from envs.simulators import SIMULATORS
 from utils.atomic_files import check_writable, write_json_atomic
@@ -85,6 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{name}: {PARTS[name].about}; about {minutes} minutes")
         return 0
     kept_in(options.json)  # a file that cannot be added to is found out now
+    if "disk" in names:  # and so is a user who may mount none
+        with small_disk():
+            pass
     lost = 0
     with stop_on_interrupt("stopping: what was tried until now counts") as stop:
         for name in names:
