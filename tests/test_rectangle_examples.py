@@ -133,9 +133,11 @@ def test_the_border_goes_on_beside_the_image():
 def test_beyond_a_photograph_and_beyond_a_simulated_image_is_the_same():
     """A network that adapts would else tell the domains by their corners."""
     one, turn = sample(GraspRectangle([79.5, 59.5], 0.0, 24, 12)), Similarity(turn=np.pi / 4)
-    rgb, depth, _ = VIEW.warp(one, turn.matrix((50, 50)), border=cv2.BORDER_CONSTANT)
-    plain = [np.moveaxis(VIEW.warp(one)[0], -1, 0), VIEW.warp(one)[1]]
-    colours, known = (torch.from_numpy(np.ascontiguousarray(part)) for part in plain)
+    seen = replace(one, **dict(zip(("rgb", "depth"), VIEW.warp(one))))  # nothing beyond the view
+    whole = replace(VIEW, side=50)
+    rgb, depth, _ = whole.warp(seen, turn.matrix((50, 50)), border=cv2.BORDER_CONSTANT)
+    colours = torch.from_numpy(np.moveaxis(seen.rgb, -1, 0).copy())
+    known = torch.from_numpy(seen.depth)
     maps = torch.zeros(18, 50, 50)
     image = LabelledImage(colours, known, maps, maps, torch.ones(50, 50, dtype=torch.bool))
     simulated = apply_similarity(image, turn)
