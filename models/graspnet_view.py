@@ -166,9 +166,9 @@ class _Prediction:
 
 def mostly_table(frame: RGBDFrame, table_height: float) -> bool:
     """Whether the median depth of a frame is the table's, as it is where networks have learned."""
-    known = frame.depth[known_depth(frame.depth)]
-    table = depth_of_plane(frame, table_height + TABLE_FLATNESS)[known_depth(frame.depth)]
-    return bool((known >= table).mean() >= 0.5)
+    known = known_depth(frame.depth)
+    table = known & (frame.depth >= depth_of_plane(frame, table_height + TABLE_FLATNESS))
+    return bool(2 * table.sum() >= known.sum())
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:

@@ -167,7 +167,7 @@ class GraspPPO:
         self.network.observe(self._flat(rollout), self.team)
         self.updates += 1
         means = self.team.gather(torch.stack(parts).mean(0)).mean(0).tolist()
-        explained = self.team.gather(parts[0].new_tensor(explained_variance)).mean().item()
+        explained = self.team.gather(parts[0].new_tensor([explained_variance])).mean().item()
         return dict(zip(Losses._fields, means)) | {
             "gradient_norm": float(np.mean(norms)),
             "explained_variance": explained,

@@ -471,7 +471,7 @@ def test_the_diagram_has_a_line_for_each_name() -> None:
 
 
 @pytest.mark.parametrize("text, message", [
-    (None, "does not exist: .*make calibration"),
+    (None, "does not exist, .*: git checkout checkpoints"),
     ("{", "holds no chances of success"),
     ('{"planner": {}}', "holds no chances of success"),
 ])  # fmt: skip

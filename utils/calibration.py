@@ -185,8 +185,8 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
         planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
     except FileNotFoundError:
         raise UserError(
-            f"{path} does not exist: without it no planner states chances of success; "
-            "git checkout it, or fit them anew with `make calibration`"
+            f"{path} does not exist, without which no planner states chances of success; bring it "
+            "back from the repository: git checkout checkpoints"
         ) from None
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no chances of success by planner: {error!r}") from None
