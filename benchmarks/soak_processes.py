@@ -133,7 +133,7 @@ def _is_read(kind: Kind, content: bytes) -> bool:
         path.write_bytes(content)
         try:
             kind.read(path)
-        except Exception:
+        except Exception:  # whatever it raises, what was written is lost
             return False
     return True
 
