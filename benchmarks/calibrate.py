@@ -98,8 +98,8 @@ def commit_of(runs: Sequence[Path]) -> str | None:
         raise UserError(f"{changed[0]} was played with uncommitted code; play it anew")
     commits = {facts.get("commit") for facts in begun.values()}
     if len(commits) > 1:
-        raise UserError(f"the runs are of several commits ({', '.join(map(str, commits))}); play "
-                        "them anew with one")  # fmt: skip
+        found = ", ".join(sorted(map(str, commits)))
+        raise UserError(f"the runs are of several commits ({found}); play them anew with one")
     return commits.pop()
 
 
