@@ -63,7 +63,7 @@ PUBLISHED = (
         "5 objects, one noisy view from any side, floating hand",
         "97 %",
         "98 %",
-        _SURVEY,
+        "arXiv 2407.03531",
     ),
     ("AnyGrasp", "real bins of 300 unseen objects", "93 %", "-", "arXiv 2212.08333"),
 )
@@ -104,9 +104,9 @@ _AHEAD = (
 )
 CHINESE = {
     "planner": "规划器",
-    "5 objects: success": "5 个物体:成功率",
+    "5 objects: success": "5 个物体：成功率",
     "cleared": "清空率",
-    "15 objects: success": "15 个物体:成功率",
+    "15 objects: success": "15 个物体：成功率",
     "measured at commit": "测量于提交",
     "seed": "种子",
     "95 % intervals": "95 % 区间",
@@ -118,15 +118,15 @@ CHINESE = {
     " with `{}` depth": "、深度噪声为 `{}` ",
     " with `{}` depth noise": "、深度噪声为 `{}` ",
     _HEADLINE: (
-        "**结果**:没见过的物体{}时,GraspNet 的抓取在 5 个物体的堆中有 {} 成功,"
-        "在 15 个物体的堆中有 {};分别有 {} 和 {} 的物体被放进托盘。"
+        "**结果**：没见过的物体{}时，GraspNet 的抓取在 5 个物体的堆中有 {} 成功，"
+        "在 15 个物体的堆中有 {}；分别有 {} 和 {} 的物体被放进托盘。"
     ),
     _AHEAD: (
-        "15 个物体{}时,GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"
-        "(95 % bootstrap,按场景配对)。"
+        "15 个物体{}时，GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"
+        "（95 % bootstrap，按场景配对）。"
     ),
     "OrbitGrasp (published: floating hand, noisy side view)": (
-        "OrbitGrasp(已发表:没有手臂的浮动手爪,带噪声的侧视图)"
+        "OrbitGrasp（已发表：没有手臂的浮动手爪，带噪声的侧视图）"
     ),
     "In real bins of 300 objects AnyGrasp reaches 93 %.": (
         "AnyGrasp 在 300 个物体的真实料箱中达到 93 %。"
