@@ -11,6 +11,7 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -32,6 +33,7 @@ SMALLEST_SIDE, LARGEST_SIDE = (
 # What the preparation of a mesh depends on; another value is another file in the cache.
 _SETTINGS = (
     3,  # counts the changes of the method
+    *((name, version(name)) for name in ("manifold3d", "scipy", "trimesh")),
     *sorted(
         (name, value)
         for name, value in vars(object_parts).items()
