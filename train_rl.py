@@ -48,7 +48,7 @@ from envs.vector_env import (
     make_env,
     training_envs,
 )
-from models.grasp_policy import GraspPPO, make_ppo
+from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
     Curves,
@@ -125,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if config.rl.env_id in OWN_ENVS:
                     print("its score on other scenes:")
                     print(f"  {scoring_command(config, run, ppo.layout, KNOWN_TO_A_ROBOT)}")
-                film(config, run, ppo)
+                film(config, run)
             if processes.is_main and not finished:
                 print(stopped_in_words(run, config, ppo.updates, history, options.weights))
     return 0 if finished else 130
@@ -225,15 +225,16 @@ def begin_episodes(
     ppo.memory.clear()
 
 
-def film(config: Config, run: Path, ppo: GraspPPO) -> None:
-    """Film the first `rl.films` episodes of the evaluations, played by the policy as it is now."""
+def film(config: Config, run: Path) -> None:
+    """Film the first `rl.films` episodes of the evaluations, played by the policy of the best."""
     if not config.rl.films:
         return
+    policy = load_policy(run / "best.pt")
     seeds = derived_seeds(config.rl.evaluation_episodes, config.seed, EVALUATION)
     with closing(make_env(config, render_mode="rgb_array")) as env:
         for number, seed in enumerate(seeds[: config.rl.films]):
             path = run / "films" / f"{number}.mp4"
-            reason = film_episode(env, ppo.action, seed, path, full_difficulty(config.rl.env_id))
+            reason = film_episode(env, policy, seed, path, full_difficulty(config.rl.env_id))
             print(f"{path}: {reason}")
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,6 +47,7 @@ __all__ = [
 ]
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
+_SHIPPED = ("layout", "history", "rewards")  # of a checkpoint's other entries
 BOUNDS = ("action_low", "action_high")  # of an action space, perhaps infinite
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
@@ -315,7 +316,8 @@ def policy_for(
     """A new network for an environment's observations and actions.
 
     Raises UserError for actions that are not a vector of real numbers, or without bounds where
-    they would have to be squashed, and for images of which the convolutions leave nothing.
+    they would have to be squashed, for images of which the convolutions leave nothing, and for a
+    relief of what is not depth.
     """
     if (
         not isinstance(action_space, spaces.Box)
@@ -333,6 +335,12 @@ def policy_for(
                 f"nothing of {part.key!r}, {part.shape[1]}x{part.shape[0]} pixels; shorten "
                 "rl.conv_channels or use larger images"
             )
+    if settings.relief and (not layout.images or layout.images[-1].shape[2:] != (1,)):
+        raise UserError(
+            f"rl.relief: it needs a depth image, of one channel, as the last image of the policy, "
+            f"which sees {_listed(layout)}; name one last in rl.policy_observations, or set "
+            "rl.relief=false"
+        )
     if settings.squash and not action_space.is_bounded():
         raise UserError(
             f"rl.squash: the actions of {settings.env_id} have no bounds to be squashed between; "
@@ -382,15 +390,23 @@ def make_ppo(
     layout = ObservationLayout.of(observation_space, settings.policy_observations, privileged)
     torch.manual_seed(config.seed)
     network = policy_for(layout, action_space, settings)
-    if settings.initial is not None:
-        load_initial(network, layout, settings.initial)
-    return GraspPPO(network, layout, settings, team, config.seed)
+    if settings.initial is None:
+        return GraspPPO(network, layout, settings, team, config.seed)
+    extra = load_initial(network, layout, settings.initial)
+    ppo = GraspPPO(network, layout, settings, team, config.seed)
+    if "rewards" in extra:  # the critic's values are in units of their deviation
+        with reading(settings.initial):
+            ppo.rewards.load_state_dict(extra["rewards"])
+    return ppo
 
 
-def load_initial(network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str) -> None:
-    """Load a checkpoint's weights into a network that sees by `layout`, which keeps the bounds of
-    its own actions. Raises UserError where the checkpoint's policy sees something else, and for
-    weights that are not finite."""
+def load_initial(
+    network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str
+) -> dict[str, Any]:
+    """Load a checkpoint's weights, the deviation of its actions among them, into a network that
+    sees by `layout`, which keeps the bounds of its own actions. Returns the checkpoint's other
+    entries. Raises UserError where the checkpoint's policy sees something else, and for weights
+    that are not finite."""
     checkpoint = load_checkpoint(path, KIND)
     with reading(path):
         seen = ObservationLayout.from_plain(checkpoint["extra"]["layout"])
@@ -404,6 +420,7 @@ def load_initial(network: GraspPolicyNetwork, layout: ObservationLayout, path: P
     if not all(bool(weights[name].isfinite().all()) for name in weights.keys() - own.keys()):
         raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
     load_weights(network, checkpoint | {"model": weights}, path)
+    return checkpoint["extra"]
 
 
 def _listed(layout: ObservationLayout) -> str:
@@ -444,14 +461,14 @@ def load_policy(path: Path | str) -> SavedPolicy:
 
 
 def save_policy(path: Path | str, policy: SavedPolicy) -> None:
-    """Write what `load_policy` reads, in half precision and without what only a resumed training
-    needs."""
+    """Write what `load_policy` and `rl.initial` read, in half precision and without what only a
+    resumed training needs."""
     save_checkpoint(
         path,
         kind=KIND,
         model_args=policy.network.model_args,
         model=policy.network,
         config=policy.config,
-        extra={key: policy.extra[key] for key in ("layout", "history") if key in policy.extra},
+        extra={key: policy.extra[key] for key in _SHIPPED if key in policy.extra},
         half_precision=True,
     )

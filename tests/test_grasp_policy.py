@@ -292,6 +292,37 @@ def test_a_policy_that_is_continued_acts_within_the_new_environment_s_bounds(con
     torch.testing.assert_close(network.mean_head.weight, stored["mean_head.weight"])
 
 
+def test_a_policy_that_is_continued_keeps_the_unit_of_its_values(tmp_path):
+    settings = ["rl.hidden_dim=16"]
+    act = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    before = make_ppo(SEEN, act, load_config(None, settings))
+    before.rewards.scale(np.random.default_rng(0).normal(0, 40, (64, 8)), np.zeros((64, 8), bool))
+    before.save(tmp_path / "whole.pt")
+    save_policy(tmp_path / "shipped.pt", load_policy(tmp_path / "whole.pt"))
+    for name in ("whole", "shipped"):
+        initial = f"rl.initial={tmp_path / name}.pt"
+        after = make_ppo(SEEN, act, load_config(None, [*settings, initial]))
+        assert after.rewards.moments.variance.item() == pytest.approx(
+            before.rewards.moments.variance.item(), rel=1e-3
+        )
+
+
+@pytest.mark.parametrize("keys", [["depth", "rgb"], ["rgb"], ["state"]])
+def test_relief_asks_for_depth_last(keys):
+    box = {
+        "rgb": spaces.Box(0, 255, (32, 32, 3), np.uint8),
+        "depth": spaces.Box(0, 2, (32, 32, 1), np.float32),
+        "state": spaces.Box(-1, 1, (3,), np.float32),
+    }
+    act = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    settings = ["rl.relief=true", "rl.conv_channels=[4,4]"]
+    seen = f"rl.policy_observations={','.join(keys)}"
+    with pytest.raises(UserError, match="rl.relief: .*depth image.*last"):
+        make_ppo(spaces.Dict(box), act, load_config(None, [*settings, seen]))
+    seen = "rl.policy_observations=state,rgb,depth"
+    make_ppo(spaces.Dict(box), act, load_config(None, [*settings, seen]))
+
+
 def _diverged(stored):
     stored["model"]["mean_head.bias"][0] = math.nan
 
