@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.out is not None:
         check_output(options.out)
     image = read_image(options)
-    options.mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
+    mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     network = options.planner in NETWORK_PLANNERS
     saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
     if saved is not None:
@@ -94,18 +94,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
-    marked = marked_pixels(frame.depth.shape, options.point, options.box, options.mask)
+    marked = marked_pixels(frame.depth.shape, options.point, options.box, mask)
     workspace, cut = chosen_workspace(frame, table.height, options.workspace, marked)
     remarks = [*scaled, *cut, *check_view(frame, workspace)]
     planner = new_planner(options, saved, workspace)
-    frame = replace(frame, target=find_target(planner, frame, options))
+    frame = replace(frame, target=find_target(planner, frame, options, mask))
 
     found, clearing = planner(frame), None
     grasps = found[: options.count]
     if frame.target is not None:
         clearing = TargetPlanner(planner).clearing(frame, found)[: options.count]
         width, opening = least_width(frame, table.height), planner.gripper.max_opening
-        remarks += [*check_mask(options.mask), *check_reached(grasps, clearing, width, opening)]
+        remarks += [*check_mask(mask), *check_reached(grasps, clearing, width, opening)]
     else:
         remarks += check_found(len(grasps), frame, workspace)
     if planner.calibration is not None:
@@ -233,12 +233,13 @@ def new_planner(
 
 
 def find_target(
-    planner: SearchPlanner, frame: RGBDFrame, options: argparse.Namespace
+    planner: SearchPlanner, frame: RGBDFrame, options: argparse.Namespace, mask: np.ndarray | None
 ) -> np.ndarray | None:
-    """(H, W) bool, the pixels of the one object that was named; None where none was."""
-    if options.mask is not None:
-        check_target(options.mask, frame, planner.workspace)
-        return options.mask
+    """(H, W) bool, the pixels of the one object that was named, as a mask of this shape or else by
+    the options; None where none was."""
+    if mask is not None:
+        check_target(mask, frame, planner.workspace)
+        return mask
     if options.point is not None:
         return target_at(planner.segments(frame), frame, options.point)
     if options.box is not None:

@@ -29,6 +29,7 @@ from envs.simulators import make_cell
 from utils.config import Config, load_config
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import GraspLabels, Trial, dense_labels, label_truth
+from utils.random_streams import Stream
 from utils.runs import run_script
 from utils.transforms import RGBDFrame
 
@@ -83,7 +84,8 @@ def timed_labels(frame: RGBDFrame, workspace: Workspace) -> tuple[GraspLabels, f
 
 
 def execute(cell: Cell, scene: Scene, frame: RGBDFrame, labels: GraspLabels) -> list[Trial]:
-    return execute_pairs(cell, scene, frame, labels, np.random.default_rng([scene.seed, 1]))
+    rng = np.random.default_rng([scene.seed, Stream.LABEL_TRIALS])
+    return execute_pairs(cell, scene, frame, labels, rng)
 
 
 def speed_metrics(rates: Sequence[float]) -> list[Metric]:

@@ -40,7 +40,7 @@ from utils.runs import run_script
 
 PARTS = ("speed", "digits")
 PAIRS = ("mnist:uci", "uci:mnist", "mnist:photo")
-TEST_SHARE = 0.2  # of a domain's images, seen by no training
+TEST_SHARE = 0.2  # of a domain's images, which no training of this domain sees
 RESETS = 10
 
 
@@ -135,7 +135,8 @@ def bench_depth_noise(side: int) -> Metric:
 def bench_digits(
     source: str, target: str, seeds: int, settings: AdaptationSettings
 ) -> list[Metric]:
-    """Mean accuracies over seeds on images that no training saw, in percent.
+    """Mean accuracies over seeds on images that no training saw, in percent; both domains of
+    mnist:photo show the same digits, so that most digits of its test were seen on another ground.
 
     source_only uses the source's batch-norm statistics, as a user without target images
     would have to; own_norms is the same weights with the target's (Li et al. 2016); dann adds the

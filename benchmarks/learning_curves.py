@@ -68,7 +68,7 @@ def evaluations(run: Path) -> list[tuple[int, float]]:
     file = run / "results.json"
     if file.is_file():
         history = json.loads(file.read_text())["history"]
-        return [(row["step"], row["success"]) for row in history]
+        return [(row["step"], row["success"]) for row in history if "success" in row]
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
     if "evaluation/success" not in events.Tags()["scalars"]:  # none yet

@@ -170,7 +170,7 @@ def headline(say: Say, scoreboard: Figures, clutter: Figures) -> str:
         {noise_of(row): row for row in rows if row["policy"] == "graspnet"}
         for rows in (_piles(scoreboard), rows_of(clutter))
     )
-    noise = min(few.keys() & many.keys(), key=lambda noise: noise == CLEAN)
+    noise = min(few.keys() & many.keys(), key=lambda noise: (noise == CLEAN, noise))
     noisy = "" if noise == CLEAN else say(" with `{}` depth noise").format(noise)
     cells = [share(rows[noise]) for share in (success, cleared) for rows in (few, many)]
     return say(_HEADLINE).format(noisy, *(cell.split(" [")[0] for cell in cells))

@@ -30,6 +30,7 @@ from torch.nn import functional
 from tqdm import tqdm
 
 from envs.critic_examples import (
+    GENERATION,
     LABEL,
     PLANNERS,
     Examples,
@@ -166,7 +167,7 @@ def check_same_settings(folder: Path, config: Config) -> None:
     sections = ("gripper", "objects", "scene", "workspace", "execution", "sim", "camera", "robot")
     settings = {name: getattr(config, name).model_dump(mode="json") for name in sections}
     settings |= {"seed": config.seed, "object_sets": usual_sets(config), "label": LABEL}
-    settings["candidates"] = PLANNERS
+    settings |= {"candidates": PLANNERS, "generation": GENERATION}
     settings["simulator"] = config.simulator
     for name, weights in (("critic", SHIPPED), ("network", SHIPPED_NETWORK)):
         settings[name] = hashlib.sha256(weights.read_bytes()).hexdigest()
@@ -318,7 +319,8 @@ def half_width(values: np.ndarray, scene: np.ndarray) -> float:
     independent: as of the sums of whole scenes."""
     _, number = np.unique(scene, return_inverse=True)
     off = np.bincount(number, weights=values - values.mean())
-    return float(1.96 * np.sqrt(off @ off) / len(values))
+    scale = len(off) / max(len(off) - 1, 1)
+    return float(1.96 * np.sqrt(off @ off * scale) / len(values))
 
 
 if __name__ == "__main__":

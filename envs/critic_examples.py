@@ -61,7 +61,10 @@ _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gam
 _FROM_ABOVE = 0.4  # share of cameras within 15 degrees of the vertical; the others up to 65
 VGN_LEAST_HELD = 0.008  # m, as configs/vgn.yaml has it
 LABEL = "carried, not too thin"  # what counts as a success: see `execute`
-_FIRST_SEED = 3_000_000_000  # no other training uses these, nor an evaluation with seeds < 10,000
+GENERATION = 2  # counts the changes of what is drawn here
+# No other training uses these, nor an evaluation with a seed below 30,000; the sealed scenes, of
+# seed 31847, are beyond them and of other objects.
+_FIRST_SEED = 3_000_000_000
 
 
 class Examples(NamedTuple):
@@ -148,12 +151,15 @@ def numbered_examples_of(config: Config, number: int) -> tuple[int, Examples]:
 def worth_trying(
     inputs: CriticInputs, most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `most` indices (M,) of candidates, and which of them were drawn (M,) bool: the others,
-    half of them, are those that the shipped critic ranks first."""
-    tilt = inputs.facts[:, INPUTS.index("tilt")]
-    rank = np.argsort(-shipped_critic().chance(inputs) * JUDGED_FAN.preference(tilt))
-    best = rank[: most // 2]
-    drawn = rng.permutation(rank[most // 2 :])[: most - len(best)]
+    """Up to `most` indices (M,) of candidates, and which of them were drawn (M,) bool, from all, so
+    that they favour no critic. The others, half of them, are those of the rest that the shipped
+    critic ranks first."""
+    order = rng.permutation(len(inputs.facts))
+    drawn, rest = np.split(order, [most - most // 2])
+    others = inputs.take(rest)
+    tilt = others.facts[:, INPUTS.index("tilt")]
+    rank = np.argsort(-shipped_critic().chance(others) * JUDGED_FAN.preference(tilt))
+    best = rest[rank[: most // 2]]
     return np.concatenate([best, drawn]), np.arange(len(best) + len(drawn)) >= len(best)
 
 

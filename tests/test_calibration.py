@@ -186,6 +186,13 @@ def test_a_fit_finds_what_rough_depth_costs() -> None:
     np.testing.assert_allclose(truth.scores(truth(scores, rough), rough), scores)
 
 
+def test_few_grasps_do_not_make_a_rough_frame_hopeless() -> None:
+    fitted = Calibration.fit([0.5, 0.5, 0.5], [True, True, False], [0.0, 0.0, 1e-4])
+    assert 0 < fitted.penalty < 5000  # per metre: half a unit of log odds for 0.1 mm at most
+    with pytest.raises(ValueError, match="roughness"):
+        Calibration.fit([0.5], [True], [np.nan])
+
+
 def test_no_fit_states_that_noise_helps() -> None:
     rough = np.repeat([0.0, 0.003], 100)
     fitted = Calibration.fit(np.full(200, 0.5), np.arange(200) % 10 < 6 + 3 * (rough > 0), rough)

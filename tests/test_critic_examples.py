@@ -61,9 +61,16 @@ def test_half_of_what_is_tried_is_what_the_critic_likes_best(monkeypatch) -> Non
     inputs = CriticInputs(facts, np.zeros((30, 3, 24, 48), np.int8))
     tried, drawn = worth_trying(inputs, 9, np.random.default_rng(1))
     assert len(tried) == len(set(tried)) == 9
-    assert set(tried[~drawn]) == set(np.argsort(-cover)[:4])
+    assert drawn.sum() == 5
+    best = [i for i in np.argsort(-cover) if i not in tried[drawn]]
+    assert set(tried[~drawn]) == set(best[:4])
     others, _ = worth_trying(inputs, 9, np.random.default_rng(2))
     assert set(tried) != set(others)
+    favourite, shares = np.argmax(cover), []
+    for seed in range(300):  # it is drawn as often as any other: 5 times of 30
+        tried, drawn = worth_trying(inputs, 9, np.random.default_rng(seed))
+        shares.append(favourite in tried[drawn])
+    assert np.mean(shares) == pytest.approx(5 / 30, abs=3 * np.sqrt(5 / 30 * 25 / 30 / 300))
     assert len(worth_trying(inputs.take(np.arange(3)), 9, np.random.default_rng(1))[0]) == 3
 
 

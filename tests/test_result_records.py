@@ -89,6 +89,10 @@ def test_a_journal_of_an_older_version_is_read(tmp_path):
     assert record.depth_noise == "none"
     (record,) = read_rounds(tmp_path / "old.jsonl", "kinect")
     assert record.depth_noise == "kinect", "of the run's config"
+    fell = old | {"ended": "lost", "objects_cleared": 0, "attempts": []}
+    (tmp_path / "fell.jsonl").write_text(json.dumps(fell) + "\n")
+    (record,) = read_rounds(tmp_path / "fell.jsonl")
+    assert record.ended == "fell_off"
     origin = {"commit": None, "versions": {}, "overrides": ["camera.depth_noise=gamma"]}
     (tmp_path / "sample.jsonl").write_text(f"{json.dumps(origin)}\n{json.dumps(old)}\n")
     (record,) = read_sample(tmp_path / "sample.jsonl").rounds

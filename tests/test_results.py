@@ -135,7 +135,7 @@ def test_a_plan_without_a_reason_had_no_grasps():
 
 
 def test_rounds_whose_last_objects_fell_off_are_told():
-    fell = [a_round("heuristic", seed, 2, 1, [attempt("success")], "lost") for seed in (3, 4)]
+    fell = [a_round("heuristic", seed, 2, 1, [attempt("success")], "fell_off") for seed in (3, 4)]
     (stop,) = stop_reasons(fell)
     assert (stop.count, stop.reason, stop.seed) == (2, None, 3) and "fell off" in stop.sentence
 

@@ -128,7 +128,7 @@ def test_a_target_that_falls_off_while_another_thing_is_picked_is_lost(
     settings = {"policy": "x", "objects": "box", "max_failures": 9}
     plan = Targeted([cube_grasp(offset=(0, 0.06, 0))])
     record = run_round(cell, Scene("retrieve", 0, placements, target=1), plan, **settings)
-    assert (record.ended, record.target_in_hand) == ("lost", False)
+    assert (record.ended, record.target_in_hand) == ("fell_off", False)
     record = run_round(cell, Scene("retrieve", 0, placements, target=0), plan, **settings)
     assert (record.ended, record.target_in_hand) == ("target", True)
     record = run_round(cell, Scene("pile", 0, placements), plan, **settings)

@@ -50,7 +50,7 @@ def test_plans_of_one_scene_are_not_independent() -> None:
     """Of ten scenes whose four plans end alike, the mean is as certain as of ten plans."""
     ends, scene = np.array([1.0, 0, 0, 1, 1, 0, 1, 1, 1, 0]), np.arange(10)
     alone = half_width(ends, scene)
-    assert alone == pytest.approx(1.96 * ends.std() / np.sqrt(10))
+    assert alone == pytest.approx(1.96 * ends.std(ddof=1) / np.sqrt(10))
     assert half_width(np.repeat(ends, 4), np.repeat(scene, 4)) == pytest.approx(alone)
     examples = made_up(3, 0)
     plans = len({*examples.plan}) // 3

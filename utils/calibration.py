@@ -42,6 +42,7 @@ LEAST_SLOPE = 0.01  # keeps the order of grasps where the score tells nothing
 # Standard deviation of slopes that are expected: so few grasps do not make a step of the line.
 SLOPE_SPREAD = 10.0
 DOUBT_SPREAD = 2.0  # and of doubts
+PENALTY_SPREAD = 2.0  # and of penalties, 1 / mm
 _NEVER, _ALWAYS = np.finfo(float).tiny, 1 - np.finfo(float).epsneg  # chances that have a score
 _LONGEST = 700.0  # logarithm of a number that floats hold
 _HALVINGS = 60
@@ -118,7 +119,8 @@ class Calibration:
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
-        slopes and DOUBT_SPREAD on the doubt.
+        slopes, DOUBT_SPREAD on the doubt and PENALTY_SPREAD on the penalty. Raises RuntimeError
+        where it finds none.
         """
         own = _Sample.of(scores, successes, roughness, failed, bounded)
         most = None if bounded else 0.0  # of the upper slope
@@ -127,6 +129,8 @@ class Calibration:
             lambda numbers: own.loss(*numbers) / len(own.low), [1.0, 0.0, 0.0, 0.0, 0.0],
             method="L-BFGS-B", bounds=bounds,
         )  # fmt: skip
+        if not best.success:
+            raise RuntimeError(f"a calibration of {len(own.low)} grasps: {best.message}")
         slope, offset, doubt, upper, penalty = best.x.tolist()
         return Calibration(slope, offset, 1000 * penalty, doubt, upper)
 
@@ -152,6 +156,8 @@ class _Sample(NamedTuple):
         scores, won = np.asarray(scores, dtype=float), np.asarray(successes, dtype=bool)
         if scores.size == 0 or not np.isfinite(scores).all():
             raise ValueError("a fit needs at least one grasp, and scores that are finite numbers")
+        if not np.isfinite(np.asarray(roughness, dtype=float)).all():
+            raise ValueError("the roughness of a frame has to be a finite number")
         if bounded and scores.max() > 1.0 + ROUNDING:
             raise ValueError(f"a score is {scores.max():g}: give bounded=False where some exceed 1")
         target = np.where(won, (won.sum() + 1) / (won.sum() + 2), 1 / ((~won).sum() + 2))
@@ -166,7 +172,8 @@ class _Sample(NamedTuple):
         z = line - penalty * self.rough - doubt * self.failed
         likelihood = np.sum(self.target * log_expit(z) + (1 - self.target) * log_expit(-z))
         slopes = (slope**2 + upper**2) / SLOPE_SPREAD**2
-        return float((slopes + (doubt / DOUBT_SPREAD) ** 2) / 2 - likelihood)
+        others = (doubt / DOUBT_SPREAD) ** 2 + (penalty / PENALTY_SPREAD) ** 2
+        return float((slopes + others) / 2 - likelihood)
 
 
 def _low(scores: ArrayLike) -> np.ndarray:

@@ -27,3 +27,4 @@ class Stream(IntEnum):
     APPEARANCE = 13  # a randomised scene (`envs.simulators`)
     TRACKED_MOTION = 15  # of an object that is tracked (`benchmarks.bench_tracking`)
     RANDOM_PLANNER = 17  # `models.planners.RandomPlanner`
+    LABEL_TRIALS = 19  # the pairs that are executed (`benchmarks.bench_labels`)

@@ -26,7 +26,7 @@ OPEN_LOOP = "open_loop"  # the controller that takes no further image on the way
 CLEAN = "none"  # the depth noise of a camera without noise
 NO_PLAN = "no_plan"
 PLANNER_ERROR = "planner_error"
-FELL_OFF = "lost"  # how a round ends whose last objects left the table without a pick
+FELL_OFF = "fell_off"  # how a round ends whose last objects left the table without a pick
 FAILURES = {  # reason: its name in tables, in the order in which a grasp can fail
     NO_PLAN: "no plan",
     PLANNER_ERROR: "planner failed",
@@ -246,6 +246,8 @@ def _parse(
 def _round(content: dict[str, Any]) -> RoundRecord:
     attempts = content.pop("attempts")
     _check_types(content, _ROUND_TYPES)
+    if content["ended"] == "lost":  # its name in older files
+        content["ended"] = FELL_OFF
     for attempt in attempts:
         _check_types(attempt, _ATTEMPT_TYPES)
         grasp = attempt["grasp"]
