@@ -13,8 +13,8 @@ A part is a list of commands that anyone can run alone. The parts that stop earl
 with the next call: finished commands lie in runs/results/<commit>/, unfinished ones are resumed.
 A finished part leaves its figures in docs/results/<part>.json and the first rounds of each row in
 docs/results/<part>-<command>.jsonl; the tables are written from these files alone and say how many
-rounds each row has. Each part has a file of its own, so that parts may have different scales. Each
-publication adds a look at the sealed scenes to docs/results/looks.json (`benchmarks.looks`).
+rounds each row has. Each part has a file of its own, so that parts may have different scales.
+docs/results/looks.json keeps each measurement, a look at the sealed scenes (`benchmarks.looks`).
 
 Seed and objects are those of configs/sealed.yaml, on which no choice is made; docs/choices.md tells
 on which seeds choices were made. A trial, whose figures no page shows, plays none of these scenes.
@@ -36,7 +36,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from benchmarks.looks import add_look
+from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import (
     NOWHERE,
     PARTS,
@@ -90,6 +90,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 for name in missing:
                     print(f"{part.name}: skipped, because no --{name} names {SOURCES[name]}")
             else:
+                if writes_docs(options) and not is_finished(part, commit, options.scale):
+                    about = {"part": part.name, "commit": commit, "scale": options.scale}
+                    begin_look(FIGURES, about | {"date": str(date.today())})
                 measure(part, commit, options.scale, folders)
                 if writes_docs(options):
                     publish(part, commit, options.scale)

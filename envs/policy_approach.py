@@ -64,8 +64,8 @@ class PolicyApproach:
         self.closed_at: Grasp | None = None
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
-        """Raises GraspFailure when nothing is gripped within the actions of a training episode; what
-        was gripped by the last of them alone counts."""
+        """Raises GraspFailure when nothing is gripped within the actions of a training episode;
+        a grip at the last of them alone counts, too."""
         self.closed_at, ended, gripped, touches = None, False, 0, False
         before = cell.robot.opening
         try:

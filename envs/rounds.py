@@ -99,8 +99,8 @@ def run_round(
     """
     scenario = scenario or scene.layout
     work = _Round(
-        cell, scene, plan, policy, SCENARIOS[scenario], controller, approach_by, abstain,
-        second_look,
+        cell, scene, plan, policy=policy, conditions=SCENARIOS[scenario], controller=controller,
+        approach_by=approach_by, abstain=abstain, second_look=second_look,
     )  # fmt: skip
     ended = work.play(max_failures, on_attempt)
     return work.record(scenario, objects, ended)
@@ -115,7 +115,7 @@ class _Round:
     """
 
     def __init__(
-        self, cell: Cell, scene: Scene, plan: Planner, policy: str, conditions: Scenario,
+        self, cell: Cell, scene: Scene, plan: Planner, *, policy: str, conditions: Scenario,
         controller: str, approach_by: GraspFinder | None, abstain: float | None, second_look: float,
     ):  # fmt: skip
         self.cell, self.scene, self.policy = cell, scene, policy

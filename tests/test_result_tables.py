@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import results
-from benchmarks.looks import add_look
+from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import PARTS, REPOSITORY, SEALED, SEED, SPLIT
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
@@ -194,7 +194,7 @@ def test_noisy_rows_come_first_with_a_column_that_names_the_noise(tmp_path):
     assert written[7].startswith("| OrbitGrasp") and " | - | 97 % | 98 % |" in written[7]
     assert "| planner | depth | success | cleared | picks an hour |" in written
     chinese = with_tables(page, tmp_path, chinese=True)
-    assert "| 规划器 | 深度噪声 | 5 个物体:成功率 |" in chinese
+    assert "| 规划器 | 深度噪声 | 5 个物体：成功率 |" in chinese
 
 
 def test_differences_name_the_noise_of_the_first_pair(tmp_path):
@@ -211,7 +211,7 @@ def test_differences_name_the_noise_of_the_first_pair(tmp_path):
     assert "On 15 objects with `realsense` depth GraspNet's success minus" in written
     assert "| `random_urdfs` | pile | `realsense` | +1.5 [-0.2, +3.1] | - |" in written
     chinese = with_tables(page, tmp_path, chinese=True)
-    assert "15 个物体、深度噪声为 `realsense` 时,GraspNet" in chinese
+    assert "15 个物体、深度噪声为 `realsense` 时，GraspNet" in chinese
 
 
 def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
@@ -497,11 +497,17 @@ def test_every_look_at_sealed_scenes_is_kept(tmp_path):
         part = {"part": name, "commit": 40 * commit, "date": "2026-01-02", "scale": 1.0}
         first, second = {"rows": rows[:1]}, {"rows": rows[1:]}
         add_look(tmp_path, part | {"commands": {"one": first, "two": second, "three": {}}})
+    for name in ("mujoco", "servo", "servo"):  # the first one is broken off
+        about = {"part": name, "commit": 40 * "c", "scale": 0.5, "date": "2026-01-03"}
+        begin_look(tmp_path, about)
+        if name == "servo":
+            add_look(tmp_path, about | {"commands": {"one": {"rows": clean[1:]}}})
     written = with_tables("<!-- results:looks -->\n<!-- /results -->", tmp_path).splitlines()
     assert [line.split(" | ")[:2] + line.split(" | ")[4:] for line in written[3:-1]] == [
         ["| `scoreboard`", "1", "`realsense`", "1000", "95 %, 14 %", "-", "- |"],
         ["| `scoreboard`", "2", "`none`", "500", "-", "-", "75 %, 1 % |"],
         ["| `mujoco`", "1", "`none`", "500", "-", "-", "75 %, 1 % |"],
+        ["| `mujoco`", "2", "not finished", "0", "-", "-", "- |"],
         ["| `retrieve`", "1", "`none`", "5", "80 %, 80 %", "-", "- |"],
     ]
 

@@ -13,8 +13,10 @@ import pytest
 from envs import vector_env
 from envs.vector_env import start_method, training_envs
 from models.grasp_policy import make_ppo
+from tests.helpers.object_files import box_moments, urdf_box, urdf_inertia
 from tests.helpers.quick_envs import POINT
 from utils.config import load_config
+from utils.errors import UserError
 
 
 def first_observation(env, index):
@@ -76,6 +78,31 @@ def test_workers_leave_sigterm_to_the_main_process():
     config = load_config(None, [*POINT, "rl.parallel=true"])
     with training_envs(config, 2) as envs:
         assert envs.each(sent_sigterm) == [0, 1]
+
+
+def broken(env, index):
+    yield
+    raise UserError("the table is gone")
+
+
+def test_an_error_in_an_evaluation_is_told_as_it_is():
+    """Its workers are gone, and cannot be set back to the resets of a training."""
+    config = load_config(None, [*POINT, "rl.parallel=true"])
+    with (
+        pytest.raises(UserError, match="the table is gone"),
+        training_envs(config, 2) as envs,
+        envs.at_full_difficulty(),
+    ):
+        envs.each(broken)
+
+
+def test_a_broken_object_is_told_of_before_the_training(tmp_path):
+    inertia = urdf_inertia(box_moments(0.1))
+    urdf_box(tmp_path, "0.1", inertia).rename(tmp_path / "a.urdf")
+    urdf_box(tmp_path, "-0.1", inertia).rename(tmp_path / "b.urdf")
+    config = load_config(None, [f"env.objects={tmp_path}", "rl.parallel=false"])
+    with pytest.raises(UserError, match="b.urdf.*mass"), training_envs(config, 1):
+        pass
 
 
 @pytest.mark.slow
