@@ -52,7 +52,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.graspnet_inference import training_scale
+from models.graspnet_inference import USUAL_PIXEL, training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached, least_width
@@ -89,8 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     network = options.planner in NETWORK_PLANNERS
     saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
-    if saved is not None:
-        training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
+    pixel = USUAL_PIXEL if saved is None else saved.metres_per_pixel
+    training_scale(image, pixel)  # wrong units fail here, not at the table
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
@@ -235,8 +235,7 @@ def new_planner(
 def find_target(
     planner: SearchPlanner, frame: RGBDFrame, options: argparse.Namespace, mask: np.ndarray | None
 ) -> np.ndarray | None:
-    """(H, W) bool, the pixels of the one object that was named, as a mask of this shape or else by
-    the options; None where none was."""
+    """(H, W) bool, the pixels of the one object that was named; None where none was."""
     if mask is not None:
         check_target(mask, frame, planner.workspace)
         return mask

@@ -21,7 +21,7 @@ from envs.cell_layout import ObjectModel, Placement, Scene
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from envs.simulators import cell_class
-from utils.image_overlay import write_picture
+from utils.image_overlay import picture_path, write_picture
 from utils.runs import parse_args, run_script
 from utils.transforms import look_at
 
@@ -75,7 +75,7 @@ def tilt(cell: Cell, axis: int = 0) -> float:
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
         )
 
     summary = "Grip a bar off its centre in both simulators."

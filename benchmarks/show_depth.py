@@ -23,7 +23,7 @@ from utils.config import Config
 from utils.depth import DEPTH_NOISES
 from utils.errors import UserError
 from utils.evaluation import with_depth_noise
-from utils.image_overlay import contact_sheet, write_picture
+from utils.image_overlay import contact_sheet, picture_path, write_picture
 from utils.result_records import CLEAN
 from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, deproject, known_depth
@@ -39,7 +39,7 @@ _TABLE = 0.015  # m from the median height, within which a pixel shows the table
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
         )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)

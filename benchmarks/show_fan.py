@@ -28,7 +28,7 @@ from models.planner_fan import FanPlanner
 from models.planners import needs_truth
 from utils.errors import UserError
 from utils.height_map import HeightMap, height_map_from_frame, tilted_height_map, tilted_view
-from utils.image_overlay import contact_sheet, write_picture
+from utils.image_overlay import contact_sheet, picture_path, write_picture
 from utils.runs import parse_args, run_script
 from utils.seen_heights import without_holes
 from utils.transforms import Grasp, RGBDFrame, look_at
@@ -41,7 +41,7 @@ _SHOWN = 0.12  # m of height between black and white
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
         )
         parser.add_argument("--planner", default="graspnet6d", help="one that grasps from any side")
         parser.add_argument("--layout", default="pile", help="of the scenes, a key of scenarios")

@@ -19,7 +19,7 @@ from envs.mujoco_cell import MujocoCell
 from envs.objects import load_object_set
 from envs.simulators import cell_class
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
-from utils.image_overlay import write_picture
+from utils.image_overlay import picture_path, write_picture
 from utils.runs import parse_args, run_script
 from utils.transforms import RGBDFrame, look_at
 
@@ -31,7 +31,7 @@ _DEEPEST, _HIGHEST = 0.81, 0.70  # m, black and white in the picture of depth
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=Path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
         )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)

@@ -30,7 +30,7 @@ from envs.objects import load_object_set
 from envs.simulators import make_cell
 from utils.atomic_files import check_writable, new_folder, write_atomic
 from utils.errors import UserError
-from utils.image_overlay import write_picture
+from utils.image_overlay import PICTURES, write_picture
 from utils.runs import parse_args, run_script, this_python
 from utils.transforms import RGBDFrame, look_at
 
@@ -38,7 +38,6 @@ SCENIC_EYE, SCENIC_TARGET = (1.22, -0.50, 0.72), (0.38, -0.12, 0.20)  # m in W
 _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 0.5}
 FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
 SCENE = "scene.png"  # the picture of a scene, where no name is given
-PICTURES = (".png", ".jpg", ".jpeg")
 _HOLD = 6  # pictures for which the last one of an episode stays
 
 

@@ -104,7 +104,9 @@ def load_graspnet(path: Path | str) -> SavedGraspNet:
         raise UserError(f"{path}: does not hold the pixel size of its images ({PIXEL_SIZE})")
     saved = SavedGraspNet(model, pixel_size, checkpoint["config"], extra)
     with reading(path):
-        saved.gripper  # noqa: B018 - raises for a hand that cannot be
+        opening = saved.gripper.max_opening
+        if not min(opening, model.max_width) > 0:
+            raise ValueError(f"its hand opens {opening} m, its widths end at {model.max_width} m")
     return saved
 
 

@@ -21,10 +21,31 @@ MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
         ('<robot name="r"><link name="l"/></robot>', "bad.urdf has neither"),
         (MISSING_MESH, r"bad\.urdf: mesh .*box.obj does not exist"),
         (f"<robot name='r'>{301 * '<geometry/>'}</robot>", "301 geometries, expected at most 300"),
+        ("<robot><link name='l'/></robot>", "bad.urdf is no URDF"),
+        ("<sdf name='r'/>", "bad.urdf is no URDF"),
+        (2 * "<link name='l'/>", "two links named 'l'"),
+        (
+            "<joint name='j'><parent link='l'/><child link='m'/></joint>",
+            "the child of its joint 'j'",
+        ),
+        ("<mesh/>", "filename of a <mesh> is '', expected a file"),
+        ("<mesh filename='https://x.org/a.obj'/>", "filename of a <mesh> is 'https.*copy the mesh"),
+        (
+            "<cylinder radius='0' length='0.1'/>",
+            "radius of a <cylinder> is '0', expected 1 number ",
+        ),
+        ("<box size='0.05 0.05'/>", "size of a <box> is '0.05 0.05', expected 3 numbers over 0"),
+        ("<box/>", "size of a <box> is None"),
+        ("<mesh filename='a.obj' scale='0 0 0'/>", "scale of a <mesh> is '0 0 0', expected 1 or 3"),
+        ("<lateral_friction/>", "value of a <lateral_friction> is None, expected 1 number of 0 or"),
+        ("<mass value='heavy'/>", "value of a <mass> is 'heavy', expected 1 number .kilograms"),
+        ("<inertia ixx='much'/>", "ixx of a <inertia> is 'much'"),
     ],
 )
 def test_a_bad_urdf_is_named(tmp_path, content, message):
     path = tmp_path / "bad.urdf"
+    if not content.startswith(("<robot", "<sdf")):
+        content = f"<robot name='r'><link name='l'/>{content}</robot>"
     path.write_text(content)
     with pytest.raises(ObjectError, match=message):
         read_object(path)
@@ -36,7 +57,11 @@ COLOUR = '<material name="m"><color rgba="1 0 0"/></material>'
 @pytest.mark.parametrize(
     ("mesh", "material", "message"),
     [
-        ('filename="box.obj" scale="1 1"', "", r"bad.urdf .* its visual mesh is \[1. 1.\]"),
+        (
+            'filename="box.obj" scale="1 1"',
+            "",
+            r"bad.urdf.* scale of a <mesh> is '1 1', expected 1 or 3 numbers",
+        ),
         ('filename="box.obj"', COLOUR, r"bad.urdf .* colour of a visual is \[1. 0. 0.\]"),
         (f'filename="{300 * "b"}.obj"', "", "b.obj does not exist"),
         (f'filename="package://{300 * "b"}/other.obj"', "", "other.obj does not exist"),

@@ -379,6 +379,12 @@ def pose(files, T):
     np.savetxt(files.folder / "pose.txt", T)
 
 
+def pose_in_millimetres(files):
+    T = OVERHEAD.copy()
+    T[:3, 3] *= 1000
+    pose(files, T)
+
+
 def mirrored_pose(files):
     pose(files, OVERHEAD @ np.diag([1, 1, -1, 1]))
 
@@ -441,6 +447,12 @@ def newer_checkpoint(files):
 def three_channels(files):
     save_graspnet(files.folder / "rgb.pt", GraspNet(3, backbone="ggcnn"), PIXEL)
     return {"checkpoint": files.folder / "rgb.pt"}
+
+
+def closed_hand(files):
+    shut = files.folder / "shut.pt"
+    save_graspnet(shut, GraspNet(backbone="ggcnn"), PIXEL, config={"gripper": {"max_opening": -1}})
+    return {"checkpoint": shut}
 
 
 def other_json(files):
@@ -550,6 +562,9 @@ def only_a_count_beside_export(files):
         (options(intrinsics=[481, 481, 960, 120]), "far outside"),
         (options(intrinsics=[481, 481, 400, 120]), r"point \(400, 120\) lies outside .* 320x240"),
         (options(intrinsics=[48100, 48100, 160, 120]), "too little"),
+        (options(depth_scale=0.01, planner="heuristic", checkpoint=None), "unit of the depth"),
+        (pose_in_millimetres, "stands 9.* m from .* is the position in millimetres"),
+        (closed_hand, "its hand opens -1"),
         (mirrored_pose, "not rigid"),
         (scaled_pose, "not rigid"),
         (transposed_pose, "transposed"),

@@ -106,13 +106,10 @@ def check_rgbd(rgb: np.ndarray, depth: np.ndarray) -> float:
         raise UserError("depth: no pixel is known; all are zero, negative or NaN")
     typical, (low, high) = float(np.median(known)), PLAUSIBLE_DEPTH
     if not low <= typical <= high:
-        hint = (
-            "; are these millimetres? Divide by 1000 (predict.py: --depth-scale 0.001)"
-            if typical > high
-            else ""
-        )
         raise UserError(
-            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m{hint}"
+            f"depth: the median is {typical:.4g} m, expected {low:g} to {high:g} m; check its unit "
+            "(predict.py: --depth-scale is the metres for 1 in the file, 0.001 for millimetres, 1 "
+            "for metres)"
         )
     return typical
 

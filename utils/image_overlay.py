@@ -6,6 +6,7 @@ This module knows the pinhole camera, but no simulator, no planner and no networ
 from __future__ import annotations
 
 import io
+from argparse import ArgumentTypeError
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+PICTURES = (".png", ".jpg", ".jpeg")  # what a picture's name may end in
 SUCCESS_COLOR = (52, 211, 123)  # RGB
 FAILURE_COLOR = (248, 92, 92)
 PLATE_LENGTH = 0.02  # m, width of a Panda fingertip across the closing line
@@ -146,6 +148,15 @@ def _lines(text: str, width: int) -> list[str]:
 
 def _text_width(text: str) -> int:
     return cv2.getTextSize(text, _FONT, _TEXT, 1)[0][0]
+
+
+def picture_path(name: str) -> Path:
+    """The file of a picture that an option names, as the type of this option. Raises
+    ArgumentTypeError for a name that tells no type."""
+    path = Path(name)
+    if path.suffix.lower() not in PICTURES:
+        raise ArgumentTypeError(f"{name!r} is no file {' or '.join(PICTURES)}")
+    return path
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:

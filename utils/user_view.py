@@ -64,7 +64,8 @@ def workspace_of(
     centre = np.where(high - low < LARGEST, (low + high) / 2, inwards)
     remark = (
         f"what is above the table is spread over {size:.1f} m, so that only the square of "
-        f"{LARGEST:g} m {place} was searched; give --workspace or crop the image"
+        f"{LARGEST:g} m {place} was searched; crop the image, or give --workspace "
+        "(with --camera-pose)"
     )
     return Workspace(_pair(centre), LARGEST, table_height), [remark]
 
