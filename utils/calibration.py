@@ -48,6 +48,7 @@ _LONGEST = 700.0  # logarithm of a number that floats hold
 _HALVINGS = 60
 ROUNDING = 1e-6  # by which a score of 1 may come back from its chance
 BINS = 10  # of equal width in [0, 1]
+_DRAWS = 4000  # of the outcomes of all grasps
 
 
 @dataclass(frozen=True)
@@ -229,38 +230,36 @@ class ReliabilityBin(NamedTuple):
     success: float
 
 
-def reliability(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> list[ReliabilityBin]:
+def reliability(chances: ArrayLike, successes: ArrayLike) -> list[ReliabilityBin]:
     """The bins of [0, 1] that hold grasps, lowest first; a chance of 1 belongs to the last."""
     chances, successes = np.asarray(chances, dtype=float), np.asarray(successes, dtype=float)
-    place = _bins_of(chances, bins)
+    place = _bins_of(chances)
     return [
         ReliabilityBin(int(here.sum()), float(chances[here].mean()), float(successes[here].mean()))
-        for here in (place == number for number in range(bins))
+        for here in (place == number for number in range(BINS))
         if here.any()
     ]
 
 
-def _bins_of(chances: np.ndarray, bins: int) -> np.ndarray:
+def _bins_of(chances: np.ndarray) -> np.ndarray:
     """(N,) numbers of the bins that hold chances (N,)."""
-    return np.minimum((chances * bins).astype(int), bins - 1)
+    return np.minimum((chances * BINS).astype(int), BINS - 1)
 
 
-def calibration_error(chances: ArrayLike, successes: ArrayLike, bins: int = BINS) -> float:
+def calibration_error(chances: ArrayLike, successes: ArrayLike) -> float:
     """The expected calibration error: the mean over the grasps of |share of successes - mean
     chance| of their bin."""
-    found = reliability(chances, successes, bins)
+    found = reliability(chances, successes)
     total = sum(one.count for one in found)
     return sum(one.count * abs(one.success - one.chance) for one in found) / total
 
 
-def error_by_chance(
-    chances: ArrayLike, bins: int = BINS, draws: int = 4000, seed: int = 0
-) -> tuple[float, float]:
+def error_by_chance(chances: ArrayLike) -> tuple[float, float]:
     """The mean and the 95th percentile of the calibration error of a planner that knows its chances
     (N,) exactly: few grasps leave an error to it, too. By outcomes drawn from these chances."""
     chances = np.asarray(chances, dtype=float)
-    belongs = (_bins_of(chances, bins)[:, None] == np.arange(bins)).astype(float)  # (N, bins)
-    outcomes = np.random.default_rng(seed).random((draws, len(chances))) < chances
+    belongs = (_bins_of(chances)[:, None] == np.arange(BINS)).astype(float)  # (N, BINS)
+    outcomes = np.random.default_rng(0).random((_DRAWS, len(chances))) < chances
     errors = np.abs((outcomes - chances) @ belongs).sum(axis=1) / len(chances)
     return float(errors.mean()), float(np.quantile(errors, 0.95))
 

@@ -12,23 +12,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
+CONFIDENCE = 0.95  # of every interval
+RESAMPLES = 10_000  # of a bootstrap interval
 FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
 
 
-def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """Wilson's score interval of a success rate, (low, high) in [0, 1]; n = 0 gives (0, 1).
 
     It assumes independent trials. E. B. Wilson, "Probable inference, the law of succession, and
     statistical inference", JASA 22 (1927); equation as in Newcombe, Stat. Med. 17 (1998), method 3.
-    Raises ValueError unless 0 <= successes <= n and 0 < confidence < 1.
+    Raises ValueError unless 0 <= successes <= n.
     """
-    _check_confidence(confidence)
     if not 0 <= successes <= n:
         raise ValueError(f"wilson_interval: need 0 <= successes <= n, got {successes} of {n}")
-    return _score_interval(successes / n, n, confidence) if n else (0.0, 1.0)
+    return _score_interval(successes / n, n) if n else (0.0, 1.0)
 
 
-def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+def clustered_interval(outcomes: ArrayLike) -> tuple[float, float]:
     """Interval of the rate sum(successes) / sum(trials) of rounds, (low, high) in [0, 1].
 
     outcomes: (R, 2) successes and trials of each round, or (R,) 0/1 as in
@@ -42,7 +43,6 @@ def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[f
     does that of a single round, or of none or only successes, which show no variance. No trial
     gives (0, 1). Raises ValueError on shapes and counts that make no sense.
     """
-    _check_confidence(confidence)
     counts = _counts(outcomes)
     successes, n = counts.sum(axis=0)
     if n == 0:
@@ -51,7 +51,7 @@ def clustered_interval(outcomes: ArrayLike, confidence: float = 0.95) -> tuple[f
     if rounds > 1 and 0 < successes < n:
         off = counts[:, 0] - rate * counts[:, 1]
         effect = max(rounds / (rounds - 1) * (off @ off) / (n * rate * (1 - rate)), 1.0)
-    return _score_interval(rate, n / effect, confidence)
+    return _score_interval(rate, n / effect)
 
 
 def counts_by_group(groups: Iterable[Hashable], right: Iterable[bool]) -> list[tuple[int, int]]:
@@ -64,9 +64,9 @@ def counts_by_group(groups: Iterable[Hashable], right: Iterable[bool]) -> list[t
     return list(counts.values())
 
 
-def _score_interval(rate: float, n: float, confidence: float) -> tuple[float, float]:
+def _score_interval(rate: float, n: float) -> tuple[float, float]:
     """Wilson's interval of a rate that was seen in n trials, which need not be a whole number."""
-    z = float(ndtri(0.5 + confidence / 2))  # the normal distribution's quantile
+    z = float(ndtri(0.5 + CONFIDENCE / 2))  # the normal distribution's quantile
     centre = rate + z**2 / (2 * n)
     spread = z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
     low, high = (centre - spread) / (1 + z**2 / n), (centre + spread) / (1 + z**2 / n)
@@ -84,13 +84,7 @@ class Difference:
     rounds: int
 
 
-def paired_difference_interval(
-    a: ArrayLike,
-    b: ArrayLike,
-    confidence: float = 0.95,
-    resamples: int = 10_000,
-    seed: int = 0,
-) -> Difference | None:
+def paired_difference_interval(a: ArrayLike, b: ArrayLike, seed: int = 0) -> Difference | None:
     """Difference of two policies' rates over the same rounds, a - b, with a bootstrap interval.
 
     a, b: row i of both belongs to the same scene. Shape (R, 2) holds (successes, attempts) of each
@@ -106,7 +100,6 @@ def paired_difference_interval(
     Returns None where a rate is undefined (no round, or no attempt by one of the policies).
     Raises ValueError on shapes that do not pair up.
     """
-    _check_confidence(confidence)
     a, b = _counts(a), _counts(b)
     if a.shape != b.shape:
         raise ValueError(f"paired_difference_interval: a has {len(a)} rounds, b has {len(b)}")
@@ -115,12 +108,12 @@ def paired_difference_interval(
     value = a[:, 0].sum() / a[:, 1].sum() - b[:, 0].sum() / b[:, 1].sum()
     rng = np.random.default_rng(seed)
     # How often each round was drawn; a resample's sums are then matrix products.
-    draws = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=resamples)
+    draws = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES)
     sums_a, sums_b = draws @ a, draws @ b
     defined = (sums_a[:, 1] > 0) & (sums_b[:, 1] > 0)  # a resample may hold no attempt at all
     rates_a = sums_a[defined, 0] / sums_a[defined, 1]
     rates_b = sums_b[defined, 0] / sums_b[defined, 1]
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(rates_a - rates_b, [tail, 1 - tail])
     return Difference(float(value), float(low), float(high), len(a))
 
@@ -178,8 +171,3 @@ def _counts(outcomes: ArrayLike) -> np.ndarray:
     if (outcomes[:, 0] > outcomes[:, 1]).any():
         raise ValueError("a round has more successes than attempts")
     return outcomes
-
-
-def _check_confidence(confidence: float) -> None:
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
