@@ -45,10 +45,10 @@ TIMEOUT = 3.0  # s of a call
 
 
 @contextmanager
-def small_disk(size: int = DISK) -> Iterator[Path]:
-    """A file system of `size` bytes. Raises UserError where this process may not mount one."""
+def small_disk() -> Iterator[Path]:
+    """A file system of DISK bytes. Raises UserError where this process may not mount one."""
     with TemporaryDirectory() as folder:
-        options = ["-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
+        options = ["-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", folder]
         done = subprocess.run(["mount", *options], capture_output=True, text=True)
         if done.returncode:
             raise UserError(f"part disk: cannot mount a file system ({done.stderr.strip()})")

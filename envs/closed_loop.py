@@ -358,7 +358,7 @@ class GuidedApproach:
         desired = law.compute_joint_velocities(T_WE, v_C, J, away, _DAMPING)
         ahead = self.target.twist(T_WE[:3, 3], self.cell.seconds)
         ahead[2] -= sink
-        return desired + joint_velocities(J, ahead, damping=_DAMPING)[0]
+        return desired + joint_velocities(J, ahead, damping=_DAMPING)
 
     def _pose_at_goal(self, T_WE: np.ndarray, correction: np.ndarray) -> np.ndarray:
         """(4, 4) T_WE of the gripper once the law's correction is done."""
@@ -433,7 +433,7 @@ class FinalApproach:
         twist = self.target.twist(path[:3, 3], now) + _PATH_GAIN * error
         twist[:3] += sink * path[:3, 2] * (self.descended < self.height)
         away = joint_limit_avoidance(q, JOINT_LOWER, JOINT_UPPER, _AVOIDANCE_GAIN)
-        desired = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)[0]
+        desired = joint_velocities(geometric_jacobian(q), twist, away, _DAMPING)
         # The object is too near to be seen: by design the velocity rests on a prediction, for no
         # longer than final_seconds, and only as long as images arrive.
         self.arm.move(desired, now - self.target.image_seconds)

@@ -52,6 +52,12 @@ _ELBOW = 5  # of the ends of the links' parts, two for each joint, that of the e
 
 _IDENTITY = np.eye(6)
 
+# Of inverse kinematics: how near a pose counts as reached along and about each axis, in m and rad.
+POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
+_MOST_STEPS = 100
+_DAMPING = 0.02  # of a step's least squares
+_LONGEST_STEP = 0.3  # rad of a joint
+
 
 class UnreachableError(UserError):
     """The arm cannot reach a pose within its joint limits."""
@@ -222,26 +228,20 @@ def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
 
 
 def inverse_kinematics(
-    target: np.ndarray,
-    seed: np.ndarray,
-    rest: np.ndarray | None = None,
-    *,
-    position_tolerance: float = 1e-4,
-    rotation_tolerance: float = 1e-3,
-    max_iterations: int = 100,
+    target: np.ndarray, seed: np.ndarray, rest: np.ndarray | None = None
 ) -> np.ndarray:
     """Joint positions (7,) that bring E to the target pose (4, 4) in W.
 
     Damped least squares within the joint limits (Buss, "Introduction to inverse kinematics",
     2004), started at `seed`; the redundant joint is drawn towards `rest`. The result has been
-    checked by forward kinematics: along each axis within `position_tolerance` metres, about each
-    within `rotation_tolerance` radians, otherwise UnreachableError.
+    checked by forward kinematics: along each axis within POSITION_TOLERANCE metres, about each
+    within ROTATION_TOLERANCE radians, otherwise UnreachableError.
     """
     q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
-    for _ in range(max_iterations):
+    for _ in range(_MOST_STEPS):
         T, jacobian = _chain(q)
         error = pose_error(T, target)
-        if abs(error[:3]).max() < position_tolerance and abs(error[3:]).max() < rotation_tolerance:
+        if abs(error[:3]).max() < POSITION_TOLERANCE and abs(error[3:]).max() < ROTATION_TOLERANCE:
             return q
         q = q + _damped_step(jacobian, error, q, rest)
         q = np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
@@ -254,10 +254,10 @@ def inverse_kinematics(
     )
 
 
-def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: float = 0.3):
+def _damped_step(jacobian, error, q, rest):
     """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
     # Positive definite, so that Cholesky's method serves.
-    square = jacobian @ jacobian.T + damping**2 * _IDENTITY
+    square = jacobian @ jacobian.T + _DAMPING**2 * _IDENTITY
     if rest is None:
         step = jacobian.T @ dposv(square, error)[1]
     else:
@@ -265,7 +265,7 @@ def _damped_step(jacobian, error, q, rest, damping: float = 0.02, max_step: floa
         pull = 0.1 * min(1.0, abs(error).max() / 0.05) * (rest - q)
         step = pull + jacobian.T @ dposv(square, error - jacobian @ pull)[1]
     largest = abs(step).max()
-    return step * (max_step / largest) if largest > max_step else step
+    return step * (_LONGEST_STEP / largest) if largest > _LONGEST_STEP else step
 
 
 class ServoStep:

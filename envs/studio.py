@@ -39,6 +39,7 @@ _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 
 FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
 SCENE = "scene.png"  # the picture of a scene, where no name is given
 _HOLD = 6  # pictures for which the last one of an episode stays
+_SPEED = 2.0  # of a film, in multiples of real time
 
 
 class Studio:
@@ -95,10 +96,10 @@ class Film:
         self._studio.close()
         return self._pictures
 
-    def encoded(self, ending: str, speed: float = 2.0) -> bytes:
-        """Stop filming; returns a file that runs at `speed` times real time. ending: its name's,
-        "mp4" or "gif"."""
-        return _encoded(ending, self.stop(), speed * self._rate)
+    def encoded(self, ending: str) -> bytes:
+        """Stop filming; returns a file that runs at twice real time. ending: its name's, "mp4" or
+        "gif"."""
+        return _encoded(ending, self.stop(), _SPEED * self._rate)
 
 
 def film_episode(

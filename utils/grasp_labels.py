@@ -27,6 +27,8 @@ SETTINGS = LabelSettings()
 _ROBOT = -2  # in RGBDFrame.segmentation
 ANGLE_BINS = 18  # bin k is centred at k * 10 degrees of ImageGrasp.angle
 STRATA = (0.0, 1e-6, 0.3, 0.5, 0.6, 0.7, 0.8, 1.01)  # edges in quality
+CELL = 0.001  # m, along the closing line
+MARGIN = 0.08  # m outside the workspace, up to which grasps are labelled
 PER_STRATUM = 3  # pairs drawn from each stratum of a frame; twice as many of quality 0
 
 
@@ -70,18 +72,9 @@ def bin_angles() -> np.ndarray:
     return np.arange(ANGLE_BINS) * np.pi / ANGLE_BINS
 
 
-def dense_labels(
-    frame: RGBDFrame,
-    gripper: GripperGeometry,
-    workspace: Workspace,
-    settings: LabelSettings = SETTINGS,
-    cell: float = 0.001,
-    margin: float = 0.08,
-) -> GraspLabels:
-    """Label every pixel and angle bin of a noise-free frame that carries its true geometry.
-
-    cell: resolution along the closing line, metres. margin: distance outside the workspace up to
-    which grasps are labelled, metres. Raises ValueError if the frame holds no truth.
+def dense_labels(frame: RGBDFrame, gripper: GripperGeometry, workspace: Workspace) -> GraspLabels:
+    """Label every pixel and angle bin of a noise-free frame that carries its true geometry. Raises
+    ValueError if the frame holds no truth.
 
     Table pixels have quality 0, because a grasp is centred on its object; robot pixels are not
     valid. Angles are computed in steps of 10 degrees in W from bin 0 at the principal point. These
@@ -93,11 +86,11 @@ def dense_labels(
     points = frame.points()
     with np.errstate(invalid="ignore"):
         reach = np.abs(points[..., :2] - workspace.centre).max(axis=-1)
-        valid = reach < workspace.size / 2 + margin - cell
+        valid = reach < workspace.size / 2 + MARGIN - CELL
         if frame.segmentation is not None:
             valid &= frame.segmentation != _ROBOT
         rise = points[..., 2] - frame.truth.table_height
-        active = valid & (rise > settings.table_clearance + settings.min_engagement)
+        active = valid & (rise > SETTINGS.table_clearance + SETTINGS.min_engagement)
         if frame.segmentation is not None:
             active &= frame.segmentation >= 0  # walls are part of the table
     quality = np.zeros((ANGLE_BINS, *valid.shape), np.float32)
@@ -105,12 +98,12 @@ def dense_labels(
     v, u = np.nonzero(active)
     if len(u) and frame.truth.objects:
         # A quarter of a cell more makes the count odd: a cell, not a corner, in the middle.
-        heights = height_map_from_scene(frame.truth, workspace, cell, margin + cell / 4)
+        heights = height_map_from_scene(frame.truth, workspace, CELL, MARGIN + CELL / 4)
         under = undersides(frame.truth, heights)
         start, step, turn_of_bin = _world_turns(frame, u, v)
         surface = points[v, u]
         judged = [
-            grasp_quality(surface, start + k * step, heights, under, frame.truth, gripper, settings)
+            grasp_quality(surface, start + k * step, heights, under, frame.truth, gripper, SETTINGS)
             for k in range(ANGLE_BINS)
         ]
         each = np.arange(len(u))
@@ -155,11 +148,7 @@ class Trial:
 
 
 def draw_pairs(
-    frame: RGBDFrame,
-    labels: GraspLabels,
-    gripper: GripperGeometry,
-    rng: np.random.Generator,
-    per_stratum: int = PER_STRATUM,
+    frame: RGBDFrame, labels: GraspLabels, gripper: GripperGeometry, rng: np.random.Generator
 ) -> Iterator[tuple[Grasp, float, float]]:
     """Yield grasps of pairs drawn from every stratum of quality, with their quality and weight.
 
@@ -172,7 +161,7 @@ def draw_pairs(
     quality = np.where(on_object, labels.quality, -1)
     for low, high in zip(STRATA, STRATA[1:]):
         members = np.flatnonzero((quality >= low) & (quality < high))
-        count = min(len(members), per_stratum * (2 if low == 0 else 1))
+        count = min(len(members), PER_STRATUM * (2 if low == 0 else 1))
         for flat in rng.choice(members, count, replace=False) if count else ():
             k, v, u = np.unravel_index(flat, quality.shape)
             at_surface = ImageGrasp(

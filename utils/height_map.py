@@ -33,7 +33,9 @@ from utils.transforms import (
 
 WALL_LABEL = -2
 OTHER_LABEL = -3  # of objects that are not the target (`utils.target`)
+CELL = 0.002  # m, of a map from a frame
 LABEL_FLOOR = 0.004  # m over the table, from which matter belongs to an object
+LABEL_STEP = 0.006  # m between neighbouring cells, at which a piece ends
 # Pieces of which more than this share is so near a fixture's edge, and no higher over it, are its.
 _RIM_REACH, _RIM_RISE, _RIM_SHARE = 0.012, 0.015, 0.7  # m, m
 HUNG = 0.015  # m beside and under what hangs over the table, which counts as part of it
@@ -148,8 +150,6 @@ def tilted_view(approach: np.ndarray, workspace: Workspace) -> np.ndarray:
 def height_map_from_frame(
     frame: RGBDFrame,
     workspace: Workspace,
-    cell: float = 0.002,
-    margin: float = MARGIN,
     below: bool = False,
     holeless: tuple[RGBDFrame, np.ndarray] | None = None,
 ) -> HeightMap:
@@ -163,35 +163,35 @@ def height_map_from_frame(
     camera at the side sees below them is an object of the map; no hand can come down to it from
     above. holeless: the frame `without_holes`, where that is known.
     """
-    grid, origin = grid_points(workspace, margin, cell)
+    grid, origin = grid_points(workspace, MARGIN, CELL)
     table, noise = float(workspace.table_height), _noise(frame)
     filled, hiding = holeless or without_holes(frame, workspace)
     if below:
         filled, hiding = _uncovered(filled, hiding, table)
-    seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, cell, table)
+    seen = seen_heights(filled, hiding, np.eye(4), grid.shape[:2], origin, CELL, table)
     surface = seen.height
     if len(filled.fixtures) < len(frame.fixtures):  # the back of a shelf is no object's shadow
         surface = np.where(seen.hidden, table, surface)
     if not filled.fixtures:
-        label = label_walls(label_pieces(surface, table, cell), grid, workspace, cell)
+        label = label_walls(label_pieces(surface, table, CELL), grid, workspace, CELL)
         centres = _column_centroids(seen.height - table, label, grid, table)
         beyond = None
         if _goes_on(filled, frame):
             points = np.concatenate([grid, seen.height[..., None]], axis=-1)
             beyond = outside(frame, points)
         return HeightMap(
-            *seen.walled(), label, centres, origin, cell, table, beyond=beyond, noise=noise
+            *seen.walled(), label, centres, origin, CELL, table, beyond=beyond, noise=noise
         )
-    fixed = _tops(filled.fixtures, grid, origin, cell)
+    fixed = _tops(filled.fixtures, grid, origin, CELL)
     bare = _bare(seen.height, fixed)
-    label = label_pieces(np.where(bare, table, surface), table, cell)
-    label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, cell)
+    label = label_pieces(np.where(bare, table, surface), table, CELL)
+    label = without_rims(np.where(bare, WALL_LABEL, label), seen.height, fixed, CELL)
     base = base_heights(label, fixed, table)
     on = np.append(base, (table, table))[label]  # the last two are of walls and of the table
     centres = _column_centroids(np.maximum(seen.height - on, _LEAST_RISE), label, grid, 0.0)
     centres[:, 2] += base
     height, ceiling = (np.maximum(surface, fixed) for surface in seen.walled())
-    return HeightMap(height, ceiling, label, centres, origin, cell, table, fixed=fixed, noise=noise)
+    return HeightMap(height, ceiling, label, centres, origin, CELL, table, fixed=fixed, noise=noise)
 
 
 def _noise(frame: RGBDFrame) -> float:
@@ -373,21 +373,20 @@ def _tops(
     return tops
 
 
-def label_pieces(
-    height: np.ndarray, table: float, cell: float, step: float = 0.006, floor: float = LABEL_FLOOR
-) -> np.ndarray:
-    """(R, C) labels of the pieces higher than `floor` over the table, cut where neighbouring cells
-    differ by `step`, all in metres.
+def label_pieces(height: np.ndarray, table: float, cell: float) -> np.ndarray:
+    """(R, C) labels of the pieces higher than LABEL_FLOOR over the table, cut where neighbouring
+    cells differ by LABEL_STEP, all in metres.
 
     Slivers (under 0.6 cm2: side walls, edge pixels) join the nearest larger piece within SLIVER;
     others stay without a label.
     """
-    above = height > table + floor
+    above = height > table + LABEL_FLOOR
     label = np.full(height.shape, -1)
     x, y, columns, rows = cv2.boundingRect(above.astype(np.uint8))
     if rows:
         box = np.s_[y : y + rows, x : x + columns]
-        label[box] = _pieces(height[box], above[box], step, 0.6e-4 / cell**2, int(SLIVER / cell))
+        smallest, reach = 0.6e-4 / cell**2, int(SLIVER / cell)
+        label[box] = _pieces(height[box], above[box], LABEL_STEP, smallest, reach)
     return label
 
 

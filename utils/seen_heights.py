@@ -374,15 +374,13 @@ def subpixels(frame: RGBDFrame, cell: float) -> int:
     return max(SUBPIXELS, int(np.ceil(pixel / cell)))
 
 
-def _grazing_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, jump: float = GRAZING_JUMP
-) -> Iterator[np.ndarray]:
+def _grazing_points(frame: RGBDFrame, origin: np.ndarray, cell: float) -> Iterator[np.ndarray]:
     """Columns, rows and z (3, S, N) of points on the rays between neighbouring pixels whose depths
-    differ by a jump: beside each other, and one below the other."""
+    differ by GRAZING_JUMP: beside each other, and one below the other."""
     for step in ((1, 0), (0, 1)):
         here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
         there = frame.depth[step[1] :, step[0] :]
-        edge = (np.abs(here - there) > jump) & (here > 0) & (there > 0)
+        edge = (np.abs(here - there) > GRAZING_JUMP) & (here > 0) & (there > 0)
         row, column = np.divmod(np.flatnonzero(edge), edge.shape[1])
         pixel = np.stack([column, row], axis=-1)
         if len(pixel) == 0:

@@ -126,23 +126,20 @@ def joint_velocities(
     twist: np.ndarray,
     secondary: np.ndarray | None = None,
     damping: float = 0.0,
-    truncation: float = 0.0,
-) -> tuple[np.ndarray, float]:
-    """Joint velocities (n,) with J qdot = twist, rad/s, and J's condition number.
+) -> np.ndarray:
+    """Joint velocities (n,) with J qdot = twist, rad/s.
 
     secondary: (n,) desired velocities of a second task, projected into the null space of the first:
     qdot = J^+ twist + (I - J^+ J) secondary.
     """
-    inverse, condition = pseudo_inverse(J, damping, truncation)
+    inverse = pseudo_inverse(J, damping)[0]
     velocities = inverse @ twist
     if secondary is not None:
         # The projector needs the exact inverse: with a damped one the second task would disturb
         # the first.
-        exact = (
-            inverse if damping == 0.0 else pseudo_inverse(J, truncation=max(truncation, 1e-6))[0]
-        )
+        exact = inverse if damping == 0.0 else pseudo_inverse(J, truncation=1e-6)[0]
         velocities = velocities + secondary - exact @ (J @ secondary)
-    return velocities, condition
+    return velocities
 
 
 def joint_limit_avoidance(

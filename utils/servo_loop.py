@@ -218,7 +218,7 @@ class VisualServo(ABC):
         T_WE = check_pose("end_effector_pose", end_effector_pose)
         camera = self.camera
         J = camera_jacobian(camera.mounting, T_WE, jacobian, camera.T_EC, camera.T_WC)
-        return joint_velocities(J, velocity, secondary, damping)[0]
+        return joint_velocities(J, velocity, secondary, damping)
 
     def pixel_to_3d(self, u: float, v: float, Z: float) -> np.ndarray:
         """(3,) point in C, metres, seen at pixel (u, v) and depth Z."""
