@@ -354,23 +354,21 @@ def _without_dust(parts: list[Manifold]) -> list[Manifold]:
     return parts
 
 
-def simplify_hull(
-    vertices: np.ndarray, max_vertices: int = MAX_VERTICES, tolerance: float | None = None
-) -> np.ndarray:
+def simplify_hull(vertices: np.ndarray) -> np.ndarray:
     """Return the few vertices (V, 3) of a convex hull that span nearly all of it.
 
     The choice starts from a tetrahedron and keeps adding the vertex that lies farthest outside, as
-    quickhull does, until none is farther than `tolerance` (None: as VERTEX_TOLERANCE and
-    THICKNESS_TOLERANCE say) or there are `max_vertices`.
+    quickhull does, until none is farther than VERTEX_TOLERANCE and THICKNESS_TOLERANCE admit or
+    there are MAX_VERTICES.
     """
     points = _arrays(hull_of(vertices))[0]
-    if tolerance is None:
-        thickness = np.ptp(points @ principal_axes(points).T, axis=0).min()
-        tolerance = min(VERTEX_TOLERANCE, THICKNESS_TOLERANCE * float(thickness))
+    thickness = np.ptp(points @ principal_axes(points).T, axis=0).min()
+    tolerance = min(VERTEX_TOLERANCE, THICKNESS_TOLERANCE * float(thickness))
+    most = min(MAX_VERTICES, len(points))
     chosen = _tetrahedron(points)
     try:
         hull = ConvexHull(points[chosen], incremental=True)
-        while len(chosen) < min(max_vertices, len(points)):
+        while len(chosen) < most:
             outside = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
             farthest = int(outside.argmax())
             if outside[farthest] <= tolerance:
@@ -380,7 +378,7 @@ def simplify_hull(
         # An early choice may have come to lie inside the final hull.
         return points[chosen][ConvexHull(points[chosen]).vertices]
     except QhullError:  # a plate too thin for its arithmetic
-        return points[np.linspace(0, len(points) - 1, min(max_vertices, len(points)), dtype=int)]
+        return points[np.linspace(0, len(points) - 1, most, dtype=int)]
 
 
 def _tetrahedron(points: np.ndarray) -> list[int]:

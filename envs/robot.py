@@ -35,6 +35,7 @@ FINGER_SPEED = 0.05  # m/s a finger, from the Franka Hand's product manual
 DRIVE_GAIN = 0.1  # share of the way left that the arm covers in a period near the end of a drive
 GRIPPED_OPENING = 0.001  # m by which something between closed fingers has to part them
 GRIPPED_SHARE = 0.5  # of the commanded force with which the motor has to press on it
+_LEAST_GRIP = 0.1  # N of each finger on what the hand holds
 GRIP_COSINE = np.cos(np.radians(70))  # of the steepest contact normal that counts as a grip
 LEFT, RIGHT = 0, 1  # fingers; the left one is on the side of E's +y axis
 
@@ -149,9 +150,9 @@ class Hand(ABC):
             inwards.append(force)
         return inwards[LEFT], inwards[RIGHT]
 
-    def holds(self, body: int, min_force: float = 0.1) -> bool:
-        """Whether both fingers grip the body with at least `min_force` newtons each."""
-        return min(self.grip_forces(body)) >= min_force
+    def holds(self, body: int) -> bool:
+        """Whether both fingers grip the body, with at least 0.1 N each."""
+        return min(self.grip_forces(body)) >= _LEAST_GRIP
 
     def carrying(self) -> AbstractContextManager[None]:
         """While the hand lifts and carries something: a simulator whose solver is too coarse for

@@ -48,6 +48,7 @@ _LINKS = [
 ]
 _ARM_FROM_ITS_END = _LINKS[-2::-1]
 
+_POINT_SPACING = 0.05  # m along the links
 _ELBOW = 5  # of the ends of the links' parts, two for each joint, that of the elbow
 
 _IDENTITY = np.eye(6)
@@ -166,15 +167,15 @@ def link_poses(q: np.ndarray) -> np.ndarray:
     return poses
 
 
-def arm_points(q: np.ndarray, spacing: float = 0.05) -> np.ndarray:
-    """(N, P, 3) points in W on the arm's links, at most `spacing` m apart, from the elbow to the
+def arm_points(q: np.ndarray) -> np.ndarray:
+    """(N, P, 3) points in W on the arm's links, at most 5 cm apart, from the elbow to the
     flange, for joint positions q (N, 7)."""
     links = list(_walk(q))
     corners = [corner for link in links for corner in (link.before, link.after)]
     corners = [*corners[_ELBOW:], links[-1].after + FLANGE_LENGTH * links[-1].z]
     points = [corners[0]]
     for start, end in zip(corners, corners[1:]):
-        count = int(np.ceil(np.linalg.norm(end[0] - start[0]) / spacing))
+        count = int(np.ceil(np.linalg.norm(end[0] - start[0]) / _POINT_SPACING))
         points += [start + share * (end - start) for share in (np.arange(count) + 1) / count]
     return np.stack(points, axis=1)
 

@@ -27,8 +27,11 @@ LABELS = [
 
 
 def labelled(rectangles=LABELS, shape=(SIZE, SIZE)) -> LabelledImage:
-    """The labelled pixels are white on black and nearer to the camera than the table."""
-    quality, width = (torch.from_numpy(x) for x in rasterise(rectangles, shape, falloff=0))
+    """The labelled pixels are white on black and nearer to the camera than the table. Labels are
+    hard: each is in its nearest bin alone."""
+    quality, width = (torch.from_numpy(x) for x in rasterise(rectangles, shape))
+    hard = quality == 1
+    quality, width = hard.float(), width * hard
     painted = quality.amax(0)
     return LabelledImage(
         rgb=(255 * painted).to(torch.uint8).expand(3, -1, -1).contiguous(),

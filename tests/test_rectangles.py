@@ -142,13 +142,14 @@ def test_transformed_follows_the_image():
 
 
 def test_rasterise_central_third():
-    """30 x 10 px around (20, 12): |u - 20| <= 5 and |v - 12| <= 5, so 11 x 11 pixel centres."""
-    quality, width = rasterise([rectangle(20, 12, width=30, height=10)], (25, 40), falloff=0)
-    expected = np.zeros((18, 25, 40), dtype=bool)
-    expected[0, 7:18, 15:26] = True
+    """30 x 10 px around (20, 12): |u - 20| <= 5 and |v - 12| <= 5, so 11 x 11 pixel centres. Bins
+    beside the label's are half a bin beyond the half bin of quality 1."""
+    quality, width = rasterise([rectangle(20, 12, width=30, height=10)], (25, 40))
+    expected = np.zeros((18, 25, 40))
+    expected[[17, 0, 1], 7:18, 15:26] = np.array([0.5, 1, 0.5])[:, None, None]
     assert quality.dtype == width.dtype == np.float32
-    assert np.array_equal(quality, expected.astype(np.float32))
-    assert np.array_equal(width, np.where(expected, 30, 0).astype(np.float32))
+    np.testing.assert_allclose(quality, expected, atol=1e-6)
+    np.testing.assert_allclose(width, np.where(expected, 30, 0), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_overlapping_labels_are_merged_whatever_their_order():
 
 
 def test_a_label_thinner_than_a_pixel_is_not_lost():
-    quality, width = rasterise([rectangle(3.4, 2.4, 0, 1.0, 0.5)], (6, 6), falloff=0)
+    quality, width = rasterise([rectangle(3.4, 2.4, 0, 1.0, 0.5)], (6, 6))
     assert np.argwhere(quality[0]).tolist() == [[2, 3]]
     assert width[0, 2, 3] == 1
     outside, _ = rasterise([rectangle(-50, 2), rectangle(3, 900)], (6, 6))

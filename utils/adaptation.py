@@ -264,7 +264,6 @@ def train_domain_adaptation(
     seed: int = 0,
     task_loss: Loss = F.cross_entropy,
     source_score: Loss | None = None,
-    on_check: Callable[[Check], None] | None = None,
 ) -> AdaptationHistory:
     """Train the network in place on labelled source and unlabelled target images.
 
@@ -319,8 +318,6 @@ def train_domain_adaptation(
             check = _check(model, step, images[held_s], labels[held_s], target[held_t], score)
             history.checks.append(check)
             weights.append(deepcopy(model.state_dict()))
-            if on_check is not None:
-                on_check(check)
     adversarial = bool(settings.adversarial)
     history.chosen = choose_check(history.checks, with_information=adversarial)
     model.load_state_dict(weights[history.checks.index(history.chosen)])

@@ -159,31 +159,24 @@ class DenseTargets(NamedTuple):
     width: np.ndarray
 
 
-def rasterise(
-    rectangles: Sequence[GraspRectangle],
-    shape: tuple[int, int],
-    num_bins: int = ANGLE_BINS,
-    falloff: float = np.pi / ANGLE_BINS,
-) -> DenseTargets:
+def rasterise(rectangles: Sequence[GraspRectangle], shape: tuple[int, int]) -> DenseTargets:
     """Draw rectangles as dense targets of an image of shape (H, W).
 
     Each rectangle labels the pixels of the central third along its closing line, over the whole
     plate length, as GG-CNN does (Morrison, Corke, Leitner, RSS 2018, section V); a rectangle that
     is too thin to cover a pixel's centre labels the pixel nearest to its own centre. There the
-    nearest angle bin gets quality 1, which falls linearly to 0 over `falloff` radians beyond half a
-    bin (0: nearest bin only). Where labels overlap, each bin keeps the highest quality and the
-    quality-weighted mean width, so the order of the labels does not matter.
+    nearest angle bin gets quality 1, which falls linearly to 0 over one bin beyond half a bin.
+    Where labels overlap, each bin keeps the highest quality and the quality-weighted mean width, so
+    the order of the labels does not matter.
     """
     height, width = shape
-    step = np.pi / num_bins
-    quality = np.zeros((num_bins, height, width))
+    step = np.pi / ANGLE_BINS
+    quality = np.zeros((ANGLE_BINS, height, width))
     weighted_width, total = np.zeros_like(quality), np.zeros_like(quality)
     for rectangle in rectangles:
         rows, columns = _central_third(rectangle, shape)
-        beyond = angle_difference(rectangle.angle, np.arange(num_bins) * step) - step / 2
-        weights = np.where(
-            beyond <= _ROUNDING, 1.0, np.clip(1 - beyond / max(falloff, _ROUNDING), 0, 1)
-        )
+        beyond = angle_difference(rectangle.angle, np.arange(ANGLE_BINS) * step) - step / 2
+        weights = np.where(beyond <= _ROUNDING, 1.0, np.clip(1 - beyond / step, 0, 1))
         for k in np.flatnonzero(weights):
             at = (k, rows, columns)
             quality[at] = np.maximum(quality[at], weights[k])
