@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         scenes = training_scenes(config, count, options.seed)
         frames = [frame_of(cell, scene) for scene in scenes]
         labels, rates = zip(*(timed_labels(frame, workspace) for frame in frames))
-        trials = [t for job in zip(scenes, frames, labels) for t in execute(cell, *job)]
+        trials = [execute(cell, *job) for job in zip(scenes, frames, labels)]
     report([*speed_metrics(rates), *truth_metrics(trials)], options.json)
 
 
@@ -95,8 +95,9 @@ def speed_metrics(rates: Sequence[float]) -> list[Metric]:
     ]
 
 
-def truth_metrics(trials: Sequence[Trial]) -> list[Metric]:
-    """Precision and recall of positive labels; weighted: over all pairs instead of those drawn."""
+def truth_metrics(trials: Sequence[Sequence[Trial]]) -> list[Metric]:
+    """Precision and recall of positive labels, from the trials of each scene; weighted: over all
+    pairs instead of those drawn."""
     truth = label_truth(trials)
     metrics = [
         Metric("positives_executed", truth.positives, ""),

@@ -83,7 +83,7 @@ def test_what_is_stored_comes_back_to_half_a_unit(stored):
                 expected, _ = project(centre, K, T_WC)
                 assert (u, v) == pytest.approx(tuple(expected), abs=1e-3)
     assert images.scenes == ["pile box 7"] * 4
-    assert read_trials(folder) == 2 * trials
+    assert read_trials(folder) == 2 * [trials]
 
 
 def test_labels_of_a_wider_hand_are_stored_unclipped(tmp_path):
@@ -104,7 +104,7 @@ def test_depth_beyond_16_bits_is_cut_off_not_wrapped(tmp_path):
     frame.frame.depth[1, 1] = 5.0
     write_shard(shard_path(tmp_path, "train", 0), [frame], [], 0.08)
     assert SimulatedDataset(tmp_path, "train")[0].depth[1, 1] == pytest.approx(65535 * 5e-5)
-    assert read_trials(tmp_path) == []
+    assert read_trials(tmp_path) == [[]]
 
 
 def test_frames_limits_how_many_are_used(stored):

@@ -294,17 +294,12 @@ def test_labels_are_the_same_every_time() -> None:
 
 
 def test_label_truth_of_seven_trials():
-    truth = label_truth(
-        [
-            Trial(1.0, 2.0, True),
-            Trial(0.7, 4.0, False),
-            Trial(0.6, 1.0, True),
-            Trial(0.59, 10.0, True),
-            Trial(0.2, 3.0, True),
-            Trial(0.0, 5.0, True),
-            Trial(0.0, 5.0, False),
-        ]
-    )
+    trials = [
+        Trial(1.0, 2.0, True), Trial(0.7, 4.0, False), Trial(0.6, 1.0, True),
+        Trial(0.59, 10.0, True), Trial(0.2, 3.0, True), Trial(0.0, 5.0, True),
+        Trial(0.0, 5.0, False),
+    ]  # fmt: skip
+    truth = label_truth([trials])
     assert (truth.executed, truth.positives) == (7, 3)
     assert truth.precision == pytest.approx(2 / 3)
     # Wilson's interval of 2 in 3 with z = 1.96, by hand.
@@ -322,10 +317,21 @@ def test_label_truth_of_seven_trials():
 
 def test_label_truth_in_words_says_what_its_shares_are_of():
     trials = [Trial(0.9, 1.0, True)] * 5 + [Trial(0.2, 20.0, True)]
-    assert label_truth(trials).describe() == (
+    assert label_truth([trials]).describe() == (
         "labels against physics: 6 executed, 100.0 % [56.6, 100.0] of the 5 positive ones succeed; "
         "20 % of all grasps that would succeed are positive (labels are strict)"
     )
+
+
+def test_trials_of_one_scene_are_not_independent():
+    """Of ten scenes whose four trials end alike, the precision is as certain as of ten trials and
+    a tenth of them more (Bessel's correction)."""
+    ends = [True, True, False, True, True, True, False, True, True, True]
+    truth = label_truth([[Trial(0.9, 1.0, end)] * 4 for end in ends])
+    z, n = 1.959964, 40 / (4 * 10 / 9)
+    spread = z * np.sqrt(0.8 * 0.2 / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    low, high = truth.precision_ci95
+    assert (high - low) / 2 == pytest.approx(spread, abs=1e-5)
 
 
 def test_label_truth_of_nothing_is_not_a_number():

@@ -150,7 +150,7 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     monkeypatch.chdir(tmp_path)
-    sure = label_truth([Trial(1.0, 1.0, True)])
+    sure = label_truth([[Trial(1.0, 1.0, True)]])
     monkeypatch.setattr(train_graspnet, "label_truth", lambda trials: sure)
     assert train_graspnet.main(["--resume", str(copy)]) == 0
     printed = capsys.readouterr().out

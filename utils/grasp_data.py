@@ -105,12 +105,13 @@ def _whole(values: Sequence[np.ndarray], unit: float, kind: type) -> np.ndarray:
     return np.clip(scaled, 0, np.iinfo(kind).max).astype(kind)
 
 
-def read_trials(folder: Path) -> list[Trial]:
-    """Read all label trials on a data set's training images."""
+def read_trials(folder: Path) -> list[list[Trial]]:
+    """Read all label trials on a data set's training images, those of each shard, which holds whole
+    scenes."""
     trials = []
     for path in sorted((Path(folder) / "train").glob("*.h5")):
         with _open(path) as file, _reading(path):
-            trials += [Trial(float(q), float(w), bool(s)) for q, w, s in file["trials"][:]]
+            trials.append([Trial(float(q), float(w), bool(s)) for q, w, s in file["trials"][:]])
     return trials
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_quality import LabelSettings, grasp_depth, grasp_quality, undersides
 from utils.height_map import height_map_from_scene
-from utils.statistics import wilson_interval
+from utils.statistics import clustered_interval
 from utils.transforms import Grasp, ImageGrasp, RGBDFrame, image_to_grasp
 
 SETTINGS = LabelSettings()
@@ -182,7 +182,8 @@ class LabelTruth:
     """Precision and recall of positive labels (quality `LabelSettings.positive` and above).
 
     executed, positives: the number of executed pairs, and of the positive ones among them.
-    precision: of the drawn pairs, with its 95 % interval. precision_weighted, recall_weighted: over
+    precision: of the drawn pairs, with its 95 % interval, for which those of one scene are not
+    independent. precision_weighted, recall_weighted: over
     all pairs of the frames. by_stratum: (low, high, executed, success rate) in quality.
     """
 
@@ -205,13 +206,17 @@ class LabelTruth:
         )
 
 
-def label_truth(trials: Sequence[Trial]) -> LabelTruth:
-    """Compute precision and recall of the labels from trials; NaN where none was executed."""
-    positive = [t for t in trials if t.quality >= LabelSettings().positive]
+def label_truth(groups: Sequence[Sequence[Trial]]) -> LabelTruth:
+    """Compute precision and recall of the labels from the trials of each scene, or of several
+    scenes together; NaN where none was executed."""
+    trials = [trial for group in groups for trial in group]
+    least = LabelSettings().positive
+    positive = [t for t in trials if t.quality >= least]
     hits = sum(t.success for t in positive)
     good = sum(t.weight for t in trials if t.success)
     caught = sum(t.weight for t in positive if t.success)
-    groups = [
+    of_groups = [[t.success for t in group if t.quality >= least] for group in groups]
+    strata = [
         (low, high, [t.success for t in trials if low <= t.quality < high])
         for low, high in zip(STRATA, STRATA[1:])
     ]
@@ -219,12 +224,12 @@ def label_truth(trials: Sequence[Trial]) -> LabelTruth:
         executed=len(trials),
         positives=len(positive),
         precision=_ratio(hits, len(positive)),
-        precision_ci95=wilson_interval(hits, len(positive)),
+        precision_ci95=clustered_interval([(sum(group), len(group)) for group in of_groups]),
         precision_weighted=_ratio(caught, sum(t.weight for t in positive)),
         recall_weighted=_ratio(caught, good),
         by_stratum=tuple(
-            (low, min(high, 1.0), len(group), _ratio(sum(group), len(group)))
-            for low, high, group in groups
+            (low, min(high, 1.0), len(stratum), _ratio(sum(stratum), len(stratum)))
+            for low, high, stratum in strata
         ),
     )
 
