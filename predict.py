@@ -52,7 +52,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.graspnet_inference import USUAL_PIXEL, training_scale
+from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached, least_width
@@ -89,8 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     network = options.planner in NETWORK_PLANNERS
     saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
-    pixel = USUAL_PIXEL if saved is None else saved.metres_per_pixel
-    training_scale(image, pixel)  # wrong units fail here, not at the table
+    if saved is not None:
+        training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
     table = locate_table(image, options)
     print(f"table: {table.describe()}", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)

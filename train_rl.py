@@ -46,6 +46,7 @@ from envs.vector_env import (
     WorkerError,
     full_difficulty,
     make_env,
+    make_objects,
     training_envs,
 )
 from models.grasp_policy import GraspPPO, load_policy, make_ppo
@@ -105,6 +106,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
     if config.rl.films:  # one that draws no pictures is told of now
         make_env(config, render_mode="rgb_array").close()
+    if os.environ.get("LOCAL_RANK", "0") == "0":
+        make_objects(config)
     with (
         team(config.rl.device, os.environ, "rl.device") as processes,
         training_envs(config, envs_of_each(config, processes)) as envs,

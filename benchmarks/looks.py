@@ -48,8 +48,9 @@ def add_look(folder: Path, part: Figures) -> None:
     look = look_of(part)
     if look["noises"] and look not in earlier:
         earlier.append(look)
-    if earlier or part["part"] in looks:
-        write_json_atomic(folder / FILE, looks | {part["part"]: earlier})
+    after = {name: own for name, own in (looks | {part["part"]: earlier}).items() if own}
+    if after != looks:
+        write_json_atomic(folder / FILE, after)
 
 
 def _looks(folder: Path) -> dict[str, list[Figures]]:

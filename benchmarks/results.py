@@ -91,8 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     print(f"{part.name}: skipped, because no --{name} names {SOURCES[name]}")
             else:
                 if writes_docs(options) and not is_finished(part, commit, options.scale):
-                    about = {"part": part.name, "commit": commit, "scale": options.scale}
-                    begin_look(FIGURES, about | {"date": str(date.today())})
+                    note_look(part, commit, options.scale)
                 measure(part, commit, options.scale, folders)
                 if writes_docs(options):
                     publish(part, commit, options.scale)
@@ -218,6 +217,14 @@ def set_aside(command: Command, name: str) -> None:
     run = latest_run(Path(command.program).stem, name)
     if run is not None:
         run.rename(run.with_name(f"{run.name}-of-two-commits"))
+
+
+def note_look(part: Part, commit: str, scale: float) -> None:
+    """Note, also in the docs, that a part's scenes are going to be played, if it has any."""
+    if any(command.rounds is not None for command in part.commands):
+        facts = {"part": part.name, "commit": commit, "scale": scale, "date": str(date.today())}
+        begin_look(FIGURES, facts)
+        write_tables(FIGURES)
 
 
 def publish(part: Part, commit: str, scale: float) -> None:

@@ -3,9 +3,9 @@
 Scenes of training objects, household things and some larger than usual among them, are seen by a
 camera from above or from a side, with one of the depth noises. A floating hand, half the time by
 VGN's rule of when it is empty, executes some of the candidates and carries away what it grips
-(`envs.floating_execution`): half of them the ones that the shipped critic likes best, so that the
-next one learns what this one overrates, the others drawn at random. The examples of a scene are a
-pure function of the config, its number and the shipped critic.
+(`envs.floating_execution`): half of them drawn at random, the others those of the rest that the
+shipped critic likes best, so that the next one learns what this one overrates. The examples of a
+scene are a pure function of the config, its number and the shipped critic.
 """
 
 from __future__ import annotations

@@ -10,11 +10,10 @@ import importlib
 import math
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
@@ -30,47 +29,12 @@ from envs.object_meshes import (
     surface_colour,
     write_mesh_obj,
 )
+from envs.urdf_check import check_urdf
 
 SUFFIXES = (".urdf", ".xml", *MESH_SUFFIXES)
 # For files that state none. The density, kg/m3, is the median of 26 of the YCB household objects,
 # mass over the volume of their convex parts.
 DEFAULT_FRICTION, DEFAULT_DENSITY = 0.7, 700.0
-
-
-def _positive(number: float) -> bool:
-    return 0 < number < math.inf
-
-
-def _not_negative(number: float) -> bool:
-    return 0 <= number < math.inf
-
-
-def _not_zero(number: float) -> bool:
-    return number != 0 and math.isfinite(number)
-
-
-def _number(_: float) -> bool:
-    return True
-
-
-_WORDS = {
-    _number: "(kilograms)",
-    _positive: "over 0", _not_negative: "of 0 or more", _not_zero: "other than 0",
-    math.isfinite: "that are finite",
-}  # fmt: skip
-# Of an element's attribute, how many numbers it holds, and which.
-_URDF_NUMBERS: dict[tuple[str, str], tuple[tuple[int, ...], Callable[[float], bool]]] = {
-    ("box", "size"): ((3,), _positive),
-    ("cylinder", "radius"): ((1,), _positive), ("cylinder", "length"): ((1,), _positive),
-    ("capsule", "radius"): ((1,), _positive), ("capsule", "length"): ((1,), _positive),
-    ("sphere", "radius"): ((1,), _positive),
-    ("mesh", "scale"): ((1, 3), _not_zero),
-    ("mass", "value"): ((1,), _number),  # which number, `_inertial` tells with the link's name
-    ("lateral_friction", "value"): ((1,), _not_negative),
-    **{("inertia", name): ((1,), math.isfinite) for name in ("ixx", "iyy", "izz")},
-    ("origin", "xyz"): ((3,), math.isfinite), ("origin", "rpy"): ((3,), math.isfinite),
-}  # fmt: skip
-_DEFAULTED = ("mesh", "inertia", "origin")  # whose attributes may be left out
 MOST_GEOMETRIES = 300  # of a URDF, which yourdfpy reads in some ten seconds
 
 
@@ -230,8 +194,8 @@ def _read_urdf(path: Path) -> ObjectSource:
         raise ObjectError(
             f"URDF {path} has {count:,} geometries, expected at most {MOST_GEOMETRIES}; simplify it"
         )
-    _check_urdf(xml, path)
-    for element in xml.iter("mesh"):
+    check_urdf(xml, path)
+    for element in xml.iterfind("link/*/geometry/mesh"):
         # Reading the mesh first gives an error that names it, which yourdfpy's error may not.
         load_mesh(_resolve_mesh(element.get("filename", ""), path))
     try:
@@ -256,7 +220,9 @@ def _read_urdf(path: Path) -> ObjectSource:
     except Exception as error:  # yourdfpy passes on whatever lxml, NumPy and trimesh raise
         raise ObjectError(f"URDF {path} cannot be read ({error}); repair or remove it") from error
     if len(mesh.faces) == 0:
-        raise ObjectError(f"URDF {path} has neither collision nor visual geometry; add some")
+        raise ObjectError(
+            f"URDF {path} has neither collision nor visual geometry of any size; add some"
+        )
     return ObjectSource(
         mesh=checked_mesh(mesh, str(path)),
         friction=friction,
@@ -267,50 +233,8 @@ def _read_urdf(path: Path) -> ObjectSource:
     )
 
 
-def _check_urdf(xml: ElementTree.Element, path: Path) -> None:
-    """Raise ObjectError, which names the element, for what yourdfpy would pass on, or say in words
-    of the libraries below it."""
-    if xml.tag != "robot" or not xml.get("name"):
-        raise ObjectError(f"{path} is no URDF, which is a <robot name=...>; convert or remove it")
-    links = [link.get("name") for link in xml.iter("link")]
-    for name in links:
-        if links.count(name) > 1:
-            raise ObjectError(f"URDF {path} has two links named {name!r}; rename one")
-    for joint in xml.findall("joint"):
-        for end in ("parent", "child"):
-            named = joint.find(end)
-            if named is None or named.get("link") not in links:
-                raise ObjectError(
-                    f"URDF {path}: the {end} of its joint {joint.get('name')!r} is none of its "
-                    f"links ({', '.join(map(str, links))}); repair the file"
-                )
-    for element in xml.iter("mesh"):
-        name = element.get("filename", "")
-        if not name or (":" in name and not name.startswith(("package://", "file://"))):
-            raise ObjectError(
-                f"URDF {path}: the filename of a <mesh> is {name!r}, expected a file beside the "
-                "URDF or package://...; copy the mesh there"
-            )
-    for (tag, attribute), (counts, least) in _URDF_NUMBERS.items():
-        for element in xml.iter(tag):
-            text = element.get(attribute)
-            if text is None and tag in _DEFAULTED:
-                continue
-            try:
-                numbers = [float(word) for word in (text or "").split()]
-                good = len(numbers) in counts and all(map(least, numbers))
-            except ValueError:
-                good = False
-            if not good:
-                raise ObjectError(
-                    f"URDF {path}: the {attribute} of a <{tag}> is {text!r}, expected "
-                    f"{' or '.join(map(str, counts))} number{'' if counts == (1,) else 's'} "
-                    f"{_WORDS[least]}; repair it"
-                )
-
-
 def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
-    """The sum over all links. Raises ValueError for a mass that is no positive number."""
+    """The sum over all links. Raises ValueError for a mass below 0."""
     stated = []
     for link in robot.robot.links:
         if link.inertial is None or link.inertial.mass is None:
@@ -355,14 +279,11 @@ def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float
 
 
 def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
-    """Raises ValueError for a scale that is neither one number nor three."""
     if len(shown) != 1 or shown[0][1].geometry.mesh is None:
         return None
     link, item = shown[0]
     file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
     scale = item.geometry.mesh.scale
-    if np.size(scale) not in (1, 3) or not (scale is None or np.isfinite(scale).all()):
-        raise ValueError(f"the scale of its visual mesh is {scale}, expected one number or three")
     scale = np.broadcast_to(1.0 if scale is None else scale, 3)
     origin = np.eye(4) if item.origin is None else item.origin
     return file, scale, robot.get_transform(link.name) @ origin

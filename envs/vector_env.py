@@ -16,7 +16,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -26,11 +26,11 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from tqdm import tqdm
 
-from envs.objects import OBJECT_SETS, load_object_set, prepare
+from envs.objects import load_object_set
 from utils.config import YAML_ERRORS, Config, load_yaml
 from utils.errors import UserError, one_line
-from utils.executor import open_executor
 from utils.runs import REPOSITORY
 from utils.worker_process import leave_signals, worker_environment
 
@@ -53,10 +53,8 @@ class WorkerError(RuntimeError):
 def training_envs(config: Config, count: int) -> Iterator[TrainingEnvs]:
     """`count` environments of the config's section `rl`, closed at the end.
 
-    Raises UserError for an environment that does not exist or does not take its arguments, and for
-    objects that cannot be used.
+    Raises UserError for an environment that does not exist or does not take its arguments.
     """
-    _prepare_objects(config)
     envs = TrainingEnvs(config, count)
     try:
         yield envs
@@ -66,16 +64,16 @@ def training_envs(config: Config, count: int) -> Iterator[TrainingEnvs]:
     envs.close()
 
 
-def _prepare_objects(config: Config) -> None:
+def make_objects(config: Config) -> None:
     """Make all objects of a folder, so that a broken one is told of before the training begins, and
-    not at the reset that happens to draw it."""
-    if config.rl.env_id in OWN_ENVS and config.env.objects not in OBJECT_SETS:
+    not at the reset that happens to draw it. Raises UserError."""
+    if config.rl.env_id in OWN_ENVS and Path(config.env.objects).is_dir():
         objects = load_object_set(
             config.env.objects, max_opening=config.gripper.max_opening,
             cache_dir=config.cache_folder, **config.objects.model_dump(),
         )  # fmt: skip
-        with open_executor(config.compute, config.evaluate.workers) as workers:
-            prepare(objects, workers, config.gripper.geometry)
+        for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
+            objects[index]
 
 
 def full_difficulty(env_id: str) -> dict[str, Any]:
@@ -155,8 +153,13 @@ class TrainingEnvs:
     def _reset_options(self, options: dict[str, Any]) -> Iterator[None]:
         """Resets of this project's environments get these options; others do not know them."""
         self._set("reset_options", options if self._id in OWN_ENVS else {})
-        yield
-        self._set("reset_options", {})  # not after an error, which may have ended the workers
+        try:
+            yield
+        except Exception:
+            with suppress(Exception):  # its workers may be gone
+                self._set("reset_options", {})
+            raise
+        self._set("reset_options", {})
 
     def _set(self, name: str, value: Any) -> None:
         with _as_worker_errors(self._died):

@@ -335,11 +335,12 @@ def policy_for(
                 f"nothing of {part.key!r}, {part.shape[1]}x{part.shape[0]} pixels; shorten "
                 "rl.conv_channels or use larger images"
             )
-    if settings.relief and (not layout.images or layout.images[-1].shape[2:] != (1,)):
+    last = layout.images[-1] if layout.images else None
+    if settings.relief and (last is None or (last.shape[2], last.dtype) != (1, "float32")):
         raise UserError(
-            f"rl.relief: it needs a depth image, of one channel, as the last image of the policy, "
-            f"which sees {_listed(layout)}; name one last in rl.policy_observations, or set "
-            "rl.relief=false"
+            f"rl.relief: it needs a depth image in metres, one channel of float32, as the last "
+            f"image of the policy, which sees {_listed(layout)}; name one last in "
+            "rl.policy_observations, or set rl.relief=false"
         )
     if settings.squash and not action_space.is_bounded():
         raise UserError(
@@ -394,9 +395,9 @@ def make_ppo(
         return GraspPPO(network, layout, settings, team, config.seed)
     extra = load_initial(network, layout, settings.initial)
     ppo = GraspPPO(network, layout, settings, team, config.seed)
-    if "rewards" in extra:  # the critic's values are in units of their deviation
+    if "rewards" in extra:
         with reading(settings.initial):
-            ppo.rewards.load_state_dict(extra["rewards"])
+            ppo.rewards.continue_from(extra["rewards"], settings.envs * settings.rollout_steps)
     return ppo
 
 

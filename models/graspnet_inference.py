@@ -15,7 +15,6 @@ from utils.errors import UserError
 from utils.images import PixelScaling
 from utils.transforms import RGBDFrame
 
-USUAL_PIXEL = 0.0018  # m, which one pixel spans at the shipped network's training
 SMALLEST_SIDE = 32  # pixels at the training's scale, some 6 cm: less cannot show a grasp
 MOST_PIXELS = 2**22  # at the training's scale, 3.6 m x 3.6 m; half a GB for a layer of 32 channels
 

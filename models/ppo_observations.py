@@ -276,6 +276,15 @@ class RewardScaler(nn.Module):
         self.moments = RunningMoments(1)
         self._returns: np.ndarray | None = None
 
+    def continue_from(self, state: dict[str, torch.Tensor], most: int) -> None:
+        """Take over the deviation of another training, in whose unit its critic states values; it
+        counts as of `most` steps at most, so that it follows rewards of another kind. Raises
+        ValueError where it is not finite."""
+        self.load_state_dict(state)
+        if not all(bool(part.isfinite().all()) for part in self.state_dict().values()):
+            raise ValueError("the deviation of its rewards is not finite")
+        self.moments.count.clamp_(max=most)
+
     def restart(self) -> None:
         """All environments begin new episodes."""
         self._returns = None

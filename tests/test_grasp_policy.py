@@ -305,12 +305,16 @@ def test_a_policy_that_is_continued_keeps_the_unit_of_its_values(tmp_path):
         assert after.rewards.moments.variance.item() == pytest.approx(
             before.rewards.moments.variance.item(), rel=1e-3
         )
+        # 512 steps were seen, of which a rollout's worth still counts.
+        rollout = after.settings.envs * after.settings.rollout_steps
+        assert after.rewards.moments.count.item() == min(512, rollout)
 
 
-@pytest.mark.parametrize("keys", [["depth", "rgb"], ["rgb"], ["state"]])
+@pytest.mark.parametrize("keys", [["depth", "rgb"], ["rgb"], ["state"], ["grey"]])
 def test_relief_asks_for_depth_last(keys):
     box = {
         "rgb": spaces.Box(0, 255, (32, 32, 3), np.uint8),
+        "grey": spaces.Box(0, 255, (32, 32, 1), np.uint8),
         "depth": spaces.Box(0, 2, (32, 32, 1), np.float32),
         "state": spaces.Box(-1, 1, (3,), np.float32),
     }

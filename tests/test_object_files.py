@@ -14,6 +14,26 @@ MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
 <mesh filename="mesh/box.obj"/></geometry></collision></link></robot>"""
 
 
+def shape(text: str) -> str:
+    return f"<collision><geometry>{text}</geometry></collision>"
+
+
+def test_what_others_read_is_read(tmp_path):
+    """Commas between numbers, an empty scale, four angles, a dummy of no size, and elements
+    of other programs that have the names of a URDF's."""
+    write_textured(tmp_path)
+    path = tmp_path / "good.urdf"
+    foreign = "<mass>1</mass><box><size>1 1 1</size></box><link name='l'/><mesh/>"
+    box = shape("<box size='0.04, 0.05, 0.06'/>").replace("<geo", "<origin rpy='0 0 0 1'/><geo")
+    rest = shape("<cylinder radius='0' length='0.1'/>") + shape(
+        "<mesh filename='box.obj' scale=''/>"
+    )
+    path.write_text(
+        f"<robot name=''><gazebo>{foreign}</gazebo><link name='l'>{box}{rest}</link></robot>"
+    )
+    assert len(read_object(path).mesh.faces) >= 12
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -23,29 +43,28 @@ MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
         (f"<robot name='r'>{301 * '<geometry/>'}</robot>", "301 geometries, expected at most 300"),
         ("<robot><link name='l'/></robot>", "bad.urdf is no URDF"),
         ("<sdf name='r'/>", "bad.urdf is no URDF"),
-        (2 * "<link name='l'/>", "two links named 'l'"),
         (
             "<joint name='j'><parent link='l'/><child link='m'/></joint>",
             "the child of its joint 'j'",
         ),
-        ("<mesh/>", "filename of a <mesh> is '', expected a file"),
-        ("<mesh filename='https://x.org/a.obj'/>", "filename of a <mesh> is 'https.*copy the mesh"),
-        (
-            "<cylinder radius='0' length='0.1'/>",
-            "radius of a <cylinder> is '0', expected 1 number ",
-        ),
-        ("<box size='0.05 0.05'/>", "size of a <box> is '0.05 0.05', expected 3 numbers over 0"),
-        ("<box/>", "size of a <box> is None"),
-        ("<mesh filename='a.obj' scale='0 0 0'/>", "scale of a <mesh> is '0 0 0', expected 1 or 3"),
-        ("<lateral_friction/>", "value of a <lateral_friction> is None, expected 1 number of 0 or"),
-        ("<mass value='heavy'/>", "value of a <mass> is 'heavy', expected 1 number .kilograms"),
-        ("<inertia ixx='much'/>", "ixx of a <inertia> is 'much'"),
+        (shape("<mesh/>"), "filename of a <mesh> is '', expected a file"),
+        (shape("<mesh filename='https://x.org/a.obj'/>"), "a <mesh> is 'https.*copy the mesh"),
+        (shape("<cylinder radius='wide' length='0.1'/>"), "radius of a <cylinder> is 'wide'"),
+        (shape("<cylinder radius='0' length='0.1'/>"), "bad.urdf has neither .* of any size"),
+        (shape("<box size='0.05 0.05'/>"), "size of a <box> is '0.05 0.05', expected three"),
+        (shape("<box/>"), "size of a <box> is None"),
+        (shape("<mesh filename='a.obj' scale='1 0 1'/>"), "scale of a <mesh> is 0"),
+        ("<contact><lateral_friction/></contact>", "value of a <lateral_friction> is None"),
+        ("<inertial><mass value='heavy'/></inertial>", "value of a <mass> is 'heavy', expected a"),
+        ("<inertial><inertia ixy='much'/></inertial>", "ixy of a <inertia> is 'much'"),
     ],
 )
 def test_a_bad_urdf_is_named(tmp_path, content, message):
     path = tmp_path / "bad.urdf"
     if not content.startswith(("<robot", "<sdf")):
-        content = f"<robot name='r'><link name='l'/>{content}</robot>"
+        inside = content if content.startswith("<joint") else ""
+        own = "" if inside else content
+        content = f"<robot name='r'><link name='l'>{own}</link>{inside}</robot>"
     path.write_text(content)
     with pytest.raises(ObjectError, match=message):
         read_object(path)
@@ -60,7 +79,7 @@ COLOUR = '<material name="m"><color rgba="1 0 0"/></material>'
         (
             'filename="box.obj" scale="1 1"',
             "",
-            r"bad.urdf.* scale of a <mesh> is '1 1', expected 1 or 3 numbers",
+            r"bad.urdf.* scale of a <mesh> is '1 1', expected one number or three",
         ),
         ('filename="box.obj"', COLOUR, r"bad.urdf .* colour of a visual is \[1. 0. 0.\]"),
         (f'filename="{300 * "b"}.obj"', "", "b.obj does not exist"),

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -468,6 +469,31 @@ def test_a_trial_leaves_the_docs_alone(two_parts, capsys):
     assert two_parts.read_text() == before and not results.FIGURES.exists()
     assert main(["--parts", "mujoco", "--scale", "0.1", "--write-docs"]) == 0
     assert "(5 rounds a row)" in two_parts.read_text()
+
+
+def test_a_look_is_noted_before_it_begins(two_parts, monkeypatch):
+    """A run that is stopped leaves it; one that goes on makes it none."""
+    play = results.run_command
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    def looks() -> dict:
+        file = results.FIGURES / "looks.json"
+        return json.loads(file.read_text()) if file.exists() else {}
+
+    for part, is_look in (("clutter15", True), ("speed", False)):
+        monkeypatch.setattr(results, "run_command", stop)
+        with pytest.raises(KeyboardInterrupt):
+            main(["--parts", part])
+        assert looks().get(part, []) == is_look * [
+            {"commit": 40 * "c", "scale": 1.0, "date": str(date.today()), "noises": {}}
+        ]
+        with pytest.raises(KeyboardInterrupt):
+            main(["--parts", part])
+        assert len(looks().get(part, [])) == is_look
+    monkeypatch.setattr(results, "run_command", play)
+    assert main(["--parts", "clutter15"]) == 0 and "clutter15" not in looks()  # no planner's
 
 
 def test_each_part_has_its_own_scale_and_the_date_of_its_measuring(two_parts):

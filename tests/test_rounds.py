@@ -112,7 +112,7 @@ def test_a_round_with_a_target_ends_when_it_is_in_the_tray(cell, box_set):
     assert (record.ended, record.target_in_hand) == ("no_plan", False)
 
 
-def test_a_target_that_falls_off_while_another_thing_is_picked_is_lost(
+def test_a_target_that_falls_off_while_another_thing_is_picked_ends_the_round(
     cell, box_set, monkeypatch
 ) -> None:
     """So is one of two things without a target, of which the other was picked."""
@@ -132,7 +132,7 @@ def test_a_target_that_falls_off_while_another_thing_is_picked_is_lost(
     record = run_round(cell, Scene("retrieve", 0, placements, target=0), plan, **settings)
     assert (record.ended, record.target_in_hand) == ("target", True)
     record = run_round(cell, Scene("pile", 0, placements), plan, **settings)
-    assert (record.ended, record.objects_cleared, record.target_in_hand) == ("lost", 1, None)
+    assert (record.ended, record.objects_cleared, record.target_in_hand) == ("fell_off", 1, None)
 
 
 def test_after_a_failure_another_object_comes_first() -> None:

@@ -591,6 +591,8 @@ def test_the_environment_of_films_is_closed_where_one_fails(tmp_path, monkeypatc
     monkeypatch.setattr(
         train_rl, "make_env", lambda *_, **__: SimpleNamespace(close=lambda: closed.append(True))
     )
+    asked = []
+    monkeypatch.setattr(train_rl, "load_policy", asked.append)
     with pytest.raises(UserError, match="no room for a film"):
-        train_rl.film(load_config(None, ["rl.films=1"]), tmp_path, SimpleNamespace(action=None))
-    assert closed == [True]
+        train_rl.film(load_config(None, ["rl.films=1"]), tmp_path)
+    assert closed == [True] and asked == [tmp_path / "best.pt"]

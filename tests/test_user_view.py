@@ -13,6 +13,7 @@ from utils.transforms import RGBDFrame, look_at
 from utils.user_view import (
     LARGEST,
     SMALLEST,
+    _check_units,
     check_found,
     check_view,
     corrected_view,
@@ -56,6 +57,20 @@ def test_a_principal_point_outside_the_image_is_remarked_upon() -> None:
     assert check_view(frame, Workspace((0.0, 0.0))) == []
     (remark,) = check_view(replace(frame, K=outside), Workspace((-0.8, 0.0)))
     assert remark.startswith("the principal point (480, 239.5) lies outside the image of 480x480")
+
+
+def test_what_may_be_in_another_unit_is_remarked_upon() -> None:
+    frame = scene((0.0, 0.0, 0.06))
+    wide = replace(frame, depth=10 * frame.depth)
+    depth = np.median(wide.depth)
+    (remark,) = _check_units(wide)
+    assert f"spans {SIDE * depth / FOCAL:.3g} m x" in remark and "unit of the depth" in remark
+    near = replace(frame, depth=np.full_like(frame.depth, 0.05 * FOCAL / SIDE))
+    assert "spans" in _check_units(near)[0]
+    T_WC = frame.T_WC.copy()
+    T_WC[:3, 3] = (500, 0, 800)  # of a camera half a metre off and 0.8 m up, in millimetres
+    (remark,) = _check_units(replace(frame, T_WC=T_WC))
+    assert remark.startswith("the camera stands 943.4 m from the world's origin")
 
 
 def test_single_pixels_of_noise_do_not_count() -> None:

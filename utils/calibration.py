@@ -120,8 +120,7 @@ class Calibration:
 
         A logistic regression with Platt's targets, which are nearer to each other than 0 and 1
         where there are few grasps, and Gaussian priors of standard deviations SLOPE_SPREAD on both
-        slopes, DOUBT_SPREAD on the doubt and PENALTY_SPREAD on the penalty. Raises RuntimeError
-        where it finds none.
+        slopes, DOUBT_SPREAD on the doubt and PENALTY_SPREAD on the penalty.
         """
         own = _Sample.of(scores, successes, roughness, failed, bounded)
         most = None if bounded else 0.0  # of the upper slope
@@ -130,8 +129,6 @@ class Calibration:
             lambda numbers: own.loss(*numbers) / len(own.low), [1.0, 0.0, 0.0, 0.0, 0.0],
             method="L-BFGS-B", bounds=bounds,
         )  # fmt: skip
-        if not best.success:
-            raise RuntimeError(f"a calibration of {len(own.low)} grasps: {best.message}")
         slope, offset, doubt, upper, penalty = best.x.tolist()
         return Calibration(slope, offset, 1000 * penalty, doubt, upper)
 

@@ -154,7 +154,7 @@ def draw_pairs(
 
     Pairs of quality 0 come from the objects' pixels and are executed with the hand wide open.
     """
-    settings = LabelSettings()
+    settings = SETTINGS
     lowest = settings.table_clearance + settings.min_engagement
     rise = frame.points()[..., 2] - frame.truth.table_height
     on_object = labels.valid & (frame.segmentation >= 0) & (rise > lowest)
@@ -207,10 +207,10 @@ class LabelTruth:
 
 
 def label_truth(groups: Sequence[Sequence[Trial]]) -> LabelTruth:
-    """Compute precision and recall of the labels from the trials of each scene, or of several
-    scenes together; NaN where none was executed."""
+    """Compute precision and recall of the labels from the trials of each scene, or of whole
+    scenes together, such as a shard's; NaN where none was executed."""
     trials = [trial for group in groups for trial in group]
-    least = LabelSettings().positive
+    least = SETTINGS.positive
     positive = [t for t in trials if t.quality >= least]
     hits = sum(t.success for t in positive)
     good = sum(t.weight for t in trials if t.success)

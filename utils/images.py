@@ -85,7 +85,6 @@ class PixelScaling:
 MILLIMETRES = 0.001  # unit of whole numbers in a depth file, unless the user gives another one
 SATURATED = 65535  # the other usual value of an unknown pixel in 16 bits, beside 0
 MAX_PIXEL_ASPECT = 1.5  # fx / fy: real sensors stay well below; swapped numbers do not
-FARTHEST_CAMERA = 50.0  # m from the world's origin; 5 cm in millimetres
 RIGID_TOLERANCE = 1e-3  # of a rotation's orthonormality: poses are often printed with 4 digits
 
 
@@ -312,11 +311,6 @@ def read_pose(path: Path) -> np.ndarray:
         raise UserError(
             f"{path}: the camera pose is not rigid: its 3x3 part must be a rotation "
             f"(determinant {np.linalg.det(R):.3g}, expected 1)"
-        )
-    if (far := np.linalg.norm(T[:3, 3])) > FARTHEST_CAMERA:
-        raise UserError(
-            f"{path}: the camera stands {far:.4g} m from the world's origin, expected at most "
-            f"{FARTHEST_CAMERA:g} m; is the position in millimetres?"
         )
     rigid = np.eye(4)
     rigid[:3, :3] = Rotation.from_matrix(R).as_matrix()

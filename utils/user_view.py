@@ -20,6 +20,8 @@ from utils.transforms import RGBDFrame, deproject, known_depth, project
 
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
 SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
+LARGEST_SPAN, SMALLEST_SPAN = 3.0, 0.06  # m, of an image that a hand grasps from
+FARTHEST_CAMERA = 50.0  # m from the world's origin; 5 cm in millimetres
 MARGIN = 0.02  # m around what stands on the table
 ROUGH = 0.002  # m, standard deviation of a table whose bumps are as high as what a hand grasps
 _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
@@ -151,7 +153,7 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
             f"the view is too oblique: the camera looks {tilt:.0f} degrees off the table's normal, "
             f"at most {MOST_OBLIQUE:g} are allowed; look more from above"
         )
-    remarks = []
+    remarks = _check_units(frame)
     (height, width), (cx, cy) = frame.depth.shape, frame.K[:2, 2]
     if not (0 <= cx < width and 0 <= cy < height):
         remarks.append(
@@ -177,6 +179,26 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
         )
     if unseen > MANY_UNSEEN:
         remarks.append(f"{unseen:.0%} of the place that was searched has no depth")
+    return remarks
+
+
+def _check_units(frame: RGBDFrame) -> list[str]:
+    """Remarks on an image that spans far more or far less than a hand's workspace, and on a camera
+    far from the world's origin: units may be wrong."""
+    remarks = []
+    depth = float(np.median(frame.depth[known_depth(frame.depth)]))
+    rows, columns = frame.depth.shape
+    width, height = columns * depth / frame.K[0, 0], rows * depth / frame.K[1, 1]
+    if max(width, height) > LARGEST_SPAN or min(width, height) < SMALLEST_SPAN:
+        remarks.append(
+            f"at the median depth of {depth:.3g} m the image spans {width:.3g} m x {height:.3g} m; "
+            "check the unit of the depth and the focal length if that is not so"
+        )
+    if (far := np.linalg.norm(frame.T_WC[:3, 3])) > FARTHEST_CAMERA:
+        remarks.append(
+            f"the camera stands {far:.4g} m from the world's origin; check the unit of the pose if "
+            "that is not so"
+        )
     return remarks
 
 
