@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections import Counter
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -12,9 +14,20 @@ from filelock import FileLock
 from tests.helpers.simulators import INSTALLED
 from utils.config import Config, load_config
 
+ENVS = Path(__file__).parents[1] / "envs"
 # The same examples everywhere, and no verdict from how busy the machine is.
 hypothesis.settings.register_profile("everywhere", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("everywhere")
+
+
+def pytest_configure() -> None:
+    """What the cache holds was made by the code that is tested: other code has another folder, also
+    in the processes that tests start."""
+    names = ("object_parts", "object_meshes", "object_files", "object_bodies", "panda_model",
+             "panda_urdf")  # fmt: skip
+    digest = hashlib.sha256(b"".join((ENVS / f"{name}.py").read_bytes() for name in names))
+    own = Path.home() / ".cache" / "robot_grasping" / "tests" / digest.hexdigest()[:12]
+    os.environ["ROBOT_GRASPING_CACHE"] = str(own)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
