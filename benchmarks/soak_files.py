@@ -106,8 +106,12 @@ def _with_another_word(content: bytes, start: int, random: np.random.Generator) 
     return content[:start] + WORDS[random.integers(len(WORDS))] + content[end:]
 
 
-def problem(kind: Kind, path: Path) -> str | None:
-    """What is wrong with how a file is read; None where it gives something or one sentence."""
+def problem(
+    kind: Kind, path: Path, most: float = LARGEST_GROWTH, longest: float = LONGEST
+) -> str | None:
+    """What is wrong with how a file is read; None where it gives something or one sentence.
+
+    most: bytes that reading it may take. longest: seconds that it may take."""
     before, begun = psutil.Process().memory_info().rss, time.perf_counter()
     forget_peak()
     try:
@@ -117,9 +121,9 @@ def problem(kind: Kind, path: Path) -> str | None:
             return "the error says nothing"
     except Exception as error:
         return f"{type(error).__name__}: {one_line(error)}"
-    if peak_memory() - before > LARGEST_GROWTH:
+    if peak_memory() - before > most:
         return "it takes too much memory"
-    return "it takes too long" if time.perf_counter() - begun > LONGEST else None
+    return "it takes too long" if time.perf_counter() - begun > longest else None
 
 
 def forget_peak() -> None:

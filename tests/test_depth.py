@@ -1,7 +1,5 @@
 """Noises of depth images against loops over pixels, closed forms and in the cell."""
 
-import time
-
 import cv2
 import numpy as np
 import pytest
@@ -29,34 +27,18 @@ def plane(depth: float, side: int = 224) -> np.ndarray:
     return np.full((side, side), depth, dtype=np.float32)
 
 
-def test_equals_the_loops_and_is_much_faster():
-    """By 30 times on a machine that has nothing else to do; the best of several times may be half
-    of that where others work, and array code that loops over pixels is far below it."""
+def test_array_code_measures_what_the_loops_over_pixels_measure():
+    """How much faster it is, `benchmarks.bench_sim2real` measures."""
     noise, depth = KinectNoise(), steps_and_slopes(112)
-    slow = []
-    for _ in range(2):
-        start = time.perf_counter()
-        expected = by_loops(noise, depth, np.random.default_rng(3))
-        slow.append(time.perf_counter() - start)
-    np.testing.assert_array_equal(expected == 0, noise(depth, np.random.default_rng(3)) == 0)
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        fast = []
-        for _ in range(20):
-            rng = np.random.default_rng(3)
-            start = time.perf_counter()
-            measured = noise(depth, rng)
-            fast.append(time.perf_counter() - start)
-    finally:
-        cv2.setNumThreads(threads)
+    expected = by_loops(noise, depth, np.random.default_rng(3))
+    measured = noise(depth, np.random.default_rng(3))
+    np.testing.assert_array_equal(expected == 0, measured == 0)
     # Rounding in single precision may tip a disparity that lies between two steps.
     same = np.isclose(measured, expected, rtol=1e-6)
     assert (~same).mean() < 1e-3
     one_step = 0.81**2 / FB / 8
     assert abs(measured - expected)[~same].max(initial=0) < one_step
     assert 0.01 < (expected == 0).mean() < 0.5  # there was something to get wrong
-    assert min(slow) / min(fast) > 15
 
 
 @pytest.mark.parametrize("image_focal", [200.0, 900.0])

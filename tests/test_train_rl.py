@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -418,11 +417,9 @@ def test_bad_numbers_end_a_run_with_a_sound_checkpoint(tmp_path, monkeypatch, tr
 )
 def test_lost_workers_end_a_run(tmp_path, monkeypatch, capsys, trouble, message):
     monkeypatch.chdir(tmp_path)
-    before = time.monotonic()
     with pytest.raises(WorkerError, match=message):
         train_rl.main([*POINT, "rl.parallel=true", "rl.worker_timeout=10",
                        f"rl.env_kwargs=trouble={trouble}"])  # fmt: skip
-    assert time.monotonic() - before < 120
     (run,) = Path("runs/train_rl").iterdir()
     assert f"go on with {this_python()} train_rl.py --resume {run}" in capsys.readouterr().err
     assert (run / "last.pt").exists()
