@@ -445,7 +445,7 @@ def test_the_evaluation_does_not_try_what_rather_fails(planner, settings, tried)
     assert record.attempts[0].executed == tried
 
 
-@pytest.mark.parametrize("policy", ["checkpoints/graspnet.pt", "ppo"])
+@pytest.mark.parametrize("policy", [str(SHIPPED), "ppo"], ids=["graspnet", "ppo"])
 def test_what_states_no_chances_cannot_abstain(policy) -> None:
     words = [f"evaluate.policies=[{policy}]", "evaluate.abstain=0.5", "evaluate.scenarios=isolated"]
     with pytest.raises(UserError, match="evaluate.abstain: .* states no chances of success"):

@@ -3,7 +3,6 @@
 import colorsys
 import importlib.util
 import json
-import os
 from functools import cache
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from envs.rounds import run_round
 from envs.simulators import cell_class, make_cell
 from envs.vector_env import training_envs
 from tests.helpers.simulators import INSTALLED, is_pybullet, needs_pybullet, pybullet
+from tests.helpers.systems import needs_dev_full
 from utils.config import load_config
 from utils.config_types import PhysicsRangesConfig, Range, VisionRangesConfig
 from utils.domain_randomization import DomainRandomizer
@@ -657,7 +657,7 @@ def test_each_environment_of_several_writes_a_file_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("parallel", ["false", "true"])
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no /dev/full")
+@needs_dev_full
 def test_a_full_disk_ends_an_episode_with_one_sentence(tmp_path, parallel):
     config = load_config(None, [*ONE_STEP, f"rl.parallel={parallel}"])
     with (

@@ -24,6 +24,7 @@ from models.planners import make_planner
 from tests.helpers.cluster import local_cluster
 from tests.helpers.records import ROUNDS
 from tests.helpers.simulators import needs_pybullet
+from tests.helpers.systems import needs_proc
 from utils.config import DEFAULTS
 from utils.errors import UserError
 from utils.evaluation import Outcome
@@ -370,7 +371,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["--config", "missing.yaml"], "missing.yaml"),
         (["--resume", "nowhere"], "nowhere"),
         (["--results", "no/such/folder/x.json"], "no/such/folder"),
-        (["--results", "/proc/x.json"], "--results /proc/x.json: cannot be written"),
+        pytest.param(
+            ["--results", "/proc/x.json"],
+            "--results /proc/x.json: cannot be written",
+            marks=needs_proc,
+        ),
         (["camera.up=[0,0,1]"], "camera"),
         (["robot.home=[9,0,0,-2,0,1.5,0]"], "robot.home"),
         (["workspace.center=[7,7]"], "workspace"),

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from envs.cell import ROBOT, TABLE_OR_BACKGROUND, Intrinsics
 from envs.mujoco_camera import MujocoCamera, add_view, camera_of
+from utils.runs import REPOSITORY
 from utils.transforms import look_at
 
 
@@ -137,7 +138,7 @@ print(parameter.item())
 def test_a_network_is_trained_in_a_process_that_has_drawn():
     """Both load an LLVM of their own, which ended the process by a segmentation fault."""
     done = subprocess.run(
-        [sys.executable, "-c", TRAIN_AFTER_AN_IMAGE], capture_output=True, text=True
+        [sys.executable, "-c", TRAIN_AFTER_AN_IMAGE], cwd=REPOSITORY, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.splitlines()[-1]) == 0.5

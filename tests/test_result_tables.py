@@ -6,7 +6,8 @@ import json
 import os
 import re
 import shlex
-from datetime import date
+import subprocess
+from datetime import date, datetime
 from pathlib import Path
 
 import pytest
@@ -330,20 +331,26 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
 
 
 def names_sealed_scenes(root: Path) -> list[str]:
-    """Files below `root` that name the sealed seed or the sealed objects, but for those that make
-    and keep them."""
+    """Files below `root`, in a repository those that git tracks, that name the sealed seed or the
+    sealed objects, but for those that make and keep them."""
     seed, split = str(load_config(SEALED).seed), SPLIT
     named = re.compile(rf"\b{seed}\b|split\W{{1,4}}{split}\b|{split}\W{{1,4}}split")
-    found = []
-    for folder in ("envs", "models", "utils", "benchmarks", "configs", "tests", "checkpoints", "."):
-        files = (root / folder).glob("*") if folder == "." else (root / folder).rglob("*")
-        found += [
-            str(file.relative_to(root))
-            for file in files
-            if file.suffix in {".py", ".yaml", ".toml", ".sh", ".j2"}
-            and named.search(file.read_text(encoding="utf-8"))
-        ]
-    return sorted(set(found))
+    folders = {"envs", "models", "utils", "benchmarks", "configs", "tests", "checkpoints"}
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "ls-files", "-z"]
+        listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        files = [Path(name) for name in listed.split("\0")[:-1]]
+    else:
+        inside = (file for folder in folders for file in (root / folder).rglob("*"))
+        files = [file.relative_to(root) for file in (*root.glob("*"), *inside)]
+    return sorted(
+        str(file)
+        for file in files
+        if (len(file.parts) == 1 or file.parts[0] in folders)
+        and file.suffix in {".py", ".yaml", ".toml", ".sh", ".j2"}
+        and (root / file).is_file()
+        and named.search((root / file).read_text(encoding="utf-8"))
+    )
 
 
 def test_sealed_scenes_are_named_by_the_tables_alone(tmp_path):
@@ -475,6 +482,13 @@ def test_a_look_is_noted_before_it_begins(two_parts, monkeypatch):
     """A run that is stopped leaves it; one that goes on makes it none."""
     play = results.run_command
 
+    class SecondOfJanuary(date):
+        @classmethod
+        def today(cls):
+            return cls(2026, 1, 2)
+
+    monkeypatch.setattr(results, "date", SecondOfJanuary)
+
     def stop(*_):
         raise KeyboardInterrupt
 
@@ -487,7 +501,7 @@ def test_a_look_is_noted_before_it_begins(two_parts, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             main(["--parts", part])
         assert looks().get(part, []) == is_look * [
-            {"commit": 40 * "c", "scale": 1.0, "date": str(date.today()), "noises": {}}
+            {"commit": 40 * "c", "scale": 1.0, "date": "2026-01-02", "noises": {}}
         ]
         with pytest.raises(KeyboardInterrupt):
             main(["--parts", part])
@@ -552,7 +566,7 @@ def test_what_was_measured_by_an_older_version_is_written(two_parts, tmp_path, c
     file.parent.mkdir(parents=True)
     old = {"command": "python evaluate.py", "rounds": 30, "rows": [row("heuristic", 3, 4)]}
     file.write_text(json.dumps(old | {"run": str(run.relative_to(tmp_path))}))
-    os.utime(file, (1_767_441_845,) * 2)  # 2026-01-03, at noon in UTC
+    os.utime(file, (datetime(2026, 1, 3, 12).timestamp(),) * 2)  # at noon, wherever this is
     assert main(["--parts", "clutter15", "--scale", "0.5", "--commit", "cccccc"]) == 0
     content = json.loads((results.FIGURES / "clutter15.json").read_text())
     assert content["date"] == content["commands"]["clutter15"]["date"] == "2026-01-03"

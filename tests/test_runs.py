@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG
+from tests.helpers.systems import needs_proc
 from utils.atomic_files import write_atomic, write_json_atomic
 from utils.config import ConfigError, load_config
 from utils.distributed import Team, run_folder
@@ -128,7 +129,10 @@ def test_commands_that_are_printed_name_the_interpreter_from_here(tmp_path, monk
     assert shlex.split(this_python()) == [sys.executable]
 
 
-def test_git_state_is_that_of_git(tmp_path):
+def test_git_state_is_that_of_git(tmp_path, monkeypatch):
+    for name in ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):  # which may sign or run hooks
+        monkeypatch.setenv(name, os.devnull)
+
     def git(*arguments: str) -> str:
         names = ["-c", "user.name=a", "-c", "user.email=a@b"]
         command = ["git", "-C", str(tmp_path), *names, *arguments]
@@ -427,9 +431,12 @@ def limited(limit: str, size: int, code: str) -> subprocess.CompletedProcess:
         "from utils.runs import *\n"
         f"def main(argv):\n    {code}\nrun_script(main)"
     )
+    # Each thread of an algebra library takes its share of the address space.
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run(
-        [sys.executable, "-c", text], capture_output=True, text=True, cwd=REPOSITORY, timeout=60
-    )
+        [sys.executable, "-c", text], capture_output=True, text=True, cwd=REPOSITORY, timeout=60,
+        env=os.environ | threads,
+    )  # fmt: skip
 
 
 def test_a_disk_without_room_is_one_sentence_and_keeps_what_was_there(tmp_path):
@@ -445,6 +452,7 @@ def test_a_disk_without_room_is_one_sentence_and_keeps_what_was_there(tmp_path):
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the address space")
 def test_too_little_memory_is_one_sentence():
     done = limited("RLIMIT_AS", 2 * 1024**3, "np.ones(10**10)")
     assert done.returncode == 2
@@ -455,5 +463,9 @@ def test_a_folder_that_may_not_be_written_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="x.json: cannot be written .File exists"):
         write_atomic(tmp_path / "file" / "x.json", "{}")
+
+
+@needs_proc
+def test_a_folder_that_takes_no_files_is_one_sentence():
     with pytest.raises(UserError, match="/proc/x.json: cannot be written"):
         write_atomic(Path("/proc/x.json"), "{}")

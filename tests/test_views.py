@@ -55,7 +55,7 @@ def test_the_cameras_of_the_protocols(name):
     table's middle and 60 degrees off the vertical."""
     from envs.cell import camera_intrinsics
 
-    config = load_config(f"configs/{name}.yaml")
+    config = load_config(REPOSITORY / "configs" / f"{name}.yaml")
     K = camera_intrinsics(config.camera).K
     assert K[0, 0] == pytest.approx(540, abs=0.01) and (K[0, 2], K[1, 2]) == (319.5, 239.5)
     if name == "vgn":
