@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -43,6 +44,20 @@ def without_other_tests_plug_ins(monkeypatch):
     monkeypatch.setattr("utils.plugins._loaded", set())
 
 
+@pytest.fixture(autouse=True)
+def same_torch():
+    """Torch draws the same numbers whichever tests came before, and after a test has as many
+    threads as before it. Tests that do without torch do not wait for its import."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    torch.manual_seed(0)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="session")
 def config() -> Config:
     """The defaults, rendered by the CPU so that pictures are the same everywhere."""
@@ -79,14 +94,20 @@ def tiny_data(tmp_path_factory):
 
 
 @pytest.fixture
-def played_here(monkeypatch):
-    """Evaluations play their rounds in this process instead of worker processes."""
-    from tests.helpers.played_here import CallingExecutor
+def kept_here():
+    """What a worker process would keep, such as cells, is kept until the end of the test."""
     from utils.worker_process import forget
 
-    monkeypatch.setattr("utils.evaluation.open_executor", CallingExecutor)
     yield
     forget()
+
+
+@pytest.fixture
+def played_here(monkeypatch, kept_here):
+    """Evaluations play their rounds in this process instead of worker processes."""
+    from tests.helpers.played_here import CallingExecutor
+
+    monkeypatch.setattr("utils.evaluation.open_executor", CallingExecutor)
 
 
 @pytest.fixture

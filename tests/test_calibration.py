@@ -437,6 +437,7 @@ def test_grasps_that_rather_fail_are_left_to_whoever_asks_for_them() -> None:
         ("score", [], True),
     ],
 )
+@pytest.mark.usefixtures("kept_here")
 def test_the_evaluation_does_not_try_what_rather_fails(planner, settings, tried) -> None:
     config = load_config(None, settings)
     name = f"tests.helpers.unlikely:{planner}"

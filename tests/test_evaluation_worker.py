@@ -77,6 +77,7 @@ def test_a_camera_that_sees_nothing_of_the_workspace_is_refused(config, changes,
         check_sees_workspace(camera, K, config.workspace)
 
 
+@pytest.mark.usefixtures("kept_here")
 def test_a_picture_knows_its_scene_and_names_the_object_set_where_there_are_several(config):
     def caption(sets: tuple[str, ...]) -> str:
         changes = {"policies": ("random",), "object_sets": sets, "max_failures": 1}
