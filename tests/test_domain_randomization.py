@@ -723,22 +723,22 @@ def test_an_evaluation_meets_the_same_world_for_every_policy(scene, simulator):
 
 @needs_pybullet
 def test_colours_do_not_tell_where_the_object_is():
-    """Numbers of two independent draws are correlated by more than 0.33 in one of 1,000 pairs of
-    100; seeds that were the same had 0.9."""
+    """Numbers of two independent draws are correlated by more than 0.60 in one of 2,000 pairs of
+    30; seeds that were the same had 0.9."""
     config = load_config(
         None, ["evaluate.randomise=true", "sim.renderer=tiny", "randomization.colour_share=1"]
     )
     boxes = load_object_set("box", cache_dir=config.cache_folder)
     places, colours = [], []
     with make_cell(config) as cell:
-        for seed in range(100):
+        for seed in range(30):
             scene = make_scene("isolated", boxes, seed, config)
             cell.build(scene)
             places.append(scene.placements[0].position[:2])
             colours.append([colorsys.rgb_to_hsv(*rgb) for rgb in cell.sample["colours"]])
     colours = np.reshape(colours, (len(colours), -1)).T
     together = np.corrcoef(np.array(places).T, colours)[:2, 2:]
-    assert np.abs(together).max() < 0.33
+    assert np.abs(together).max() < 0.60
 
 
 def test_the_record_of_a_round_replays_its_world(tmp_path, simulator, make):

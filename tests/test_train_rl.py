@@ -459,22 +459,14 @@ def test_two_processes_take_the_step_of_the_joint_minibatch(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_script_under_torchrun_leaves_one_run(tmp_path):
-    printed = in_two_processes(tmp_path, REPOSITORY / "train_rl.py", *POINT, "rl.envs=4")
-    assert "2 process(es)" in printed and printed.count("best evaluation") == 1
-    (run,) = (tmp_path / "runs" / "train_rl").iterdir()
-    rows = json.loads((run / "results.json").read_text())["history"]
-    assert [row["step"] for row in rows] == [0, 128, 192]
-
-
-@pytest.mark.slow
 def test_torchrun_replaces_a_lost_process_and_the_training_goes_on(tmp_path):
-    """From the last checkpoint, in the run's folder, with no command of the user's."""
+    """From the last checkpoint, in the run's one folder, with no command of the user's."""
     printed = in_two_processes(
         tmp_path, "--max-restarts=1", REPOSITORY / "train_rl.py", *POINT, "rl.envs=4",
         "rl.env_kwargs=trouble=lost",
     )  # fmt: skip
     assert (tmp_path / "lost").exists() and printed.count("PPO on") == 2
+    assert "2 process(es)" in printed and printed.count("best evaluation") == 1
     (run,) = (tmp_path / "runs" / "train_rl").iterdir()
     rows = json.loads((run / "results.json").read_text())["history"]
     assert [row["step"] for row in rows] == [0, 128, 192]
