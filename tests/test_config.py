@@ -37,7 +37,7 @@ def message(*overrides: str, path: Path | None = None) -> str:
     return text
 
 
-def test_defaults():
+def test_without_a_file_or_overrides_the_values_are_those_of_the_defaults():
     config = load_config(None)
     assert config.seed == 0
     assert config.camera.position == (0.5, 0.0, 0.8)
@@ -62,7 +62,7 @@ def test_defaults_and_schema_have_the_same_keys():
     assert set(keys(yaml.safe_load(DEFAULTS.read_text(encoding="utf-8")))) == set(known_keys())
 
 
-def test_frozen():
+def test_a_loaded_config_cannot_be_changed():
     with pytest.raises(ValidationError):
         load_config(None).seed = 1
 
@@ -230,7 +230,7 @@ def test_with_settings_refuses_an_unknown_key():
     assert "did you mean env.max_steps?" in text
 
 
-def test_cache_folder(monkeypatch, tmp_path):
+def test_the_cache_is_in_the_key_s_folder_the_variable_s_or_the_home_s(monkeypatch, tmp_path):
     monkeypatch.delenv("ROBOT_GRASPING_CACHE", raising=False)
     assert load_config(None).cache_folder == Path.home() / ".cache" / "robot_grasping"
     monkeypatch.setenv("ROBOT_GRASPING_CACHE", str(tmp_path / "env"))

@@ -120,7 +120,7 @@ def seeded(noise, depth: np.ndarray) -> np.ndarray:
     return first
 
 
-def test_deterministic_and_leaves_its_input_alone():
+def test_a_seed_gives_one_image_of_kinect_noise_and_the_input_is_left_alone():
     noise, depth = KinectNoise(), steps_and_slopes()
     seeded(noise, depth)
 

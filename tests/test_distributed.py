@@ -24,7 +24,7 @@ def test_names_that_are_no_device(name):
         choose_device(name)
 
 
-def test_devices(monkeypatch):
+def test_auto_is_the_process_s_gpu_and_a_gpu_that_is_missing_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     assert choose_device("auto") == choose_device("cpu") == torch.device("cpu")

@@ -129,7 +129,7 @@ def test_a_goal_off_the_middle_leaves_less_room(monkeypatch):
     np.testing.assert_allclose([goals._narrow, goals._wide], [[0.05], [0.07]] * np.ones(len(goals)))
 
 
-def test_leaning():
+def test_the_tilt_is_the_angle_by_which_the_hand_leans():
     goals = brick()
     T = pose()
     T[:3, :3] = Rotation.from_euler("x", 0.3).as_matrix() @ T[:3, :3]

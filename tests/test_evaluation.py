@@ -44,7 +44,7 @@ def test_only_missing_rounds_are_left_to_do():
     assert (task.seed, task.policies) == (0, (("heuristic", "open_loop", "none"),))
 
 
-def test_interruption():
+def test_an_interrupted_evaluation_says_how_many_of_the_planned_rounds_it_has():
     assert planned_rounds(CONFIG) == 4
     assert interruption(4, CONFIG) is None
     assert interruption(3, CONFIG) == "interrupted: 3 of 4 rounds"

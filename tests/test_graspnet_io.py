@@ -36,7 +36,7 @@ def model():
     return GraspNet(max_width=0.08, backbone="ggcnn")
 
 
-def test_round_trip(tmp_path, model):
+def test_a_saved_network_predicts_as_before_and_takes_less_room(tmp_path, model):
     save_graspnet(tmp_path / "net.pt", model, PIXEL, {"seed": 3}, epoch=7)
     saved = load_graspnet(tmp_path / "net.pt")
     assert saved.metres_per_pixel == PIXEL

@@ -159,7 +159,7 @@ def test_a_batch_that_cannot_be_shared_equally_is_refused():
         trainer_of(team=Team(0, 3, torch.device("cpu")))
 
 
-def test_precisions():
+def test_auto_is_half_precision_on_a_gpu_and_what_is_named_is_taken():
     cpu, gpu = torch.device("cpu"), torch.device("cuda", 0)
     assert choose_precision("auto", gpu) == torch.float16
     assert choose_precision("auto", cpu) in (torch.float32, torch.bfloat16)

@@ -158,7 +158,7 @@ def test_what_presses_on_the_palm_is_felt(held_box):
     assert cell.robot.palm_touches()
 
 
-def test_speed(held_box):
+def test_the_speed_of_an_object_is_that_of_free_fall(held_box):
     """A cube that falls for 0.1 s is as fast as g t."""
     cell, _ = held_box
     cell.robot.data.qpos[cell.robot.model.joint("object0").qposadr[0] + 2] += 0.3

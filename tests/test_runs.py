@@ -250,7 +250,7 @@ def test_an_unknown_option_is_told_how_a_setting_is_written(capsys):
     )
 
 
-def test_parse_args(tmp_path):
+def test_overrides_win_over_the_file_and_options_of_a_script_are_given_back(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("seed: 3\n")
     config, options = parse_args(
@@ -315,7 +315,7 @@ def test_resume_takes_the_run_s_config(tmp_path):
         parse_args(["--resume", str(tmp_path / "empty")], "a script")
 
 
-def test_run_script(monkeypatch, capsys):
+def test_errors_of_users_end_a_script_by_one_line_and_bugs_by_their_traceback(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "evaluate.roundz=3"])
 
     def status(main) -> int:
