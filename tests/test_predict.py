@@ -530,7 +530,7 @@ def only_a_count_beside_export(files):
     ("spoil", "message"),
     [
         (small_rgb, "differ in size: 320x100 and 320x240"),
-        (metres_wanted, "median is [5-9]... m.*check its unit"),
+        (metres_wanted, "median is [5-9].. m.*check its unit"),
         (options(depth_scale=1.0), "median is [5-9].. m.*check its unit"),
         (options(depth_scale=-1), "--depth-scale"),
         (options(depth_scale="nan"), "--depth-scale"),
