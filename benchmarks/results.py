@@ -86,7 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         for part in parts:
             if options.commit is not None and not is_finished(part, commit, options.scale):
                 print(f"{part.name}: skipped, because {RUNS / commit} does not hold all of it")
-            elif options.commit is None and (missing := set(part.needs) - folders.keys()):
+            elif options.commit is None and (
+                missing := [name for name in part.needs if name not in folders]
+            ):
                 for name in missing:
                     print(f"{part.name}: skipped, because no --{name} names {SOURCES[name]}")
             else:

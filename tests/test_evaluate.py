@@ -278,7 +278,7 @@ def test_rounds_are_the_same_when_a_worker_is_killed(undisturbed, engine, tmp_pa
         while time.monotonic() < deadline:
             journals = list(tmp_path.glob("runs/evaluate/*/rounds.jsonl"))
             if journals and workers():
-                killed.append(workers()[0])
+                killed.append(min(workers()))
                 os.kill(killed[0], signal.SIGKILL)
                 return
             time.sleep(0.02)

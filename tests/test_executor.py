@@ -302,6 +302,48 @@ def test_an_error_for_the_user_says_where(compute):
     assert ("worker's machine" in str(raised.value)) is (compute.scheduler is not None)
 
 
+# --- Order --------------------------------------------------------------------------------------
+
+
+class Done(Threads):
+    """Of which every call has ended as soon as it is submitted."""
+
+    def submit(self, function, item):
+        future = Future()
+        try:
+            future.set_result(function(item))
+        except ZeroDivisionError as error:
+            future.set_exception(error)
+        return future
+
+
+def test_calls_that_have_ended_together_are_in_the_order_of_submission():
+    assert list(completed(Done(20), abs, range(50))) == list(range(50))
+
+
+def divide(number):
+    raise ZeroDivisionError(number)
+
+
+def test_of_errors_that_are_there_together_the_first_submitted_is_raised():
+    with pytest.raises(ZeroDivisionError, match="^0$"):
+        list(completed(Done(20), divide, range(50)))
+
+
+def test_workers_that_have_left_together_are_named_in_order(monkeypatch, capfd):
+    threads = dict.fromkeys((f"tcp://10.0.0.{i}:4000" for i in range(9, 0, -1)), 1)
+    client = SimpleNamespace(
+        get_executor=lambda **_: None, run=lambda *_: None, nthreads=lambda: threads
+    )
+    monkeypatch.setattr(executor, "COUNT_SECONDS", 0.0)
+    cluster = executor._Cluster(client, None, executor.Job("job", 60.0))
+    assert cluster.size() == 9
+    threads = {}
+    assert cluster.waits()
+    said = capfd.readouterr().err.split("\n\n")
+    assert [line.split()[2] for line in said] == [f"tcp://10.0.0.{i}:4000" for i in range(1, 10)]
+
+
 # --- A cluster without workers ------------------------------------------------------------------
 
 

@@ -65,6 +65,16 @@ def test_iteration_is_sorted_by_name_over_subfolders(tmp_path):
     assert len(data) == 3
 
 
+def test_a_file_that_is_there_twice_is_named_in_the_order_of_its_folders(tmp_path):
+    """Whatever the order in which the file system lists them."""
+    for folder in "cab":
+        write_cornell(tmp_path / folder, 1)
+    with pytest.raises(UserError) as raised:
+        CornellDataset(tmp_path)
+    first, second = tmp_path / "a" / "pcd0001cneg.txt", tmp_path / "b" / "pcd0001cneg.txt"
+    assert str(raised.value) == f"pcd0001cneg.txt is there twice: {first} and {second}"
+
+
 def test_objects_from_the_table_of_the_data_set(tmp_path):
     for number in (1000, 1001, 1002):
         write_cornell(tmp_path, number)

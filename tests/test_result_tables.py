@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks import results
 from benchmarks.looks import add_look, begin_look
-from benchmarks.result_parts import PARTS, REPOSITORY, SEALED, SEED, SPLIT
+from benchmarks.result_parts import PARTS, REPOSITORY, SEALED, SEED, SPLIT, Part
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
 from benchmarks.table_cells import cleared, rate, success
@@ -301,6 +301,15 @@ def test_a_trial_plays_no_sealed_scene(capsys):
 def test_a_scale_that_is_no_share_of_rounds_is_refused(scale):
     with pytest.raises(UserError, match="--scale: got .*, expected a positive number"):
         main(["--list", "--scale", scale])
+
+
+def test_what_a_part_lacks_is_said_in_its_own_order(two_parts, monkeypatch, capsys):
+    folders = ["scans", "urdfs", "photographs", "meshes", "weights", "films", "logs", "masks"]
+    part = Part("all_of_them", "needs eight folders", 1, (), needs=tuple(folders))
+    monkeypatch.setattr(results, "SOURCES", dict.fromkeys(folders, "something"))
+    monkeypatch.setattr(results, "chosen_parts", lambda names: [part])
+    assert main(["--scale", "0.1"]) == 0
+    assert re.findall(r"no --(\w+) names something", capsys.readouterr().out) == folders
 
 
 def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts, capsys):

@@ -114,10 +114,12 @@ def completed(
 
     No more items are submitted at a time than there are workers, and `items` is read only as far as
     that. stop: once it is set, no more items are submitted, and the calls under way are finished
-    unless there is no worker for them. Raises what a call has raised, the first one of several,
-    once the calls under way are finished and what they return has been yielded.
+    unless there is no worker for them. Raises what a call has raised, once the calls
+    under way are finished and what they return has been yielded. Of several calls the first to end
+    counts, and of those found ended together the first to be submitted.
     """
-    waiting, pending = iter(items), set()
+    waiting = iter(items)
+    pending: list[Future] = []  # in the order of submission, as `finished`
     failed: Exception | None = None
     while True:
         if stop is not None and stop.is_set():
@@ -125,14 +127,17 @@ def completed(
             if workers.waits():
                 break
         more = islice(waiting, max(0, workers.size() - len(pending)))
-        pending |= {workers.submit(function, item) for item in more}
+        pending += [workers.submit(function, item) for item in more]
         if not pending:
             break
         # Not for ever: workers may have joined or left, or `stop` may have been set.
-        finished, pending = wait(pending, COUNT_SECONDS, FIRST_COMPLETED)
-        while finished:  # forgotten at once, or a cluster would compute lost results again
+        done = wait(pending, COUNT_SECONDS, FIRST_COMPLETED).done
+        finished = deque(future for future in pending if future in done)
+        pending = [future for future in pending if future not in done]
+        done.clear()  # forgotten at once, or a cluster would compute lost results again
+        while finished:
             try:
-                result = finished.pop().result()
+                result = finished.popleft().result()
             except Exception as error:  # whatever it is, it is raised in the end
                 failed, waiting = failed or error, iter(())
                 continue
@@ -270,7 +275,7 @@ class _Cluster(Workers):
                     f"the worker {worker} has {count} threads, but a process computes one call at "
                     "a time; start it with --nthreads 1"
                 )
-        for name in self._names - set(threads):
+        for name in sorted(self._names - set(threads)):
             _say(f"the worker {name} has left; what it was computing is computed again")
         self._names, self._counted = set(threads), now
         if self._names:

@@ -299,7 +299,7 @@ def existing_folder(root: str | Path, key: str = "data.root") -> Path:
 def group_files(root: Path, pattern: str) -> dict[str, dict[str, Path]]:
     """Return the files under root whose names match (name)(suffix), as {name: {suffix: path}}."""
     groups: dict[str, dict[str, Path]] = {}
-    for path in root.rglob("*"):
+    for path in sorted(root.rglob("*")):
         fit = re.fullmatch(pattern, path.name)
         if fit is None:
             continue
