@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -34,6 +35,7 @@ from envs.simulators import make_cell
 from tests.helpers.simulators import pybullet
 from utils.config import load_config
 from utils.errors import UserError
+from utils.executor import LostWorkerError
 from utils.grasp_data import SimulatedDataset, read_trials, shard_path
 from utils.grasp_labels import Trial
 from utils.transforms import look_at
@@ -127,7 +129,11 @@ def test_a_root_of_other_settings_or_of_something_else_is_left_alone(tiny_data, 
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_sets_that_cannot_be_parted_are_said_before_any_worker_starts(tmp_path):
+def test_sets_that_cannot_be_parted_are_said_before_any_worker_starts(tmp_path, monkeypatch):
+    def opened(*_):
+        raise AssertionError("a worker was started")
+
+    monkeypatch.setattr(data_generation, "open_executor", opened)
     with pytest.raises(UserError, match="box holds 1 object"):
         generate(load_config(None, [f"data.root={tmp_path / 'a'}", "data.object_sets=box"]))
     (tmp_path / "meshes").mkdir()
@@ -174,13 +180,67 @@ def test_every_shard_has_one_owner_whatever_is_there_already(tmp_path):
     assert [missing_shards(config, tmp_path, rank, 3) for rank in range(3)] == [[], *shares[1:]]
 
 
+class OneThread(ThreadPoolExecutor):
+    """In place of a process, which would not know of replaced functions."""
+
+    def __init__(self, *_):
+        super().__init__(1)
+
+    def size(self):
+        return 1
+
+
+def few_shards(monkeypatch, make_shard, root, frames=96):
+    """A config whose shards, three of training and one of validation, are made by `make_shard`."""
+    monkeypatch.setattr(data_generation, "open_executor", OneThread)
+    monkeypatch.setattr(data_generation, "_make_shard", make_shard)
+    return load_config(None, [f"data.root={root}", f"data.frames={frames}",
+                              "data.validation_frames=32", "data.object_sets=primitives",
+                              "data.workers=1"])  # fmt: skip
+
+
+def touch_shard(config, folder, shard):
+    path = shard_path(folder, *shard)
+    path.parent.mkdir(exist_ok=True)
+    path.touch(exist_ok=False)
+    return 32
+
+
+def test_what_is_kept_after_ctrl_c_is_said_and_not_made_again(tmp_path, monkeypatch, capsys):
+    def interrupted(config, folder, shard):
+        if shard == ("train", 2):
+            raise KeyboardInterrupt
+        return touch_shard(config, folder, shard)
+
+    root = tmp_path / "data"
+    config = few_shards(monkeypatch, interrupted, root)
+    with pytest.raises(KeyboardInterrupt):
+        generate(config)
+    said = f"64 of 128 frames are kept in {root}; the same command goes on from there"
+    assert said in capsys.readouterr().out
+    monkeypatch.setattr(data_generation, "_make_shard", touch_shard)
+    assert generate(config) == root and missing_shards(config, root, 0, 1) == []
+
+
+def test_what_is_kept_after_lost_workers_is_said(tmp_path, monkeypatch):
+    def lost(config, folder, shard):
+        raise LostWorkerError("4 worker processes in a row died")
+
+    root = tmp_path / "data"
+    kept = f"died; the finished shards are safe in {root}: start again, perhaps with data.workers=1"
+    with pytest.raises(UserError, match=re.escape(kept)):
+        generate(few_shards(monkeypatch, lost, root))
+
+
+def test_shards_that_were_written_on_another_machine_are_missed(tmp_path, monkeypatch):
+    config = few_shards(monkeypatch, lambda *_: 32, tmp_path / "data")
+    with pytest.raises(UserError, match="shards that are not here; on a cluster it must be in a "):
+        generate(config)
+
+
 def test_after_an_error_in_a_worker_no_shard_is_begun(tmp_path, monkeypatch):
     """Of more than 30, which one worker makes one after the other."""
     begun = []
-
-    class OneThread(ThreadPoolExecutor):
-        def size(self):
-            return 1
 
     def make_shard(config, folder, shard):
         begun.append(shard)
@@ -188,11 +248,7 @@ def test_after_an_error_in_a_worker_no_shard_is_begun(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "no space")
         return 32
 
-    # A thread in place of the process, which would not know of the replaced functions.
-    monkeypatch.setattr(data_generation, "open_executor", lambda *_: OneThread(1))
-    monkeypatch.setattr(data_generation, "_make_shard", make_shard)
-    config = load_config(None, [f"data.root={tmp_path / 'data'}", "data.frames=960",
-                                "data.object_sets=primitives", "data.workers=1"])  # fmt: skip
+    config = few_shards(monkeypatch, make_shard, tmp_path / "data", frames=960)
     with pytest.raises(OSError, match="no space"):
         generate(config)
     assert begun == [("train", 0), ("train", 1)]

@@ -1,12 +1,16 @@
 """The plan of an evaluation, and playing it."""
 
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.helpers.played_here import CallingExecutor
 from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG, ROUNDS
+from utils import evaluation, executor
 from utils.config import changed_keys, load_config
 from utils.errors import UserError
 from utils.evaluation import (
@@ -16,6 +20,7 @@ from utils.evaluation import (
     check_rounds,
     depth_noises_of,
     describe_workers,
+    going_on,
     in_order,
     interruption,
     planned_rounds,
@@ -194,6 +199,27 @@ def test_a_scene_that_cannot_be_made_ends_the_run_but_not_the_results(tmp_path):
     outcome = play(one_worker(), tmp_path, no_second_scene)
     assert "second scene" in str(outcome.error)
     assert outcome.rounds == [ROUNDS[0], ROUNDS[2]] == read_rounds(tmp_path / "rounds.jsonl")
+
+
+def dies_of_the_second_scene(config, task):
+    if task.seed == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return known_round(config, task)
+
+
+def test_a_scene_that_no_process_survives_leaves_the_rounds_so_far(tmp_path, monkeypatch):
+    """Which the next part of the run does not play again."""
+    monkeypatch.setattr(executor, "MOST_LOSSES", 1)  # of 4: each starts a process
+    outcome = play(one_worker(), tmp_path, dies_of_the_second_scene)
+    journal = tmp_path / "rounds.jsonl"
+    error = str(outcome.error)
+    assert error.startswith("1 worker processes in a row died of the same task")
+    assert f"; 2 rounds are safe in {journal}: go on with {going_on(tmp_path)}, perhaps" in error
+    assert f"evaluate.py --resume {tmp_path}, perhaps with evaluate.workers=1" in error
+    assert outcome.rounds == [ROUNDS[0], ROUNDS[2]] == read_rounds(journal)
+    monkeypatch.setattr(evaluation, "open_executor", CallingExecutor)
+    again = play(one_worker(), tmp_path, known_round)
+    assert again.error is None and again.rounds == ROUNDS and len(read_rounds(journal)) == 4
 
 
 def test_a_sample_is_played_again():

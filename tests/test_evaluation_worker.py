@@ -3,9 +3,9 @@
 import pytest
 
 from envs.cell import camera_intrinsics
-from envs.evaluation_worker import check_everything, film_name, work
+from envs.evaluation_worker import check_everything, film_name, privileged_policies, work
 from envs.views import check_sees_workspace
-from utils.config import Config, with_settings
+from utils.config import Config, load_config, with_settings
 from utils.errors import UserError
 from utils.evaluation import Task
 
@@ -36,6 +36,12 @@ def test_a_film_of_long_paths_has_a_name_of_its_own():
         names.add(film_name(task, policy, "none", "mp4"))
     assert len(names) == 3 and max(len(name.encode()) for name in names) < 200
     assert all(name.startswith("pile-mmm") and name.endswith(".mp4") for name in names)
+
+
+def test_oracles_alone_see_the_true_scene():
+    names = "random,heuristic,graspnet,oracle,oracle6d"
+    config = load_config(None, [f"evaluate.policies={names}"])
+    assert privileged_policies(config) == {"oracle", "oracle6d"}
 
 
 def test_a_planner_that_cannot_tell_objects_apart_does_not_retrieve(config):

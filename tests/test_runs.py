@@ -213,6 +213,15 @@ def test_a_run_that_another_commit_began_goes_on_with_a_remark(tmp_path):
         check_resume(CONFIG, run, [])
 
 
+def test_a_run_that_other_uncommitted_changes_began_goes_on_with_a_remark(tmp_path):
+    run = new_run_folder("evaluate", None, CONFIG, tmp_path)
+    facts = json.loads((run / "environment.json").read_text())
+    write_json_atomic(run / "environment.json", facts | {"changes": 64 * "a"})
+    remark = "it was begun with other changes to the code since the last commit; where the two"
+    with pytest.warns(UserWarning, match=remark):
+        check_resume(CONFIG, run, [])
+
+
 def test_a_run_goes_on_with_a_remark_where_what_it_names_has_changed(tmp_path, monkeypatch):
     """The weights of a policy, and the module of a plug-in; a package."""
     monkeypatch.chdir(tmp_path)
