@@ -1,5 +1,8 @@
 """The config: defaults, merging, and one clear sentence for every mistake."""
 
+import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -21,6 +24,7 @@ from utils.config import (
 )
 from utils.errors import unknown_choice
 from utils.plugins import code_named_in
+from utils.runs import REPOSITORY
 
 
 def write(folder: Path, text: str, name: str = "mine.yaml") -> Path:
@@ -329,3 +333,15 @@ def test_a_file_of_data_does_not_say_where_to_compute_and_to_write():
     config = load_foreign(stored, "FILE", ["evaluate.rounds=3"])
     assert (config.seed, config.evaluate.rounds) == (7, 3)
     assert (config.cache_dir, config.compute.scheduler) == (None, None)
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_the_quick_chain_scores_the_network_that_it_has_trained():
+    done = subprocess.run(
+        ["make", "-n", "quick"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    (trained,) = re.findall(
+        r"train_graspnet\.py --config configs/quick\.yaml --weights (\S+)", done.stdout
+    )
+    assert "evaluate.py --config configs/quick.yaml\n" in done.stdout
+    assert trained in load_config(REPOSITORY / "configs" / "quick.yaml").evaluate.policies

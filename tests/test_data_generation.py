@@ -378,7 +378,9 @@ def test_physics_of_labels(tiny_data, cell_with_scene):
     for number, solid in enumerate(cell.truth().objects):
         assert solid.friction == first.placements[number].model.friction
         if pybullet is not None:
-            simulated = pybullet.getDynamicsInfo(cell.bodies[number], -1, cell.client)
+            simulated = pybullet.getDynamicsInfo(
+                cell.bodies[number], -1, physicsClientId=cell.client
+            )
             assert simulated[1] == solid.friction
             assert simulated[0] == pytest.approx(first.placements[number].model.mass)
 

@@ -9,16 +9,25 @@ from __future__ import annotations
 
 import ast
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import grimp
 import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
 from envs.simulators import SIMULATORS
+from utils.runs import REPOSITORY
 
-ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl")
+SOURCES = sorted(
+    file for folder in (".", "envs", "models", "utils", "benchmarks")
+    for file in (REPOSITORY / folder).glob("*.py")
+)  # fmt: skip
+# What opens a client or asks whether there is one, and functions of numbers alone.
+WITHOUT_A_CLIENT = {
+    "connect", "isConnected", "multiplyTransforms", "invertTransform", "getMatrixFromQuaternion",
+    "getQuaternionFromEuler", "getEulerFromQuaternion", "computeViewMatrix",
+    "computeProjectionMatrixFOV",
+}  # fmt: skip
 # `python -m` of the first starts the demonstration in the second, below `__name__ == "__main__"`;
 # nothing is imported so when the first is imported.
 DEMONSTRATIONS = {
@@ -37,7 +46,7 @@ def imports() -> dict[str, set[str]]:
 
 
 def test_contracts_of_import_linter_are_kept(capsys, monkeypatch):
-    monkeypatch.chdir(ROOT)
+    monkeypatch.chdir(REPOSITORY)
     status = lint_imports(config_filename="pyproject.toml", no_cache=True, no_logo=True)
     assert status == EXIT_STATUS_SUCCESS, capsys.readouterr().out
 
@@ -54,6 +63,39 @@ def test_only_a_simulators_own_modules_import_it(imports):
     assert not [(name, one) for name, one in importers if not one.startswith(f"envs.{name}_")]
 
 
+@pytest.mark.parametrize(
+    "file",
+    [path for path in SOURCES if "pybullet" in path.read_text(encoding="utf-8")],
+    ids=lambda path: path.name,
+)
+def test_every_pybullet_call_names_its_client(file):
+    """Without the keyword PyBullet takes the first client of the process, which may be another
+    cell's. A function may be an argument of a call with the keyword. Constants have capitals."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        assert not (isinstance(node, ast.ImportFrom) and node.module == "pybullet"), node.lineno
+        if isinstance(node, ast.Import):
+            assert not any(one.name == "pybullet" and one.asname for one in node.names), node.lineno
+    named = {
+        part
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and any(keyword.arg == "physicsClientId" for keyword in node.keywords)
+        for part in (node.func, *node.args)
+    }
+    without = [
+        f"{file.name}:{node.lineno} {node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "pybullet"
+        and not node.attr.isupper()
+        and node.attr not in WITHOUT_A_CLIENT
+        and node not in named
+    ]
+    assert without == []
+
+
 def test_no_circle_of_imports(imports):
     graph = {
         module: {one for one in imported if (module, one) not in DEMONSTRATIONS}
@@ -67,7 +109,7 @@ def test_no_circle_of_imports(imports):
 
 @pytest.mark.parametrize(("module", "demonstration"), sorted(DEMONSTRATIONS))
 def test_demonstrations_are_imported_by_scripts_alone(module, demonstration):
-    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text())
+    tree = ast.parse((REPOSITORY / f"{module.replace('.', '/')}.py").read_text())
     everywhere = [node for node in ast.walk(tree) if _is_import_of(node, demonstration)]
     main = [node for node in tree.body if isinstance(node, ast.If) and "__main__" in ast.dump(node)]
     inside = [node for block in main for node in ast.walk(block)]
@@ -85,7 +127,7 @@ def _is_import_of(node: ast.AST, module: str) -> bool:
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_no_script_imports_another(script):
-    tree = ast.parse((ROOT / f"{script}.py").read_text())
+    tree = ast.parse((REPOSITORY / f"{script}.py").read_text())
     imported = {
         name.split(".")[0]
         for node in ast.walk(tree)
@@ -101,4 +143,4 @@ def test_no_script_imports_another(script):
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_script_can_be_read_at_a_sitting(script):
     """CONTRIBUTING.md allows it 250 lines."""
-    assert len((ROOT / f"{script}.py").read_text(encoding="utf-8").splitlines()) <= 250
+    assert len((REPOSITORY / f"{script}.py").read_text(encoding="utf-8").splitlines()) <= 250
