@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from envs.env_rewards import (
-    REWARDS,
     GoalView,
     GraspGoals,
     Outline,
@@ -107,24 +106,29 @@ def test_goals_lie_on_the_object_however_it_is_turned():
     assert np.ptp(along) > 0.02
 
 
-def test_what_a_goal_costs_by_hand():
-    """0.3 m for a quality of 0 instead of 1, and 0.3 for each metre that the hand has to close."""
-    goals = brick()
-    expected = 0.3 * (1 - goals.quality) + 0.3 * (0.08 - goals._wide)
-    np.testing.assert_allclose(goals._price, expected)
-
-
-def test_a_goal_off_the_middle_leaves_less_room(monkeypatch):
-    """The hand, 4 cm wide on either side of a pixel, moves 5 mm to the middle of what it grips,
-    2 cm on either side: it may be open from 2 (2 + 0.5) to 2 (4 - 0.5) cm."""
+def judged_everywhere(monkeypatch, quality: float) -> None:
+    """Every grasp alike: the hand, 4 cm wide on either side of a pixel, moves 5 mm to the middle of
+    what it grips, 2 cm on either side."""
 
     def judged(surface, *_):
-        columns = {"quality": 1.0, "middle": 0.005, "reach": 0.02, "widest": 0.04}
+        columns = {"quality": quality, "middle": 0.005, "reach": 0.02, "widest": 0.04}
         return SimpleNamespace(
             **{name: np.full(len(surface), one) for name, one in columns.items()}
         )
 
     monkeypatch.setattr("envs.env_rewards.grasp_quality", judged)
+
+
+def test_what_a_goal_costs_by_hand(monkeypatch):
+    """A quality of 0.729 counts by its cube root, 0.9, and a hand of 8 cm has to close by 1 cm:
+    0.1 of the 0.3 m for a quality of 0 instead of 1, and 0.01 of 0.3 for each metre."""
+    judged_everywhere(monkeypatch, 0.729)
+    np.testing.assert_allclose(brick()._price, 0.030 + 0.003)
+
+
+def test_a_goal_off_the_middle_leaves_less_room(monkeypatch):
+    """It may be open from 2 (2 + 0.5) to 2 (4 - 0.5) cm."""
+    judged_everywhere(monkeypatch, 1.0)
     goals = brick()
     np.testing.assert_allclose([goals._narrow, goals._wide], [[0.05], [0.07]] * np.ones(len(goals)))
 
@@ -277,7 +281,6 @@ def test_rewards_add_their_terms():
     assert make_reward("dense")(state) == pytest.approx(1.0 + 0.4)
     assert make_reward("sparse")(state) == 1.0
     assert make_reward("dense")(state_of()) == make_reward("sparse")(state_of()) == 0.0
-    assert set(REWARDS) == {"dense", "sparse"}
 
 
 def test_a_reward_by_import_path(tmp_path, monkeypatch):

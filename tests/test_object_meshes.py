@@ -1,10 +1,17 @@
 """Meshes: what is read and refused, and a cache of convex parts that can be trusted."""
 
+import importlib.metadata
+import importlib.util
+import re
+import sys
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
-from envs import object_meshes
+from envs import object_meshes, object_parts
 from envs.object_meshes import ObjectError, checked_mesh, decompose, load_mesh, parse_xml
 from tests.helpers.meshes import l_shape
 
@@ -25,13 +32,37 @@ def test_decomposition_runs_once_for_a_shape_whatever_its_units(tmp_path, monkey
     assert second.solid.inertia == pytest.approx(1e15 * first.solid.inertia)
 
 
-def test_a_changed_constant_is_another_file_of_the_cache(tmp_path, monkeypatch):
+def names_after(monkeypatch, change=None) -> list[str]:
+    """Of the cache's files for a cube, by a module that is loaded after a change."""
+    if change is not None:
+        monkeypatch.setattr(*change)
+    spec = importlib.util.spec_from_file_location("loaded_again", object_meshes.__file__)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "loaded_again", module)
+    spec.loader.exec_module(module)
+    with tempfile.TemporaryDirectory() as folder:
+        module.decompose(trimesh.creation.box(), Path(folder))
+        return [file.name for file in Path(folder).iterdir()]
+
+
+CONSTANTS = re.findall(r"^([A-Z_]+) = [\d.]", Path(object_parts.__file__).read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_a_changed_constant_is_another_file_of_the_cache(name, tmp_path, monkeypatch):
     decompose(trimesh.creation.box(), tmp_path)
-    decompose(trimesh.creation.box(), tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(object_meshes, "_SETTINGS", (*object_meshes._SETTINGS, 1))
-    decompose(trimesh.creation.box(), tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    before = [file.name for file in tmp_path.iterdir()]
+    assert len(before) == 1 and names_after(monkeypatch) == before
+    change = object_parts, name, getattr(object_parts, name) * 1.001
+    assert names_after(monkeypatch, change) != before
+
+
+@pytest.mark.parametrize("package", ["manifold3d", "scipy", "trimesh"])
+def test_another_version_of_what_cuts_is_another_file_of_the_cache(package, monkeypatch):
+    other = {package: "0.0"}
+    installed = importlib.metadata.version
+    change = importlib.metadata, "version", lambda name: other.get(name) or installed(name)
+    assert names_after(monkeypatch) != names_after(monkeypatch, change)
 
 
 def test_a_corrupt_cache_file_is_named(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from models.grasp_policy import GraspPolicyNetwork, GraspPPO
 from models.graspnet import GraspLoss, create_model
 from utils.adaptation import DomainAdaptationNetwork, train_domain_adaptation
 from utils.domain_randomization import DomainRandomizer, TextureRandomizer
+from utils.runs import REPOSITORY
 from utils.visual_servo import (
     HybridVisualServo,
     ImageBasedVisualServo,
@@ -24,7 +24,7 @@ CAMERA = {"intrinsics": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])}
 SEEN = [(300, 200), (340, 200), (340, 260), (300, 260)]
 WANTED = [(310, 210), (350, 210), (350, 270), (310, 270)]
 DEPTH = np.full((480, 640), 0.5)
-TABLE = Path(__file__).resolve().parent.parent / "docs" / "tutorial_names.md"
+TABLE = REPOSITORY / "docs" / "tutorial_names.md"
 
 
 def test_the_graspnet_listing_runs_as_printed():
@@ -52,9 +52,16 @@ def test_the_servo_listings_run_with_depths_and_poses():
 
 
 def test_the_policy_and_the_adaptation_network_are_made_as_printed():
-    GraspPolicyNetwork(image_feature_dim=512, state_dim=14, action_dim=7, hidden_dim=256)
-    DomainAdaptationNetwork(feature_dim=256)
-    TextureRandomizer()
+    policy = GraspPolicyNetwork(image_feature_dim=512, state_dim=14, action_dim=7, hidden_dim=256)
+    image, state = torch.rand(2, 4, 32, 32), torch.rand(2, 14)
+    assert policy(image, state).mean.shape == (2, 7)
+    assert policy.features(image, state).shape == (2, 512 + 14)
+    assert policy.value(image, state, torch.rand(2, 0)).shape == (2,)
+    adapted = DomainAdaptationNetwork(feature_dim=256)(torch.rand(2, 3, 28, 28))
+    assert [part.shape for part in adapted] == [(2, 10), (2,), (2, 256)]
+    textures = TextureRandomizer()
+    texture = textures.make(textures.draw(np.random.default_rng(0)))
+    assert texture.factor(np.zeros((5, 3))).shape == (5, 3)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +106,26 @@ def test_a_call_that_cannot_be_accepted_ends_with_one_sentence(call, message):
 
 
 def test_the_table_names_only_what_is_there():
-    """Dotted names of modules in the table's second column can be found."""
-    for module, name in re.findall(r"`((?:models|utils|envs)\.\w+)\.(\w+)", TABLE.read_text()):
+    """Dotted names of modules in the table's second column can be found, and what is called there,
+    or in the first column of a row that says "same", is defined in one of the modules."""
+    text = TABLE.read_text(encoding="utf-8")
+    dotted = re.findall(r"`((?:models|utils|envs)\.\w+)\.(\w+)", text)
+    assert len(dotted) == 2
+    for module, name in dotted:
         assert hasattr(__import__(module, fromlist=[name]), name), f"{module}.{name}"
+    called = set()
+    for row in re.findall(r"^\| (.*) \|$", text, re.MULTILINE):
+        tutorial, here, *_ = row.split(" | ")
+        told = tutorial + here if here.startswith("same") else here
+        for code in re.findall(r"`([^`]+)`", told):
+            called |= set(re.findall(r"(\w+)\(", code))
+    called -= {"model", "policy"}  # variables of the table
+    defined = {
+        name
+        for folder in ("envs", "models", "utils")
+        for file in (REPOSITORY / folder).glob("*.py")
+        for name in re.findall(
+            r"^ *(?:class|def) (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE
+        )
+    }
+    assert len(called) > 20 and called - defined == set()
