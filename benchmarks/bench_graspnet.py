@@ -39,7 +39,7 @@ from utils.augmentation import LabelledImage
 from utils.config import load_config
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import GraspLabels, dense_labels
-from utils.runs import run_script
+from utils.runs import REPOSITORY, run_script
 from utils.transforms import RGBDFrame
 
 LABELLED = 120  # scenes of test objects, both sets and all layouts in turn
@@ -235,8 +235,7 @@ def memory_metrics(backbone: str) -> list[Metric]:
     if not Path("/proc/self/status").exists():
         return []
     arguments = [sys.executable, "-m", "benchmarks.bench_graspnet", MEMORY_RUN, backbone]
-    root = Path(__file__).resolve().parent.parent
-    done = subprocess.run(arguments, cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run(arguments, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     imports, peak = map(float, done.stdout.split()[-2:])
     return [
         Metric("peak_memory_mib", peak, "MiB"),

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from utils.config import load_config
+from utils.runs import REPOSITORY
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 SEALED = REPOSITORY / "configs" / "sealed.yaml"  # what is kept for the tables
 SEED = load_config(SEALED).seed
 SPLIT = load_config(SEALED).objects.split

@@ -40,7 +40,6 @@ from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import (
     NOWHERE,
     PARTS,
-    REPOSITORY,
     SEED,
     SOURCES,
     TRIAL_SEED,
@@ -56,7 +55,7 @@ from utils.errors import UserError
 from utils.evaluation import in_order
 from utils.result_records import RoundRecord, read_rounds, write_sample
 from utils.results import compare, stated_chances
-from utils.runs import environment, run_script
+from utils.runs import REPOSITORY, environment, run_script
 
 FIGURES = Path("docs/results")  # what the tables are written from
 RUNS = Path("runs/results")

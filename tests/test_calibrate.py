@@ -8,7 +8,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 from fnmatch import fnmatch
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +19,8 @@ from utils.config import dump_config, load_config
 from utils.errors import UserError
 from utils.result_records import AttemptRecord, RoundRecord, append_round, read_rounds
 from utils.results import stated_chances, summarise
+from utils.runs import REPOSITORY
 from utils.transforms import ImageGrasp
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def played(
@@ -171,7 +169,7 @@ def test_what_the_critic_judges_has_no_penalty(tmp_path) -> None:
 
 CONFIGS = {
     config.evaluate.name: config
-    for config in map(load_config, sorted(ROOT.glob("configs/calibration*")))
+    for config in map(load_config, sorted(REPOSITORY.glob("configs/calibration*")))
 }
 
 
@@ -190,17 +188,17 @@ def test_the_shipped_fits_are_of_the_runs_that_the_configs_play() -> None:
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 def test_one_command_plays_every_config_and_fits_to_all_their_runs() -> None:
     done = subprocess.run(
-        ["make", "-n", "calibration"], cwd=ROOT, capture_output=True, text=True, check=True
+        ["make", "-n", "calibration"], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     played = re.findall(r"evaluate.py --config (\S+)", done.stdout)
-    assert {load_config(ROOT / file).evaluate.name for file in played} == {*CONFIGS}
+    assert {load_config(REPOSITORY / file).evaluate.name for file in played} == {*CONFIGS}
     fitted = done.stdout.split("benchmarks.calibrate")[1]
     assert set(re.findall(r"runs/evaluate/\S+\]-([\w-]+)", fitted)) == {*CONFIGS}
-    assert f"--output {CALIBRATIONS.relative_to(ROOT)}" in fitted
+    assert f"--output {CALIBRATIONS.relative_to(REPOSITORY)}" in fitted
 
 
 def test_make_calibration_takes_its_own_runs_alone():
-    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    text = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
     (stamp,) = re.findall(r"^STAMP := (.*)$", text, re.MULTILINE)
     assert text.count("runs/evaluate/$(STAMP)-calibration") == 3
     own = "20261127-171555-calibration"

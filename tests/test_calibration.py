@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import astuple, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +48,6 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import RoundRecord
 from utils.transforms import Grasp, RGBDFrame
 
-ROOT = Path(__file__).resolve().parent.parent
 CHANCES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
 
 

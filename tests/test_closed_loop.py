@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from envs.servo_arm import ServoArm
 from tests.helpers.box_rounds import grasp_of_box, loop, round_with_a_box
 from tests.helpers.simulators import needs_pybullet
 from utils.config import load_config
+from utils.runs import REPOSITORY
 
 IN_PYBULLET = pytest.mark.parametrize(
     "taught_cell",
@@ -69,7 +69,7 @@ def test_evaluate_scores_closed_loops(tmp_path, monkeypatch, played_here):
         "simulator=mujoco", "sim.renderer=tiny", "evaluate.object_sets=box", "evaluate.rounds=1",
         "evaluate.scenarios=moved", "evaluate.controllers=open_loop,hybrid", "evaluate.workers=1",
     )  # fmt: skip
-    config = Path(__file__).resolve().parents[1] / "configs" / "servo.yaml"
+    config = REPOSITORY / "configs" / "servo.yaml"
     assert evaluate.main(["--config", str(config), "--results", "results.json", *settings]) == 0
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     assert [(row["policy"], row["success_rate"]) for row in rows] == [

@@ -16,10 +16,10 @@ from benchmarks.result_parts import PARTS
 from benchmarks.result_tables import PAGES, with_tables
 from benchmarks.results import FIGURES
 from utils.config import load_config
+from utils.runs import REPOSITORY
 
-ROOT = Path(__file__).resolve().parent.parent
-READMES = (ROOT / "README.md", ROOT / "README.zh-CN.md")
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+READMES = (REPOSITORY / "README.md", REPOSITORY / "README.zh-CN.md")
+DOCUMENTS = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")])
 # Files that a reader brings or a run leaves.
 READERS_OWN = re.compile(
     r"^(runs/|data/|top_object|path/to/|my|color\.png|depth\.png|scene\.png|results\.|report\.html|~|\$|"
@@ -52,7 +52,7 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower().replace("`", "")).replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", [ROOT / page for page in PAGES], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [REPOSITORY / page for page in PAGES], ids=lambda page: page.name)
 def test_every_table_is_measured(page):
     """`with_tables` writes the command of `make results` in place of a table without figures, in
     italics; a sentence begins with a word in bold type."""
@@ -102,10 +102,12 @@ def test_named_files_exist(page):
     for name in sorted((named | bare) - {"models/policy.py"}):  # of the tutorial alone
         if READERS_OWN.match(name):
             continue
-        places = [ROOT / name, page.parent / name]
+        places = [REPOSITORY / name, page.parent / name]
         assert any(place.exists() for place in places), f"{page.name} names {name}"
     for module in set(re.findall(r"python -m ([\w.]+)", text)) - {"pytest", "venv", "pip"}:
-        assert (ROOT / (module.replace(".", "/") + ".py")).exists(), f"{page.name} names {module}"
+        assert (REPOSITORY / (module.replace(".", "/") + ".py")).exists(), (
+            f"{page.name} names {module}"
+        )
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
@@ -123,16 +125,18 @@ def test_overrides_of_commands_are_keys_of_the_config(page):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_tables_are_those_of_the_measured_figures(page):
-    text = text_of(ROOT / page)
-    assert text == with_tables(text, ROOT / FIGURES, "zh" in page), "make results ARGS=--write"
+    text = text_of(REPOSITORY / page)
+    assert text == with_tables(text, REPOSITORY / FIGURES, "zh" in page), (
+        "make results ARGS=--write"
+    )
 
 
 def test_architecture_lists_every_module_once():
-    text = text_of(ROOT / "docs/architecture.md")
+    text = text_of(REPOSITORY / "docs/architecture.md")
     for folder in ("envs", "models", "utils"):
         room = text.split(f"### `{folder}/`")[1].split("\n### ")[0]
         listed = re.findall(r"^\| `(\w+\.py)`", room, re.MULTILINE)
-        there = {path.name for path in (ROOT / folder).glob("*.py")} - {"__init__.py"}
+        there = {path.name for path in (REPOSITORY / folder).glob("*.py")} - {"__init__.py"}
         assert sorted(listed) == sorted(there)
 
 
@@ -142,19 +146,19 @@ def test_architecture_lists_every_module_once():
 )
 def test_recipes_name_files_and_registries_that_exist(page, title):
     """Each recipe: its files, its registry as a name in one of them, and its test."""
-    table = text_of(ROOT / page).split(title)[1].split("\n## ")[0]
+    table = text_of(REPOSITORY / page).split(title)[1].split("\n## ")[0]
     rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
     assert len(rows) >= 10
     for _, file, registry, *test in rows:
         files = re.findall(r"`((?:envs|models|utils|configs)/\w+\.[\w.]+)`", file + registry)
-        files = [text_of(ROOT / name) for name in files if "NAME" not in name]
+        files = [text_of(REPOSITORY / name) for name in files if "NAME" not in name]
         for name in re.findall(r"`([A-Z_]{3,})`", file + registry):
             assert any(re.search(rf"^{name}\b", one, re.MULTILINE) for one in files), name
         for path in re.findall(r"`(tests/\w+\.py)`", "".join(test)):
-            assert (ROOT / path).exists(), path
+            assert (REPOSITORY / path).exists(), path
 
 
 def test_the_policies_that_are_measured_are_those_that_ship() -> None:
     arguments = " ".join(command.arguments for part in PARTS for command in part.commands)
     measured = set(re.findall(r"checkpoints/(ppo_\w+\.pt)", arguments))
-    assert measured == {path.name for path in (ROOT / "checkpoints").glob("ppo_*.pt")}
+    assert measured == {path.name for path in (REPOSITORY / "checkpoints").glob("ppo_*.pt")}

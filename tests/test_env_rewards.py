@@ -19,8 +19,8 @@ from envs.env_rewards import (
     make_reward,
     progress,
 )
+from tests.helpers.box_frames import CORNERS
 from tests.helpers.shapes import cube_corners
-from tests.test_geometry import CORNERS
 from utils.config import ConfigError, changed_keys, load_config, with_settings
 from utils.errors import UserError
 from utils.geometry import ConvexSolid, GripperGeometry, SceneGeometry, SolidObject

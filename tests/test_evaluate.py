@@ -30,10 +30,9 @@ from utils.errors import UserError
 from utils.evaluation import Outcome
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
+from utils.runs import REPOSITORY, this_python
 from utils.runs import run_script as end_like_a_script
-from utils.runs import this_python
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box",
          "evaluate.depth_noises=none"]  # fmt: skip
 

@@ -22,7 +22,7 @@ from models.planner_graspnet import GraspNetFanPlanner
 from models.planner_measure import measure, turn_onto_faces, without_bumps
 from models.planner_runs import dense_candidates
 from tests.helpers.box_frames import boxes_frame, shelf_frame
-from tests.test_planner_measure import across, ridge_on_a_slab
+from tests.helpers.ridges import across, ridge_on_a_slab
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import OTHER_LABEL, WALL_LABEL, HeightMap, tilted_height_map, tilted_view
 from utils.seen_heights import without_holes

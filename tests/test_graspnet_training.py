@@ -18,10 +18,11 @@ from models.graspnet_training import (
 )
 from tests.helpers.compare import same
 from tests.helpers.one_step import joint_batch, part_of, take_steps
-from tests.helpers.torchrun import REPOSITORY, in_two_processes
+from tests.helpers.torchrun import in_two_processes
 from utils.config import load_config
 from utils.distributed import ALONE, Team
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 
 
 def test_warm_up_and_cosine():

@@ -4,13 +4,12 @@ import re
 import subprocess
 import sys
 from importlib.metadata import files
-from pathlib import Path
 
 import pytest
 
 from utils.installation import PACKAGES, problem
+from utils.runs import REPOSITORY
 
-ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = ("evaluate", "predict", "train_graspnet", "train_rl", "envs.studio")
 
 
@@ -24,7 +23,7 @@ def test_an_old_python_and_a_missing_package_are_named():
 
 def test_every_requirement_is_looked_for():
     """But PyBullet, without which MuJoCo suffices."""
-    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    lines = (REPOSITORY / "requirements.txt").read_text().splitlines()
     required = {re.match(r"[\w-]+", line)[0] for line in lines if line and line[0] != "#"}
     unknown = set(PACKAGES)
     for requirement in required - {"pybullet"} | {"imageio-ffmpeg"}:
@@ -37,9 +36,9 @@ def test_every_requirement_is_looked_for():
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_without_packages_a_script_ends_in_one_sentence(script):
     """-S -I: an interpreter that sees the standard library and the script's folder alone."""
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {script}"
+    code = f"import sys; sys.path.insert(0, {str(REPOSITORY)!r}); import {script}"
     done = subprocess.run(
-        [sys.executable, "-S", "-I", "-c", code], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "-S", "-I", "-c", code], capture_output=True, text=True, cwd=REPOSITORY
     )
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2 and done.stdout == ""

@@ -96,6 +96,14 @@ def test_every_pybullet_call_names_its_client(file):
     assert without == []
 
 
+def test_no_module_of_tests_imports_another():
+    """What several need is in tests/helpers/."""
+    graph = grimp.build_graph("tests", cache_dir=None)
+    modules = {module for module in graph.modules if module.startswith("tests.test_")}
+    assert len(modules) > 100
+    assert not [one for one in modules if graph.find_modules_that_directly_import(one)]
+
+
 def test_no_circle_of_imports(imports):
     graph = {
         module: {one for one in imported if (module, one) not in DEMONSTRATIONS}

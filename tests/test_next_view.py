@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.helpers.box_frames import boxes_frame
-from tests.test_seen_heights import BOX, from_side, seen_from
+from tests.helpers.box_frames import BOX, boxes_frame, from_side, seen_from
 from utils.geometry import Workspace
 from utils.height_map import height_map_from_frame
 from utils.next_view import OpenSpace, dome

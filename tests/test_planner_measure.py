@@ -11,17 +11,17 @@ from scipy.ndimage import gaussian_filter
 
 from models.fan_views import fan_views
 from models.planner_antipodal import search, search_once
-from models.planner_candidates import Candidates, SearchSettings
-from models.planner_measure import measure, without_bumps
+from models.planner_candidates import SearchSettings
+from models.planner_measure import without_bumps
 from models.planners import make_planner
 from tests.helpers.box_frames import boxes_frame
+from tests.helpers.ridges import HAND, SLAB, across, ridge_on_a_slab
 from utils.depth import RealSenseNoise
 from utils.depth_correction import corrected
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import Workspace
 from utils.height_map import (
     OTHER_LABEL,
     WALL_LABEL,
-    HeightMap,
     height_map_from_frame,
     height_map_from_scene,
     tilted_height_map,
@@ -30,31 +30,6 @@ from utils.height_map import (
 from utils.seen_heights import without_holes
 from utils.target import only_target
 from utils.transforms import RGBDFrame
-
-HAND = GripperGeometry()
-CELL, SLAB = 0.002, 0.05  # m, of the map and from the table to the slab's top
-
-
-def ridge_on_a_slab(rise: float, noise: float, label: int) -> HeightMap:
-    """A ridge 2 cm wide along y, of object 0, in the middle of a slab with this label on the right;
-    on the left it is a part of the object."""
-    height, labels = np.full((101, 101), SLAB), np.zeros((101, 101), int)
-    height[20:81, 45:56] += rise
-    labels[:, 56:] = label
-    centres = np.array([[0.0, 0.0, SLAB]])
-    origin = np.array([-0.1, -0.1])
-    return HeightMap(height, height, labels, centres, origin, CELL, 0.0, noise=noise)
-
-
-def across(heights: HeightMap, depth: float) -> Candidates:
-    """The measured grasp across the ridge, its fingertips this far below the ridge's top."""
-    one = Candidates.rough(
-        np.zeros((1, 2)), np.zeros(1), np.array([heights.height.max() - depth]),
-        np.full(1, 0.03), np.ones(1),
-    )  # fmt: skip
-    found = measure(one, heights, HAND, SearchSettings().relaxed())
-    assert found.width[0] == pytest.approx(0.022, abs=1e-6)  # eleven cells
-    return found
 
 
 @given(st.floats(0.007, 0.03), st.floats(0.0001, 0.006), st.floats(0.3, 0.9))

@@ -15,10 +15,10 @@ from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_labels import dense_labels
+from utils.runs import REPOSITORY
 from utils.transforms import Grasp, RGBDFrame, angle_difference
 
 HAND = GripperGeometry()
-ROOT = Path(__file__).resolve().parent.parent
 DELIBERATE = ("heuristic", "oracle")
 
 
@@ -275,7 +275,7 @@ def printed_without_a_simulator(code: str, folder: Path) -> str:
     check = f"{code}\nassert not {{'pybullet', 'mujoco', 'envs'}} & set(sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", check], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -302,7 +302,7 @@ def test_planners_run_on_a_bare_frame_without_a_simulator(tmp_path) -> None:
 
 def test_the_planner_of_the_docs_runs_without_a_simulator(tmp_path, monkeypatch) -> None:
     """Its box is 4 cm wide along the image's rows, which run along the world's x axis."""
-    text = (ROOT / "docs" / "planner.md").read_text(encoding="utf-8")
+    text = (REPOSITORY / "docs" / "planner.md").read_text(encoding="utf-8")
     code = text.split("```python\n")[1].split("```")[0]
     (tmp_path / "top_object.py").write_text(code, encoding="utf-8")
     check = "import runpy, sys; runpy.run_path('top_object.py', run_name='__main__')"

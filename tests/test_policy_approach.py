@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
@@ -22,8 +20,9 @@ from models.grasp_policy import load_policy
 from tests.helpers.simulators import move, needs_pybullet
 from utils.config import load_config
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 
-CHECKPOINTS = Path(__file__).resolve().parent.parent / "checkpoints"
+CHECKPOINTS = REPOSITORY / "checkpoints"
 ANYWHERE = ["sim.renderer=tiny", "simulator=auto", "scene.simulator=auto"]  # not as it was trained
 
 

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from models.rectangle_folds import object_folds
+from tests.helpers.real_images import CORNELL
 from utils.errors import UserError
 from utils.real_data import (
     CornellDataset,
@@ -15,7 +16,6 @@ from utils.real_data import (
     open_real_data,
 )
 
-CORNELL = Path(__file__).parents[2] / "shared" / "data" / "cornell"
 SQUARE = "10 5\n30 5\n30 15 \n10 15\n"  # opening 20, plates 10, centre (20, 10)
 WITH_NAN = "NaN NaN\n30 5\n30 15\nNaN NaN\n"
 JACQUARD_ID = "3_abc0f2"

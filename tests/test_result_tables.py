@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks import results
 from benchmarks.looks import add_look, begin_look
-from benchmarks.result_parts import PARTS, REPOSITORY, SEALED, SEED, SPLIT, Part
+from benchmarks.result_parts import PARTS, SEALED, SEED, SPLIT, Part
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
 from benchmarks.table_cells import cleared, rate, success
@@ -22,6 +22,7 @@ from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError
 from utils.result_records import append_round, read_sample
+from utils.runs import REPOSITORY
 from utils.statistics import wilson_interval
 
 # Tests that look at names and numbers of the sealed objects, and play nothing.

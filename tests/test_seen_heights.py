@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.planners import make_planner
-from tests.helpers.box_frames import boxes_frame
+from tests.helpers.box_frames import BOX, boxes_frame, from_side, seen_from
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -19,21 +19,6 @@ from utils.height_map import (
 )
 from utils.seen_heights import hides, sees_through, with_surroundings, without_holes
 from utils.transforms import RGBDFrame, look_at, project
-
-BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))
-MIDDLE = np.array([0.5, 0.0, 0.0])
-
-
-def from_side(azimuth: float, tilt: float = 45.0, distance: float = 0.6) -> np.ndarray:
-    """T_WC of a camera that looks at the workspace's middle; degrees and metres."""
-    turn, lean = np.deg2rad(azimuth), np.deg2rad(tilt)
-    out = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
-    return look_at(MIDDLE + distance * out, MIDDLE)
-
-
-def seen_from(*azimuths: float, boxes=(BOX,)) -> RGBDFrame:
-    first, *others = (boxes_frame(list(boxes), T_WC=from_side(turn)) for turn in azimuths)
-    return replace(first, second=others[0]) if others else first
 
 
 def map_along(frame: RGBDFrame, approach: np.ndarray) -> HeightMap:

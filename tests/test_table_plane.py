@@ -13,7 +13,7 @@ from models import photographs
 from models.graspnet_adaptation import DISTINCT
 from models.photographs import K
 from tests.helpers.photographs import BOX, ROBOT, ROBOT_BEFORE, T_WC, photographed
-from tests.test_real_data import CORNELL
+from tests.helpers.real_images import CORNELL
 from utils.depth import KinectNoise
 from utils.errors import UserError
 from utils.real_data import fill_depth_holes

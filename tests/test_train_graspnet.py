@@ -26,11 +26,9 @@ from utils.checkpoint import load_checkpoint
 from utils.errors import UserError
 from utils.grasp_data import shard_path
 from utils.grasp_labels import Trial, label_truth
-from utils.runs import this_python
+from utils.runs import REPOSITORY, this_python
 
 pytestmark = pytest.mark.slow  # all share one training, which takes most of a minute
-
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")

@@ -36,9 +36,7 @@ from utils.checkpoint import load_checkpoint
 from utils.config import load_config
 from utils.distributed import ALONE
 from utils.errors import UserError
-from utils.runs import Stopwatch, this_python
-
-REPOSITORY = Path(__file__).resolve().parent.parent
+from utils.runs import REPOSITORY, Stopwatch, this_python
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,10 +25,10 @@ from utils.config import Config, TransferPolicy, load_config
 from utils.errors import UserError
 from utils.evaluation import Outcome, depth_noises_of
 from utils.rectangles import GraspRectangle
+from utils.runs import REPOSITORY
 from utils.statistics import clustered_interval
 from utils.transfer import Score, pairs_of
 
-REPOSITORY = Path(__file__).resolve().parent.parent
 REPORT = REPOSITORY / "configs" / "sim_to_real.yaml"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 
 from tests.helpers.servo_cases import CORNERS, LAWS
 from utils.errors import UserError
+from utils.runs import REPOSITORY
 from utils.servo_features import interaction_matrix, rotation_interaction
 from utils.servo_reference import (
     CAMERA,
@@ -329,7 +329,7 @@ def test_every_servo_error_is_a_user_error():
 
 def test_the_example_of_the_docs_runs_as_printed(tmp_path, monkeypatch, capsys):
     """docs/servo.md compares gains; its table holds what the example prints."""
-    page = (Path(__file__).resolve().parents[1] / "docs" / "servo.md").read_text(encoding="utf-8")
+    page = (REPOSITORY / "docs" / "servo.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), {})
     assert (tmp_path / "gains.png").stat().st_size > 20_000

@@ -12,6 +12,8 @@ from utils.transforms import RGBDFrame, look_at, pose_matrix
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 K = np.array([[390.6, 0, 111.5], [0, 390.6, 111.5], [0, 0, 1.0]])  # 224 px, 32 degrees
 T_WC = look_at((0.5, 0, 0.8), (0.5, 0, 0), up=(1, 0, 0))
+BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))  # size, yaw, place as of `boxes_frame`
+MIDDLE = np.array([0.5, 0.0, 0.0])  # of the workspace, in W
 
 
 def yaw_pose(x: float, y: float, z: float, yaw: float) -> np.ndarray:
@@ -69,3 +71,16 @@ def bin_walls(half: float = 0.15, height: float = 0.10, thick: float = 0.01) -> 
     return [((thick, long, height), 0.0, (0.5 + side * off, 0.0)) for side in (-1, 1)] + [
         ((long, thick, height), 0.0, (0.5, side * off)) for side in (-1, 1)
     ]
+
+
+def from_side(azimuth: float, tilt: float = 45.0, distance: float = 0.6) -> np.ndarray:
+    """T_WC of a camera that looks at the workspace's middle; degrees and metres."""
+    turn, lean = np.deg2rad(azimuth), np.deg2rad(tilt)
+    out = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
+    return look_at(MIDDLE + distance * out, MIDDLE)
+
+
+def seen_from(*azimuths: float, boxes=(BOX,)) -> RGBDFrame:
+    """Boxes from one or two sides, in degrees; the second frame is the first one's `second`."""
+    first, *others = (boxes_frame(list(boxes), T_WC=from_side(turn)) for turn in azimuths)
+    return replace(first, second=others[0]) if others else first

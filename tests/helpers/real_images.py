@@ -9,7 +9,9 @@ import numpy as np
 from PIL import Image
 
 from utils.rectangles import GraspRectangle, RealSample, View
+from utils.runs import REPOSITORY
 
+CORNELL = REPOSITORY.parent / "shared" / "data" / "cornell"  # the real images, if they are there
 SHAPE = (120, 160)  # rows, columns
 VIEW = View(side=100, size=50, metres_per_pixel=0.004)
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+from utils.runs import REPOSITORY
 
 
 def in_two_processes(folder: Path, *arguments: object) -> str:
