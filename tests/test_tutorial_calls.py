@@ -32,7 +32,7 @@ def test_the_graspnet_listing_runs_as_printed():
     x = torch.randn(1, 4, 64, 48)
     quality, angle, width = model(x)
     assert quality.shape == width.shape == (1, 1, 64, 48) and angle.shape == (1, 18, 64, 48)
-    assert 0 < float(width.min()) <= float(width.max()) < 0.15
+    assert 0 < width.min().item() <= width.max().item() < 0.15
     assert {"x", "y", "theta", "width"} <= model.predict_grasp(x).keys()
     assert GraspLoss(angle_weight=1.0, width_weight=0.5).width_weight == 0.5
 

@@ -73,6 +73,15 @@ class GripperConfig(Section):
     opens_fully: bool
     least_held: Annotated[float, Field(ge=0, le=0.02)]
 
+    @model_validator(mode="after")
+    def _opens_wider_than_empty(self) -> GripperConfig:
+        if self.least_held >= self.max_opening:
+            raise ValueError(
+                f"least_held ({self.least_held}) must be smaller than max_opening "
+                f"({self.max_opening}): a hand that is wide open would count as empty"
+            )
+        return self
+
     @property
     def geometry(self) -> GripperGeometry:
         """The hand: the shapes of its fingers and palm are the Panda's, the rest is its own."""
@@ -284,6 +293,8 @@ class DataConfig(Section):
     def _fold_exists(self) -> DataConfig:
         if self.fold is not None and self.fold >= self.folds:
             raise ValueError(f"fold {self.fold} is not below folds ({self.folds})")
+        if self.fold is not None and self.kind == "simulated":
+            raise ValueError("fold is one of photographs, and kind is simulated; set fold to null")
         return self
 
 
