@@ -75,7 +75,7 @@ def tilt(cell: Cell, axis: int = 0) -> float:
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG or JPEG; default: {OUTPUT}"
         )
 
     summary = "Grip a bar off its centre in both simulators."

@@ -39,7 +39,7 @@ _TABLE = 0.015  # m from the median height, within which a pixel shows the table
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG or JPEG; default: {OUTPUT}"
         )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)

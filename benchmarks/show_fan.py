@@ -41,7 +41,7 @@ _SHOWN = 0.12  # m of height between black and white
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG or JPEG; default: {OUTPUT}"
         )
         parser.add_argument("--planner", default="graspnet6d", help="one that grasps from any side")
         parser.add_argument("--layout", default="pile", help="of the scenes, a key of scenarios")

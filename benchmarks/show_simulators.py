@@ -31,7 +31,7 @@ _DEEPEST, _HIGHEST = 0.81, 0.70  # m, black and white in the picture of depth
 def main(argv: Sequence[str] | None = None) -> None:
     def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
-            "--output", type=picture_path, default=OUTPUT, help=f"PNG file; default: {OUTPUT}"
+            "--output", type=picture_path, default=OUTPUT, help=f"PNG or JPEG; default: {OUTPUT}"
         )
         parser.add_argument("--objects", default="random_urdfs", help="a named set or a folder")
         parser.add_argument("--layout", default="pile", choices=LAYOUTS)

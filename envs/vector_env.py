@@ -16,7 +16,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -28,7 +28,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from tqdm import tqdm
 
-from envs.objects import load_object_set
+from envs.evaluation_worker import load_objects
 from utils.config import YAML_ERRORS, Config, load_yaml
 from utils.errors import UserError, one_line
 from utils.runs import REPOSITORY
@@ -68,10 +68,7 @@ def make_objects(config: Config) -> None:
     """Make all objects of a folder, so that a broken one is told of before the training begins, and
     not at the reset that happens to draw it. Raises UserError."""
     if config.rl.env_id in OWN_ENVS and Path(config.env.objects).is_dir():
-        objects = load_object_set(
-            config.env.objects, max_opening=config.gripper.max_opening,
-            cache_dir=config.cache_folder, **config.objects.model_dump(),
-        )  # fmt: skip
+        objects = load_objects(config.env.objects, config)
         for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
             objects[index]
 
@@ -153,12 +150,8 @@ class TrainingEnvs:
     def _reset_options(self, options: dict[str, Any]) -> Iterator[None]:
         """Resets of this project's environments get these options; others do not know them."""
         self._set("reset_options", options if self._id in OWN_ENVS else {})
-        try:
-            yield
-        except Exception:
-            with suppress(Exception):  # its workers may be gone
-                self._set("reset_options", {})
-            raise
+        yield
+        # Not after an error: `training_envs` ends environments in which one was raised.
         self._set("reset_options", {})
 
     def _set(self, name: str, value: Any) -> None:
