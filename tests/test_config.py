@@ -141,6 +141,7 @@ def test_override_values(text, expected):
         ("camera.position=[0,a,1]", ["camera.position[1]", "got 'a'", "a list of 3 numbers"]),
         ("camera.mount=overhed", ["one of overhead, wrist", "did you mean overhead?"]),
         ("camera.near=5", ["camera: near (5.0) must be smaller than far (2.0)", "command line"]),
+        ("camera={view: side, mount: wrist}", ["camera: view=side places the overhead camera"]),
         ("data.fold=0", ["data: fold is one of photographs, and kind is simulated"]),
         ("gripper={max_opening: 0.02, least_held: 0.02}", ["least_held (0.02) must be smaller"]),
         ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),

@@ -288,11 +288,12 @@ def test_what_needs_the_arm_is_refused(cell, box_set):
         execute_grasp(cell, cube_grasp())
     with pytest.raises(UserError, match=r"robot\.arm=none: RobotGraspingEnv needs"):
         RobotGraspingEnv(config=config_of(INSTALLED[0]))
-    for override, what in (
-        ("camera.mount=wrist", "camera.mount=wrist"), ("evaluate.randomise=true", "randomise"),
-    ):  # fmt: skip
+    for overrides, what in (
+        (["camera.view=fixed", "camera.mount=wrist"], r"camera\.mount=wrist needs"),
+        (["evaluate.randomise=true"], "randomise"),
+    ):
         with pytest.raises(UserError, match=what):
-            make_cell(config_of(INSTALLED[0], override))
+            make_cell(config_of(INSTALLED[0], *overrides))
     require_arm(load_config(None), "anything")
 
 

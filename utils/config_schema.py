@@ -117,6 +117,15 @@ class CameraConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _side_view_is_overhead(self) -> CameraConfig:
+        if self.view == "side" and self.mount == "wrist":
+            raise ValueError(
+                "view=side places the overhead camera, but camera.mount=wrist is set; set "
+                "camera.view=fixed or camera.mount=overhead"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _ranges_of_side_views(self) -> CameraConfig:
         for name, least, most in (
             ("side_tilt_deg", 1, 89), ("side_distance", 0.05, 5), ("side_azimuth_deg", -360, 360),
