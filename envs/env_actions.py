@@ -2,9 +2,9 @@
 
 An action changes the commanded pose of the hand a little. `ActionDecoder` decides how much of the
 change the arm may carry out, within joint limits, speeds, workspace and safety, and sends the
-commands. `checked_options` reads the options of `reset`. `near_pose` and `pretraining_state` draw
-where the hand is when an episode does not begin at home; their poses are not yet checked for the
-arm's reach.
+commands. `checked_options` reads the options of `reset`. `near_pose`, `missed_state` and
+`pretraining_state` draw where the hand is when an episode does not begin at home; their poses are
+not yet checked for the arm's reach.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ACTION_ENTRIES = {
     "joint": (*(f"joint {number}" for number in range(1, 8)), "gripper"),
 }
 
-STARTS = ("home", "near", "pretraining")  # of an episode
+STARTS = ("home", "near", "missed", "pretraining")  # of an episode
 
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
@@ -98,7 +98,9 @@ class ActionDecoder:
             if self.reachable:
                 self._servo = servo
         else:
-            self._follow(self._moved_pose(action))
+            self.reachable = self._follow(self._moved_pose(action))
+            if not self.reachable:  # at the wrist's limit the hand can still move
+                self._follow(self._moved_pose(action, turning=False))
         self._robot.drive_arm_to(self._servo.q, self._speed)
         self.opening = self._new_opening(float(action[-1]))
         self._robot.command_gripper(self.opening)
@@ -112,11 +114,13 @@ class ActionDecoder:
         opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
         return min(max(opening, 0.0), self._max_opening)
 
-    def _moved_pose(self, action: np.ndarray) -> np.ndarray:
+    def _moved_pose(self, action: np.ndarray, turning: bool = True) -> np.ndarray:
         """(4, 4) the commanded pose of E moved by an action, within the workspace."""
         settings, T = self._settings, self._T_command.copy()
         move = settings.position_step * action[:3]
-        turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
+        turn = np.zeros(3)
+        if turning:
+            turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if settings.frame == "hand":
             move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
         position = zip((T[:3, 3] + move).tolist(), self.lowest, self.highest)
@@ -125,9 +129,10 @@ class ActionDecoder:
             T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
         return T
 
-    def _follow(self, target: np.ndarray) -> None:
+    def _follow(self, target: np.ndarray) -> bool:
         """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
-        where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
+        where the arm cannot get there, and return whether it can: a compromise would tilt the hand
+        and jam the elbow."""
         goal, share = self._within_speed(self._servo.towards(target))
         for _ in range(_FOLLOW_TRIES):
             wanted = target
@@ -136,13 +141,13 @@ class ActionDecoder:
             servo = ServoStep(goal)
             error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
             if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
-                self.reachable = self._allowed(servo)
-                if self.reachable:
+                allowed = self._allowed(servo)
+                if allowed:
                     self._servo, self._T_command = servo, wanted
-                return
+                return allowed
             goal, slower = self._within_speed(servo.towards(wanted))
             share *= slower
-        self.reachable = False
+        return False
 
     def _allowed(self, goal: ServoStep) -> bool:
         """Whether a goal may be commanded: nothing blocks the arm, and its gate lets the goal
@@ -171,10 +176,16 @@ _NEAR_SIDE, _NEAR_HEIGHT, _NEAR_TURN = 0.04, (0.01, 0.10), math.pi / 4
 _PRETRAINING_HEIGHT, _PRETRAINING_TURN = (0.01, 0.42), math.pi / 2
 _PRETRAINING_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
 _OPEN_SHARE = 0.6  # of the states: with open fingers, as nearly all of an episode is seen
-_GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
+_MISSED_SHARE = 0.2  # of the states: after a grasp that missed
+_GRASP_SHARE = 0.4  # of the others: on the way down to a grasp
 _MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN = math.pi
+# After a grasp that missed: with closed fingers, and beside the object instead of over it.
+_CLOSED_SHARE, _BESIDE_SHARE = 0.7, 0.7
+_FINGER_ROOM = 0.025  # m from E to the outer side of a closed finger, and some room
+_MISSED_SIDE, _MISSED_HEIGHT = 0.04, 0.03  # m, the largest room beside the object, and in height
+_UNDER_PALM, _OVER_TOP = 0.035, 0.012  # m, of the object's top over E and under it
 _START_SLACK = 0.01  # rad or m
 
 
@@ -240,20 +251,49 @@ def near_pose(
     return _hand(T_home, object_place + side, height, random.uniform(-_NEAR_TURN, _NEAR_TURN))
 
 
+def missed_state(
+    T_home: np.ndarray, points: np.ndarray, max_opening: float, random: np.random.Generator
+) -> tuple[np.ndarray, float, float]:
+    """A state that a grasp which missed leaves: the hand low over an object or beside it, mostly
+    closed, turned anyhow: (4, 4) T_WE, the opening and the commanded opening in metres.
+
+    T_home: (4, 4) T_WE at home. points: (V, 3) m in W, of the object. max_opening: m, of the hand.
+    """
+    opening = 0.0 if random.random() < _CLOSED_SHARE else random.uniform(0, max_opening)
+    direction = random.uniform(-math.pi, math.pi)
+    away = np.array([math.cos(direction), math.sin(direction)])
+    reach, top = float((points[:, :2] @ away).max()), float(points[:, 2].max())
+    middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    if random.random() < _BESIDE_SHARE:
+        # The fingers are beside the object; the palm, if the object is tall, is over it.
+        clear = reach - float(middle @ away) + _FINGER_ROOM + opening / 2
+        place = middle + (clear + random.uniform(0, _MISSED_SIDE)) * away
+        low = max(LOWEST_TIP, top - _UNDER_PALM)
+    else:
+        place, low = random.uniform(points[:, :2].min(axis=0), points[:, :2].max(axis=0)), top
+        low += _OVER_TOP
+    height = low + random.uniform(0, _MISSED_HEIGHT)
+    turn = random.uniform(-_PRETRAINING_TURN, _PRETRAINING_TURN)
+    return _hand(T_home, place, height, turn), opening, opening
+
+
 def pretraining_state(
     T_home: np.ndarray,
+    points: np.ndarray,
     object_place: np.ndarray,
-    top: float,
     goal: GraspGoal | None,
     max_opening: float,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
-    """A state that an episode may lead to, from high above an object to right around a grasp:
-    (4, 4) T_WE, the opening and the commanded opening in metres.
+    """A state that an episode may lead to, from high above an object to right around a grasp, or
+    after one: (4, 4) T_WE, the opening and the commanded opening in metres.
 
-    Arguments as of `near_pose`; goal: a grasp of the object, None for no states on the way down.
-    max_opening: m, of the hand.
+    Arguments as of `missed_state`; object_place: (2,) x, y of the object, m in W. goal: a grasp of
+    the object, None for no states on the way down.
     """
+    if random.random() < _MISSED_SHARE:
+        return missed_state(T_home, points, max_opening, random)
+    top = float(points[:, 2].max())
     if goal is not None and random.random() < _GRASP_SHARE:
         place = goal.position[:2] + random.normal(0, _GRASP_SIDE, 2)
         height = random.uniform(goal.position[2], top + _GRASP_HEIGHT)

@@ -29,7 +29,8 @@ from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = (
-    "rgb", "depth", "state", "end_effector_position", "gripper", "opening_error", "reachable",
+    "rgb", "depth", "state", "end_effector_position", "wrist", "gripper", "opening_error",
+    "reachable",
 )  # fmt: skip
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
 _STILL = 0.001  # m between two observations: fingers that move may push without holding
@@ -65,7 +66,7 @@ class PolicyApproach:
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """Raises GraspFailure when nothing is gripped within the actions of a training episode;
-        a grip at the last of them alone counts, too."""
+        a grip at the last of them alone counts, too, and be it of fingers that still move."""
         self.closed_at, ended, gripped, touches = None, False, 0, False
         before = cell.robot.opening
         try:
@@ -83,7 +84,7 @@ class PolicyApproach:
             self.env.hand_over()
         if info["reason"] == "physics":
             raise PhysicsError("the simulation blew up while a policy was acting")
-        if not gripped:
+        if not touches:
             self.closed_at = None
             raise GraspFailure("stopped", detail=f"gripped nothing ({info['reason']})")
         return ApproachResult(cell.step, None, float(self.closed_at.position[2]))
