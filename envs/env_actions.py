@@ -204,7 +204,7 @@ def checked_options(
     known = set(start) == {"q", "opening", "command"} if isinstance(start, dict) else False
     if not known and start is not None and start not in STARTS:
         raise UserError(
-            f"reset: start must be 'home', 'near', 'pretraining' or an episode's own (q, opening "
+            f"reset: start must be {', '.join(map(repr, STARTS))} or an episode's own (q, opening "
             f"and command), got {start!r}"
         )
     if isinstance(start, dict):

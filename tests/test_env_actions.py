@@ -25,7 +25,7 @@ def test_episodes_can_begin_near_an_object(make_env):
     _, at_home = env.reset(seed=0, options={"start": "home"})
     assert at_home["end_effector_position"][2] > 0.4
     with pytest.raises(
-        UserError, match="start must be 'home', 'near', 'pretraining' or .*, got 'here'"
+        UserError, match="start must be 'home', 'near', 'missed', 'pretraining' or .*, got 'here'"
     ):
         env.reset(options={"start": "here"})
     mine = {"q": env.cell.home.tolist(), "opening": 0.04, "command": 0.05}
@@ -33,6 +33,37 @@ def test_episodes_can_begin_near_an_object(make_env):
     for wrong in ({"q": [0.0] * 3}, {"q": "x"}, {"q": [math.nan] * 7}, {"opening": -1.0}):
         with pytest.raises(UserError, match="start must have seven joint positions q in .* m; got"):
             env.reset(seed=0, options={"start": mine | wrong})
+
+
+def test_episodes_can_begin_where_a_grasp_has_missed(make_env):
+    """Low at the cube of 6 cm, fingers over it or beside it: nothing is touched."""
+    env = make_env(control="ee_planar", missed_share=1.0)
+    openings, beside = [], 0
+    for seed in range(20):
+        _, info = env.reset(seed=seed)
+        opening, command = info["gripper"]
+        x, y, z = info["end_effector_position"] - info["object_position"]
+        openings.append(opening)
+        # The fingertips reach 7 mm below E, the top of the cube is 3 cm over its centre.
+        over = z - 0.007 > 0.03
+        assert z < 0.08 and (over or math.hypot(x, y) > 0.03 + opening / 2)
+        assert command == pytest.approx(opening, abs=1e-3) and not info["grasped"]
+        beside += not over
+        before = info["object_position"]
+        *_, info = env.step(np.zeros(5))
+        np.testing.assert_allclose(info["object_position"], before, atol=5e-4)
+    assert 8 <= np.sum(np.array(openings) < 1e-3) < 20, "mostly closed"
+    assert 5 <= beside < 20
+
+
+def test_shares_of_starts(make_env):
+    """Of 200 episodes 0.3 near and 0.5 after a miss, or the hand is at home; 4 deviations off
+    would be chance once in ten thousand times."""
+    env = make_env(control="ee_planar", near_share=0.3, missed_share=0.5)
+    env.reset(seed=0)
+    drawn = [env._drawn_start() for _ in range(200)]
+    for start, share in (("near", 0.3), ("missed", 0.5), ("home", 0.2)):
+        assert abs(drawn.count(start) - 200 * share) < 4 * math.sqrt(200 * share * (1 - share))
 
 
 def test_pretraining_states_are_many_at_each_scene(make_env):
@@ -173,6 +204,23 @@ def test_what_the_arm_cannot_reach_is_refused_and_reported(make_env, control):
     assert info["reachable"]
     gone_back = farthest["end_effector_position"][0] - info["end_effector_position"][0]
     assert gone_back > 0.2
+
+
+def test_a_hand_at_the_limit_of_its_wrist_still_moves(make_env):
+    """It cannot turn any farther, and says so; it comes down by 5 cm an action all the same."""
+    env = make_env(control="ee_planar", frame="hand")
+    env.reset(seed=0)
+    turn, down = np.array([0, 0, 0, 1.0, 0]), np.array([0, 0, 0.5, 1.0, 0])
+    for _ in range(20):
+        *_, info = env.step(turn)
+    assert info["wrist"] == pytest.approx(JOINT_UPPER[6], abs=0.31), "less than one more turn"
+    assert not info["reachable"]
+    high, angle = info["end_effector_position"][2], info["wrist"]
+    for _ in range(6):
+        observation, *_, info = env.step(down)
+    assert not info["reachable"]
+    assert high - info["end_effector_position"][2] > 0.1
+    assert info["wrist"] == pytest.approx(angle, abs=0.05) == observation["state"][6]
 
 
 def test_an_arm_held_up_by_the_table_does_not_wind_up(make_env):

@@ -78,6 +78,17 @@ def test_a_brick_is_taken_across_its_short_side():
         assert view.top == pytest.approx(0.05, abs=1e-9) and view.hand == pytest.approx(0.2)
 
 
+def test_a_goal_beyond_the_limit_of_the_wrist_is_turned_to_the_other_way_round():
+    """Half a turn changes nothing for two fingers: 0.25 rad one way are pi - 0.25 the other."""
+    goals, T_WE = brick(), hand([*PLACE[:2], 0.2], YAW + 0.25)
+    free, limited = (goals.seen_from(pose(), T_WE, turns) for turns in ((-3.0, 0.3), (-3.0, 0.2)))
+    assert free.turn == pytest.approx(0.25, abs=0.02)
+    assert limited.turn == pytest.approx(free.turn - math.pi)
+    np.testing.assert_allclose(limited.vector(), free.vector(), atol=1e-9)
+    other = goals.seen_from(pose(), hand([*PLACE[:2], 0.2], YAW - 0.25), (-0.2, 3.0))
+    assert other.turn == pytest.approx(math.pi - 0.25, abs=0.02)
+
+
 def test_goals_go_with_their_object():
     goals = brick()
     before = goals.seen_from(pose(), hand([0.52, 0.07, 0.2], 0.4))
