@@ -25,9 +25,11 @@ from envs.robot_kinematics import (
     moved,
     pose_error,
     rotation_matrix,
+    wrist_room,
 )
 from utils.config import Config
 from utils.errors import UserError, unknown_choice
+from utils.geometry import GripperGeometry
 
 # What each entry of an action means, by `env.control`.
 ACTION_ENTRIES = {
@@ -98,9 +100,7 @@ class ActionDecoder:
             if self.reachable:
                 self._servo = servo
         else:
-            self.reachable = self._follow(self._moved_pose(action))
-            if not self.reachable:  # at the wrist's limit the hand can still move
-                self._follow(self._moved_pose(action, turning=False))
+            self._follow(self._moved_pose(action))
         self._robot.drive_arm_to(self._servo.q, self._speed)
         self.opening = self._new_opening(float(action[-1]))
         self._robot.command_gripper(self.opening)
@@ -114,25 +114,27 @@ class ActionDecoder:
         opening = min(max(opening, now - _GRIPPER_LEAD), now + _GRIPPER_LEAD)
         return min(max(opening, 0.0), self._max_opening)
 
-    def _moved_pose(self, action: np.ndarray, turning: bool = True) -> np.ndarray:
-        """(4, 4) the commanded pose of E moved by an action, within the workspace."""
+    def _moved_pose(self, action: np.ndarray) -> np.ndarray:
+        """(4, 4) the commanded pose of E moved by an action, within the workspace and what the
+        wrist can turn: a hand at its limit can still move."""
         settings, T = self._settings, self._T_command.copy()
         move = settings.position_step * action[:3]
-        turn = np.zeros(3)
-        if turning:
-            turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
+        turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
         if settings.frame == "hand":
             move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
         position = zip((T[:3, 3] + move).tolist(), self.lowest, self.highest)
         T[:3, 3] = [min(max(value, low), high) for value, low, high in position]
         if any(turn.tolist()):
-            T[:3, :3] = rotation_matrix(settings.rotation_step * turn) @ T[:3, :3]
+            turn = settings.rotation_step * turn
+            about, (low, high) = float(turn @ T[:3, 2]), wrist_room(self._servo.q)
+            if not low <= about <= high:
+                turn = turn + (min(max(about, low), high) - about) * T[:3, 2]
+            T[:3, :3] = rotation_matrix(turn) @ T[:3, :3]
         return T
 
-    def _follow(self, target: np.ndarray) -> bool:
+    def _follow(self, target: np.ndarray) -> None:
         """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
-        where the arm cannot get there, and return whether it can: a compromise would tilt the hand
-        and jam the elbow."""
+        where the arm cannot get there: a compromise would tilt the hand and jam the elbow."""
         goal, share = self._within_speed(self._servo.towards(target))
         for _ in range(_FOLLOW_TRIES):
             wanted = target
@@ -141,13 +143,13 @@ class ActionDecoder:
             servo = ServoStep(goal)
             error = [abs(part) for part in pose_error(servo.reached, wanted).tolist()]
             if max(error[:3]) < _FOLLOW_POSITION and max(error[3:]) < _FOLLOW_ROTATION:
-                allowed = self._allowed(servo)
-                if allowed:
+                self.reachable = self._allowed(servo)
+                if self.reachable:
                     self._servo, self._T_command = servo, wanted
-                return allowed
+                return
             goal, slower = self._within_speed(servo.towards(wanted))
             share *= slower
-        return False
+        self.reachable = False
 
     def _allowed(self, goal: ServoStep) -> bool:
         """Whether a goal may be commanded: nothing blocks the arm, and its gate lets the goal
@@ -173,19 +175,16 @@ class ActionDecoder:
 
 _NEAR_SIDE, _NEAR_HEIGHT, _NEAR_TURN = 0.04, (0.01, 0.10), math.pi / 4
 # Pretraining: heights are even in the logarithm, as what is near moves most in the image.
-_PRETRAINING_HEIGHT, _PRETRAINING_TURN = (0.01, 0.42), math.pi / 2
+_PRETRAINING_HEIGHT = 0.01, 0.42
 _PRETRAINING_SIDE = 0.01, 0.4  # m, and metres for a metre of height: deviations sideways
 _OPEN_SHARE = 0.6  # of the states: with open fingers, as nearly all of an episode is seen
-_MISSED_SHARE = 0.2  # of the states: after a grasp that missed
-_GRASP_SHARE = 0.4  # of the others: on the way down to a grasp
+_GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
 _MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
-_HALF_TURN = math.pi
+_HALF_TURN, _ANY_TURN = math.pi, math.pi / 2
 # After a grasp that missed: with closed fingers, and beside the object instead of over it.
 _CLOSED_SHARE, _BESIDE_SHARE = 0.7, 0.7
-_FINGER_ROOM = 0.025  # m from E to the outer side of a closed finger, and some room
-_MISSED_SIDE, _MISSED_HEIGHT = 0.04, 0.03  # m, the largest room beside the object, and in height
-_UNDER_PALM, _OVER_TOP = 0.035, 0.012  # m, of the object's top over E and under it
+_MISSED_SIDE, _MISSED_HEIGHT, _GAP = 0.04, 0.03, 0.004  # m, largest room; least room
 _START_SLACK = 0.01  # rad or m
 
 
@@ -252,48 +251,48 @@ def near_pose(
 
 
 def missed_state(
-    T_home: np.ndarray, points: np.ndarray, max_opening: float, random: np.random.Generator
-) -> tuple[np.ndarray, float, float]:
+    T_home: np.ndarray, points: np.ndarray, gripper: GripperGeometry, random: np.random.Generator
+) -> tuple[np.ndarray, float]:
     """A state that a grasp which missed leaves: the hand low over an object or beside it, mostly
-    closed, turned anyhow: (4, 4) T_WE, the opening and the commanded opening in metres.
+    closed, turned anyhow, and touching nothing: (4, 4) T_WE, and the opening in metres.
 
-    T_home: (4, 4) T_WE at home. points: (V, 3) m in W, of the object. max_opening: m, of the hand.
+    T_home: (4, 4) T_WE at home. points: (V, 3) m in W, of the object.
     """
-    opening = 0.0 if random.random() < _CLOSED_SHARE else random.uniform(0, max_opening)
-    direction = random.uniform(-math.pi, math.pi)
-    away = np.array([math.cos(direction), math.sin(direction)])
-    reach, top = float((points[:, :2] @ away).max()), float(points[:, 2].max())
-    middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    closed = random.random() < _CLOSED_SHARE
+    opening = 0.0 if closed else random.uniform(0, gripper.max_opening)
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    top = float(points[:, 2].max())
     if random.random() < _BESIDE_SHARE:
-        # The fingers are beside the object; the palm, if the object is tall, is over it.
-        clear = reach - float(middle @ away) + _FINGER_ROOM + opening / 2
-        place = middle + (clear + random.uniform(0, _MISSED_SIDE)) * away
-        low = max(LOWEST_TIP, top - _UNDER_PALM)
+        direction = random.uniform(-math.pi, math.pi)
+        away = np.array([math.cos(direction), math.sin(direction)])
+        middle = (low + high) / 2
+        # However the hand is turned, no corner of a finger is farther from E than this.
+        fingers = math.hypot(opening / 2 + gripper.finger_outline[-1][0], gripper.finger_half_width)
+        reach = float(((points[:, :2] - middle) @ away).max())
+        place = middle + (reach + fingers + _GAP + random.uniform(0, _MISSED_SIDE)) * away
+        # The palm, which is wider, may be over the object.
+        under_palm = gripper.palm_height - gripper.tip_below_centre - _GAP
+        height = max(LOWEST_TIP, top - under_palm)
     else:
-        place, low = random.uniform(points[:, :2].min(axis=0), points[:, :2].max(axis=0)), top
-        low += _OVER_TOP
-    height = low + random.uniform(0, _MISSED_HEIGHT)
-    turn = random.uniform(-_PRETRAINING_TURN, _PRETRAINING_TURN)
-    return _hand(T_home, place, height, turn), opening, opening
+        place, height = random.uniform(low, high), top + gripper.tip_below_centre + _GAP
+    height += random.uniform(0, _MISSED_HEIGHT)
+    return _hand(T_home, place, height, random.uniform(-_ANY_TURN, _ANY_TURN)), opening
 
 
 def pretraining_state(
     T_home: np.ndarray,
-    points: np.ndarray,
     object_place: np.ndarray,
+    top: float,
     goal: GraspGoal | None,
     max_opening: float,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
-    """A state that an episode may lead to, from high above an object to right around a grasp, or
-    after one: (4, 4) T_WE, the opening and the commanded opening in metres.
+    """A state that an episode may lead to, from high above an object to right around a grasp:
+    (4, 4) T_WE, the opening and the commanded opening in metres.
 
-    Arguments as of `missed_state`; object_place: (2,) x, y of the object, m in W. goal: a grasp of
-    the object, None for no states on the way down.
+    Arguments as of `near_pose`; goal: a grasp of the object, None for no states on the way down.
+    max_opening: m, of the hand.
     """
-    if random.random() < _MISSED_SHARE:
-        return missed_state(T_home, points, max_opening, random)
-    top = float(points[:, 2].max())
     if goal is not None and random.random() < _GRASP_SHARE:
         place = goal.position[:2] + random.normal(0, _GRASP_SIDE, 2)
         height = random.uniform(goal.position[2], top + _GRASP_HEIGHT)
@@ -305,7 +304,7 @@ def pretraining_state(
         rise = math.exp(random.uniform(*np.log(_PRETRAINING_HEIGHT)))
         deviation = _PRETRAINING_SIDE[0] + _PRETRAINING_SIDE[1] * rise
         place = object_place + random.normal(0, deviation, 2)
-        height, turn = top + rise, random.uniform(-_PRETRAINING_TURN, _PRETRAINING_TURN)
+        height, turn = top + rise, random.uniform(-_ANY_TURN, _ANY_TURN)
         opened = random.random() < _OPEN_SHARE
         opening = max_opening if opened else random.uniform(0, max_opening)
     closing = random.random() < _MOVING_SHARE

@@ -147,7 +147,6 @@ LOWEST_TIP = 0.012  # m over the table that E keeps: the fingertips reach 7 mm b
 _TURN, _QUALITY, _NARROW = 0.06, 0.3, 0.3
 _GOAL_SIDE_SLACK, _GOAL_LENGTH_SLACK = 0.006, 0.010  # m off a goal from where to come down
 _TURN_SLACK, _TURN_EDGE = math.radians(12), math.radians(12)
-ANY_TURN = (-math.pi, math.pi)  # rad
 _GOAL_OPENING_SLACK = 0.012  # m of opening that may be missing: the fingers' room on both sides
 
 
@@ -199,16 +198,18 @@ class GraspGoals:
         return GraspGoal(position, math.atan2(line[1], line[0]), *openings)
 
     def seen_from(
-        self, T_WO: np.ndarray, T_WE: np.ndarray, turns: tuple[float, float] = ANY_TURN
+        self, T_WO: np.ndarray, T_WE: np.ndarray, room: tuple[float, float] = (-math.pi, math.pi)
     ) -> GoalView:
-        """The goal nearest to a hand at T_WE (4, 4), for the object at T_WO (4, 4). turns: rad, how
-        far the hand can turn about E's z either way; beyond them it goes the other way round."""
+        """The goal nearest to a hand at T_WE (4, 4), for the object at T_WO (4, 4). room: rad, how
+        far the hand can turn about E's z either way; what is farther is the other way round."""
         T_EO_R = T_WE[:3, :3].T @ T_WO[:3, :3]
         offset = self._positions @ T_EO_R.T + T_WE[:3, :3].T @ (T_WO[:3, 3] - T_WE[:3, 3])
         lines = self._lines @ T_EO_R[:2].T
         turn = np.arctan2(-lines[:, 0], lines[:, 1])  # about z of E, from y of E
         turn -= math.pi * np.rint(turn / math.pi)
-        turn += math.pi * ((turn < turns[0]).astype(float) - (turn > turns[1]))
+        # At its limit a hand that is nearly turned has turned.
+        beyond = turn - np.clip(turn, *room)
+        turn -= math.pi * np.sign(beyond) * (abs(beyond) > _TURN_SLACK)
         price = np.hypot(offset[:, 0], offset[:, 1]) + _TURN * abs(turn) + self._price
         best = int(price.argmin())
         up = T_WO[2]
@@ -222,7 +223,7 @@ class GoalView:
     """A goal relative to the hand.
 
     offset: (3,) m from E to the goal along E's axes. turn: rad about E's z from the closing line to
-    the goal's, in (-pi/2, pi/2] where the hand can turn that way. narrow, wide: m, the openings
+    the goal's, within a quarter turn where the wrist has room for it. narrow, wide: m, the openings
     between which the hand can come down. top, hand: m, heights in W of the object's highest point
     and of E. rise: m in W, of the goal over E.
     """

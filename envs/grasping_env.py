@@ -79,7 +79,8 @@ class RobotGraspingEnv(gymnasium.Env):
 
     With `gripper="change"` the commanded opening stays within 20 mm of the true one. Directions are
     those of W, or with `frame="hand"` those of the commanded E, whose z is the approach. Changes
-    add up on the *commanded* pose, stay within the workspace and the joint limits, and are scaled
+    add up on the *commanded* pose, stay within the workspace and the joint limits (at its limit the
+    wrist turns no farther, and the hand still moves), and are scaled
     down as a whole where a joint would exceed its speed limit. The command stays where it is when
     the arm cannot reach the new one, when something holds the arm up, or when the new one lies
     outside the workspace box (`safety`). No joint exceeds 2.175 rad/s, the lowest of the Panda's
@@ -113,10 +114,10 @@ class RobotGraspingEnv(gymnasium.Env):
     | `is_success`, `reason`  |      |             | success; why the episode ended, or None          |
     | `scene_seed`            |      |             | what the scene was made from                     |
     | `end_effector_position` | 3    | m, W        | E                                                |
-    | `wrist`                 | 1    | rad         | the last joint, which turns the hand             |
+    | `wrist_angle`           | 1    | rad         | of the last joint, which turns the hand          |
     | `gripper`               | 2    | m           | opening, commanded opening                       |
     | `opening_error`         | 1    | m           | opening - commanded: the fingers move or hold something |
-    | `reachable`             | 1    |             | false where the arm could not follow all of the action |
+    | `reachable`             | 1    |             | false where the arm could not follow the action  |
     |                         |      |             | *ground truth of the simulator from here on:*    |
     | `grasped`               | 1    |             | both fingers grip the nearest object             |
     | `object_position`       | 3    | m, W        | centre of the nearest object                     |
@@ -277,18 +278,21 @@ class RobotGraspingEnv(gymnasium.Env):
         index = int(self.np_random.integers(len(outlines)))
         T_WO = self.cell.object_pose(index)
         points, widest = outlines[index].points(T_WO), self.config.gripper.max_opening
+        top, missed = float(points[:, 2].max()), self.settings.missed_share
+        if start == "pretraining" and missed > 0 and self.np_random.random() < missed:
+            start = "missed"
         if start == "near":
-            T = near_pose(T_home, T_WO[:2, 3], float(points[:, 2].max()), self.np_random)
+            T = near_pose(T_home, T_WO[:2, 3], top, self.np_random)
             opening = command = widest
         elif start == "missed":
-            T, opening, command = missed_state(T_home, points, widest, self.np_random)
-            T[:3, 3] = np.clip(T[:3, 3], self._actions.lowest, self._actions.highest)
+            T, opening = missed_state(T_home, points, self.cell.gripper, self.np_random)
+            command = opening
         else:
             goal = None
             if goals is not None:
                 goal = goals.goal(self.np_random.integers(len(goals)), T_WO)
             T, opening, command = pretraining_state(
-                T_home, points, T_WO[:2, 3], goal, widest, self.np_random
+                T_home, T_WO[:2, 3], top, goal, widest, self.np_random
             )
             T[:3, 3] = np.clip(T[:3, 3], self._actions.lowest, self._actions.highest)
         try:

@@ -29,7 +29,7 @@ from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = (
-    "rgb", "depth", "state", "end_effector_position", "wrist", "gripper", "opening_error",
+    "rgb", "depth", "state", "end_effector_position", "wrist_angle", "gripper", "opening_error",
     "reachable",
 )  # fmt: skip
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
@@ -56,8 +56,9 @@ class PolicyApproach:
         policy: Callable[[dict[str, np.ndarray]], np.ndarray],
         trained: dict[str, dict[str, Any]],
     ):
-        # The reward is not used, and the cell has its objects already.
+        # Reward and starts are not used, and the cell has its objects already.
         plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
+        plain |= {"near_share": 0.0, "missed_share": 0.0}
         noise = cell.config.camera.model_dump(include={"depth_noise", "depth_noise_args"})
         config = with_settings(cell.config, "camera", trained["camera"] | noise)
         self.env = RobotGraspingEnv(config=config, cell=cell, **plain)
@@ -66,7 +67,7 @@ class PolicyApproach:
 
     def __call__(self, cell: Cell, grasp: Grasp) -> ApproachResult:
         """Raises GraspFailure when nothing is gripped within the actions of a training episode;
-        a grip at the last of them alone counts, too, and be it of fingers that still move."""
+        a grip at the last of them alone counts, too, even of fingers that still move."""
         self.closed_at, ended, gripped, touches = None, False, 0, False
         before = cell.robot.opening
         try:

@@ -285,6 +285,12 @@ class ServoStep:
         return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
 
 
+def wrist_room(q: np.ndarray) -> tuple[float, float]:
+    """Radians (low, high) by which the last joint can still turn the hand about E's z from joint
+    positions q (7,). It is exact while the other joints stay as they are."""
+    return float(JOINT_LOWER[6] - q[6]), float(JOINT_UPPER[6] - q[6])
+
+
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about the approach: the wrist flip
 
 # Three postures from which searches reach most of the poses, 60 to 85 degrees from straight above,

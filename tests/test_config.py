@@ -142,6 +142,8 @@ def test_override_values(text, expected):
         ("camera.mount=overhed", ["one of overhead, wrist", "did you mean overhead?"]),
         ("camera.near=5", ["camera: near (5.0) must be smaller than far (2.0)", "command line"]),
         ("camera={view: side, mount: wrist}", ["camera: view=side places the overhead camera"]),
+        ("env={near_share: 0.6, missed_share: 0.5}", ["must not be more than 1 together"]),
+        ("env={missed_share: 0.1, scenario: pile}", ["missed_share is for one object"]),
         ("data.fold=0", ["data: fold is one of photographs, and kind is simulated"]),
         ("gripper={max_opening: 0.02, least_held: 0.02}", ["least_held (0.02) must be smaller"]),
         ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),

@@ -373,9 +373,11 @@ class EnvConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _goals_of_one_object(self) -> EnvConfig:
+    def _for_one_object(self) -> EnvConfig:
         if self.goal == "grasp" and self.scenario != "isolated":
             raise ValueError("goal 'grasp' is for one object: it needs scenario 'isolated'")
+        if self.missed_share > 0 and self.scenario != "isolated":
+            raise ValueError("missed_share is for one object: it needs scenario 'isolated'")
         return self
 
 
