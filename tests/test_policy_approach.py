@@ -155,6 +155,22 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
         assert np.abs(cell.robot.q - cell.home).max() < 0.02, "home again"
 
 
+def test_a_grip_at_the_last_action_counts(box, config, monkeypatch):
+    """Even of fingers that still move, by 3 mm an action here: the judge finds out what they
+    hold. The motor is said to press, though there is nothing."""
+    policy = load_policy(box)
+    objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
+    with make_cell(config) as cell:
+        trained = policy.config | {"env": policy.config["env"] | {"max_steps": 12}}
+        approach = PolicyApproach(
+            cell, lambda observation: np.array([0, 0, 1.0, 0, -0.15]), trained
+        )
+        cell.load(make_scene("isolated", objects, 0, config))
+        monkeypatch.setattr(cell.robot, "grips", lambda: cell.robot.encoder_pose()[2, 3] < 0.2)
+        assert execute_grasp(cell, placeholder(cell.frame())[0], approach).reason == "missed"
+        assert approach.closed_at is not None and 0.01 < approach.closed_at.width < 0.08
+
+
 def recorded(decoder: ActionDecoder) -> list[np.ndarray]:
     """The actions that reach the decoder from now on."""
     sent, command = [], decoder.command
