@@ -555,6 +555,9 @@ def test_shipped_configs_are_valid(name):
     if not name.endswith("_state"):
         assert hidden and hidden < truth, "only the critic sees them"
         assert not truth & set(config.rl.policy_observations)
+    if config.rl.initial:
+        layout = load_policy(REPOSITORY / config.rl.initial).layout
+        assert {part.key for part in layout.parts()} - hidden == {*config.rl.policy_observations}
 
 
 def test_episodes_are_filmed(tmp_path):
