@@ -371,7 +371,7 @@ def servo(say: Say, part: Figures) -> str:
     typical = {name: [median(column) for column in zip(*of)] for name, of in turns.items()}
     if typical:
         spent = (", ".join(f"{ms:.1f}" for ms in typical.get(name, ())) or "-" for name in names)
-        lines.append(["a turn, ms: mean, 95 %", *spent])
+        lines.append(["one iteration, ms: mean, 95 %", *spent])
     return "\n\n".join([table(["scenario", *map(str, names)], lines), origin(say, part)])
 
 

@@ -138,7 +138,7 @@ def test_loops_have_successes_of_all_objects_and_the_median_time_of_a_turn(tmp_p
         "| scenario | open_loop | ibvs |",
         "| --- | --- | --- |",
         f"| `pile` | {rate(6, 8)} | {rate(6, 8)} |",
-        "| a turn, ms: mean, 95 % | - | 4.5, 6.0 |",
+        "| one iteration, ms: mean, 95 % | - | 4.5, 6.0 |",
     ]
 
 
