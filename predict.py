@@ -6,7 +6,8 @@
     python predict.py ... --point 312 200                   # grasp that one
     python predict.py --export graspnet.onnx                            # the network for ONNX
 
---depth is a PNG, TIFF or NPY file of the colour image's size. Whole numbers are millimetres, floats
+Both images are those of a pinhole (undistorted), and the depth is registered to the colour image:
+--depth is a PNG, TIFF or NPY file of its size. Whole numbers are millimetres, floats
 metres; --depth-scale sets another unit. --intrinsics are fx fy cx cy in pixels, with integers at
 pixel centres, or a JSON file with these keys (and width and height, which are checked), as
 `python -m envs.studio --rgbd FOLDER` writes it. --camera-pose is T_WC, 4x4, .npy, .txt, .json or
@@ -52,7 +53,6 @@ from pathlib import Path
 
 import numpy as np
 
-from models.graspnet_inference import training_scale
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
 from models.planner_target import TargetPlanner, check_reached, least_width
@@ -67,10 +67,16 @@ from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
 from utils.runs import run_script, timed_folder
-from utils.table_plane import Table, find_table, table_at_height
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
-from utils.user_view import check_found, check_mask, check_view, chosen_workspace, corrected_view
+from utils.user_view import (
+    check_found,
+    check_mask,
+    check_view,
+    chosen_workspace,
+    corrected_view,
+    locate_table,
+)
 
 NETWORK_PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
@@ -89,14 +95,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     network = options.planner in NETWORK_PLANNERS
     saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
-    if saved is not None:
-        training_scale(image, saved.metres_per_pixel)  # wrong units fail here, not at the table
-    table = locate_table(image, options)
+    T_WC = None if options.camera_pose is None else read_pose(options.camera_pose)
+    table = locate_table(image, T_WC, options.table_height)
     print(f"table: {table.describe()}", file=sys.stderr)
+    if T_WC is not None:
+        x, y, z = T_WC[:3, 3]
+        print(f"camera: at ({x:.3f}, {y:.3f}, {z:.3f}) m in your world", file=sys.stderr)
     frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
     marked = marked_pixels(frame.depth.shape, options.point, options.box, mask)
     workspace, cut = chosen_workspace(frame, table.height, options.workspace, marked)
-    remarks = [*scaled, *cut, *check_view(frame, workspace)]
+    remarks = [*table.remarks(), *scaled, *cut, *check_view(frame, workspace)]
     planner = new_planner(options, saved, workspace)
     frame = replace(frame, target=find_target(planner, frame, options, mask))
 
@@ -110,7 +118,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         remarks += check_found(len(grasps), frame, workspace)
     if planner.calibration is not None:
         remarks += unlikely_ones(grasps) + unlikely_ones(clearing or [], "grasps of `clearing`")
-    posed = options.camera_pose is not None
     content = {
         **MARK,
         "rgb": str(options.rgb),
@@ -118,9 +125,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "planner": options.planner,
         "checkpoint": str(options.checkpoint or SHIPPED) if network else None,
         "calibrated": planner.calibration is not None,
-        **scene_as_plain(frame, table, workspace, posed),
-        "grasps": grasps_as_plain(grasps, frame, posed),
-        "clearing": None if clearing is None else grasps_as_plain(clearing, frame, posed),
+        **scene_as_plain(frame, table, workspace, T_WC is not None),
+        "grasps": grasps_as_plain(grasps, frame, T_WC is not None),
+        "clearing": None
+        if clearing is None
+        else grasps_as_plain(clearing, frame, T_WC is not None),
         "remarks": remarks,
     }
     text = json.dumps(content, indent=2, allow_nan=False)
@@ -206,17 +215,6 @@ def read_image(options: argparse.Namespace) -> RGBDFrame:
     check_rgbd(rgb, depth)
     K = read_intrinsics(options.intrinsics, rgb.shape[1], rgb.shape[0])
     return RGBDFrame(rgb, depth, K, np.eye(4))
-
-
-def locate_table(image: RGBDFrame, options: argparse.Namespace) -> Table:
-    """The table, and the camera above it.
-
-    Without --camera-pose the table defines the world, see `utils.table_plane.Plane.camera_pose`.
-    """
-    T_WC = None if options.camera_pose is None else read_pose(options.camera_pose)
-    if options.table_height is None:
-        return find_table(image.points(), T_WC)
-    return table_at_height(options.table_height, image.points(), T_WC)
 
 
 def new_planner(

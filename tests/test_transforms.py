@@ -1,5 +1,6 @@
 """Frames and grasps: closed forms and round trips."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -154,6 +155,12 @@ def test_frame_points_and_blinding():
     assert blind.truth is None and blind.segmentation is None
 
 
+def translated(x):
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -161,7 +168,10 @@ def test_frame_points_and_blinding():
         ({"T_WC": np.eye(4)[:3]}, r"T_WC: got an array of shape \(3, 4\)"),
         ({"T_WC": np.diag([1.0, 1.0, -1.0, 1.0])}, "no rotation"),
         ({"T_WC": np.diag([2.0, 2.0, 2.0, 1.0])}, "no rotation"),
-        ({"T_WC": np.full((4, 4), np.nan)}, "no rotation"),
+        ({"T_WC": np.full((4, 4), np.nan)}, "not finite"),
+        ({"T_WC": translated(np.nan)}, "not finite"),
+        ({"T_WC": translated(0.5).T}, r"last row is \[0.5, 0.0, 0.0, 1.0\].*transposed"),
+        ({"target": np.ones((2, 1), bool)}, r"target: .* \(2, 1\), expected .* \(1, 2\)"),
     ],
 )
 def test_a_frame_without_a_camera_is_refused(changes, message):
@@ -241,7 +251,7 @@ PINHOLE = np.array([[100.0, 0.0, 2.5], [0.0, 100.0, 1.5], [0.0, 0.0, 1.0]])
         ({"K": PINHOLE * np.nan}, "K: got"),
         ({"K": PINHOLE + np.eye(3, k=1)}, "K: got"),  # skewed pixels
         ({"K": np.eye(4)}, "K: got an array of shape"),
-        ({"T_WC": np.zeros((4, 4))}, "no rotation"),
+        ({"T_WC": np.zeros((4, 4))}, "its last row"),
         ({"T_WC": np.eye(3)}, "T_WC: got an array of shape"),
     ],
 )
@@ -255,6 +265,22 @@ def test_a_frame_takes_lists_for_its_matrices() -> None:
     frame = RGBDFrame(RGB, DEPTH, PINHOLE.tolist(), np.eye(4).tolist())
     np.testing.assert_array_equal(frame.K, PINHOLE)
     np.testing.assert_array_equal(frame.part(slice(1, 3), slice(2, 5)).K[:2, 2], (0.5, 0.5))
+
+
+def test_a_target_of_numbers_is_a_mask() -> None:
+    image = np.zeros(DEPTH.shape, np.uint8)
+    image[1, 2] = 254  # as an image file holds it; & True would make it 0
+    target = RGBDFrame(RGB, DEPTH, PINHOLE, np.eye(4), target=image).target
+    assert target.dtype == bool
+    np.testing.assert_array_equal(np.argwhere(target), [(1, 2)])
+
+
+@pytest.mark.parametrize("number", [np.float32(0.04), np.array(0.04)])
+def test_a_grasp_of_a_planner_that_computes_in_float32_can_be_written(number) -> None:
+    grasp = Grasp(np.zeros(3, np.float32), number, number, number)
+    assert json.loads(json.dumps([grasp.angle, grasp.width, grasp.quality])) == pytest.approx(
+        [0.04] * 3
+    )
 
 
 def test_a_width_in_millimetres_is_refused() -> None:

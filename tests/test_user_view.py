@@ -18,6 +18,7 @@ from utils.user_view import (
     check_view,
     corrected_view,
     given_workspace,
+    locate_table,
     workspace_of,
 )
 
@@ -57,6 +58,75 @@ def test_a_principal_point_outside_the_image_is_remarked_upon() -> None:
     assert check_view(frame, Workspace((0.0, 0.0))) == []
     (remark,) = check_view(replace(frame, K=outside), Workspace((-0.8, 0.0)))
     assert remark.startswith("the principal point (480, 239.5) lies outside the image of 480x480")
+
+
+def test_intrinsics_of_half_the_image_s_size_are_remarked_upon() -> None:
+    half = K.copy()
+    half[:2, 2] /= 2
+    (remark,) = check_view(replace(scene((0.0, 0.0, 0.06)), K=half), Workspace((0.5, -0.5)))
+    assert remark.startswith("the principal point (119.75, 119.75) is far from the middle")
+
+
+def crate() -> RGBDFrame:
+    """Tops of boxes side by side, 6 cm over a table of which a third is seen around them."""
+    return scene((0.0, 0.0, 1.88), height=0.06)
+
+
+def test_a_table_beneath_the_largest_plane_is_the_table_and_the_depths_stay_as_they_are() -> None:
+    image = replace(crate(), T_WC=np.eye(4))
+    assert np.mean(image.depth == np.float32(UP - 0.06)) == pytest.approx(0.67, abs=0.02)
+    table = locate_table(image, None, None)
+    assert table.height == 0 and table.T_WC[2, 3] == pytest.approx(UP, abs=1e-3)
+    assert table.share == pytest.approx(0.33, abs=0.02)
+    frame, remarks = corrected_view(replace(image, T_WC=table.T_WC), table.height)
+    np.testing.assert_array_equal(frame.depth, image.depth)
+    assert remarks == []
+    posed = locate_table(image, T_WC, None)  # the same in the user's world
+    assert posed.height == pytest.approx(0.0, abs=1e-3)
+    np.testing.assert_array_equal(posed.T_WC, T_WC)
+
+
+def test_a_table_of_which_a_twentieth_is_seen_beneath_what_is_on_it_is_no_error_of_scale() -> None:
+    frame = scene((0.0, 0.0, 2.22), height=0.06)
+    assert 0.05 < np.mean(frame.depth == np.float32(UP)) < 0.1
+    corrected, remarks = corrected_view(frame, 0.0)
+    np.testing.assert_array_equal(corrected.depth, frame.depth)
+    assert remarks == []
+
+
+@pytest.mark.parametrize("far", [2.2, 4.5])
+def test_a_floor_that_fills_most_of_the_image_counts_as_table(far) -> None:
+    """Lengths in pixels, and the network's level, are taken at the median depth."""
+    small = scene((0.0, 0.0, 0.06))
+    depth = small.depth.copy()
+    beside = np.ones(depth.shape, bool)
+    beside[80:400, 80:400] = False  # the table is 1.6 m wide
+    depth[beside] = far
+    assert np.median(depth) == pytest.approx(far)
+    frame, remarks = corrected_view(replace(small, depth=depth), 0.0)
+    np.testing.assert_allclose(frame.depth, small.depth, atol=1e-6)
+    assert remarks == []
+
+
+def test_what_lies_above_the_horizon_is_unknown() -> None:
+    level = look_at((0.0, 0.0, UP), (1.0, 0.0, UP - 0.3), (0.0, 0.0, 1.0))
+    frame = replace(scene(), T_WC=level, depth=np.full((SIDE, SIDE), 3.0, np.float32))
+    depth = corrected_view(frame, 0.0)[0].depth
+    assert (depth[:40] == 0).all() and (depth[-40:] > 0).all()
+
+
+def test_a_pose_that_tilts_the_table_is_remarked_upon_or_refused() -> None:
+    image = replace(scene((0.0, 0.0, 0.06)), T_WC=np.eye(4))
+
+    def leaning(degrees: float) -> np.ndarray:
+        side = UP * np.tan(np.deg2rad(degrees))
+        return look_at((side, 0.0, UP), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+    assert locate_table(image, leaning(1.0), None).remarks() == []
+    (remark,) = locate_table(image, leaning(5.0), None).remarks()
+    assert remark.startswith("the table found is tilted by 5 degrees in your world")
+    with pytest.raises(UserError, match="tilted by 20 degrees"):
+        locate_table(image, leaning(20.0), None)
 
 
 def test_what_may_be_in_another_unit_is_remarked_upon() -> None:

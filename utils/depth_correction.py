@@ -3,7 +3,8 @@
 The table's height is known. So the table shows by which factor the camera measures too far or too
 near, and how rough a flat surface appears. `corrected` takes both errors out of a frame: the first
 by a factor, the second by a filter whose guide is the colour image, so that edges of objects stay,
-and by the table's own depth where the colour is the table's.
+and by the table's own depth where the colour is the table's. What lies far below the table, as the
+floor beside it, becomes table.
 Holes are the subject of `utils.depth_holes`. This module knows no simulator and no network.
 """
 
@@ -26,6 +27,7 @@ from utils.transforms import RGBDFrame, inverse_pose, known_depth, transform_poi
 TRUSTED_SCALE = 0.002  # errors of the scale below this are left alone: 1.6 mm at 0.8 m
 SCALE_SPREAD = 0.04  # standard deviation of the errors of scale that are expected
 SCALE_REACH = 0.12  # and the largest one
+BACKGROUND = 0.9  # what is measured farther than the table's depth over this is no table
 TRUSTED_ROUGHNESS = 0.003  # m, standard deviation of a table that needs no smoothing
 SMOOTHING_RADIUS = 0.007  # m, half the side of the windows that are smoothed
 COLOUR_NOISE = 0.01  # standard deviation of colours, 0..1, that are one surface
@@ -36,15 +38,18 @@ TABLE_SPREAD, HIGHEST_BUMP = 5.0, 0.015
 
 
 def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The frame with its depth scaled until the table lies at `table_height` (m in W), smoothed
-    where the table is rough, and the table flat; as it is where its camera is as good as that
-    already. It tells how rough the table was. So is its second frame."""
+    """The frame with its depth scaled until the table lies at `table_height` (m in W), without
+    background, smoothed where the table is rough, and the table flat; as it is where its camera is
+    as good as that already. It tells how rough the table was. So is its second frame."""
     if frame.second is not None:
         frame = replace(frame, second=corrected(frame.second, table_height))
-    scale, roughness = _scale_and_roughness(frame, table_height)
+    asked = _ratio_to_table(frame, table_height)
+    scale, spread = _scale_and_spread(asked)
     if scale != 1:
         frame = replace(frame, depth=(scale * frame.depth).astype(np.float32))
-    rest = roughness
+    if (asked < BACKGROUND * scale).sum() > _MUCH_BACKGROUND * len(asked):
+        frame = replace(frame, depth=without_background(frame, table_height))
+    rest = roughness = spread * middle_depth(frame) if spread else 0.0
     if roughness > TRUSTED_ROUGHNESS:
         frame = replace(frame, depth=smoothed_by_colour(frame))
         rest = table_roughness(frame, table_height)
@@ -53,6 +58,19 @@ def corrected(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     # A frame that was corrected before is less rough now, but no more certain.
     roughness, rest = max(frame.roughness, roughness), max(frame.noise, rest)
     return replace(frame, roughness=roughness, noise=rest)
+
+
+def without_background(frame: RGBDFrame, table_height: float) -> np.ndarray:
+    """(H, W) float32 depth with the table's own, as if the table went on, where the measured one is
+    more than 1 / BACKGROUND times as large; and 0, unknown, where a pixel's ray meets no table.
+
+    The floor beside a table, or a wall behind it, may fill most of an image: lengths in pixels,
+    which are taken at the median depth, are to be those on the table.
+    """
+    table = depth_of_plane(frame, table_height)
+    met = np.isfinite(table) & (table > 0)
+    beyond = known_depth(frame.depth) & (BACKGROUND * frame.depth > table) & met
+    return np.where(beyond, table, np.where(met, frame.depth, 0)).astype(np.float32)
 
 
 def scale_to_table(frame: RGBDFrame, table_height: float) -> float:
@@ -66,8 +84,8 @@ def _densest(asked: np.ndarray) -> float:
 
     Those of the table ask for the same one. It is the densest of all, weighted by how likely a
     camera is to be that wrong, because the top of a box asks alike, too. But nothing lies under a
-    table: where a flat surface is seen beneath that one, it is the table, and what asked alike was
-    the top of something wide.
+    table: where a flat surface is seen beneath that one, even a small one, it is the table, and
+    what asked alike was the top of something wide.
     """
     least = _LEAST_SHARE * len(asked)
     asked = asked[np.abs(asked - 1) < SCALE_REACH]
@@ -80,7 +98,7 @@ def _densest(asked: np.ndarray) -> float:
     best = float(middle[(density * np.exp(-(((middle - 1) / SCALE_SPREAD) ** 2) / 2)).argmax()])
     peaks = middle[1:-1][(density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])]
     for lower in peaks[peaks < best - 2 * _BLUR]:  # the farthest first
-        if (np.abs(asked - lower) < 2 * _BLUR).sum() > least:
+        if (np.abs(asked - lower) < 2 * _BLUR).sum() > _LOWER_SHARE * len(asked):
             best = float(lower)
             break
     for _ in range(_REFITS):
@@ -95,6 +113,8 @@ _BIN = 0.001  # of the histogram of factors
 _BLUR = 0.005  # standard deviation that is expected among the table's factors
 _REFITS = 3
 _LEAST_SHARE = 0.15  # of the known pixels that have to agree on the table
+_LOWER_SHARE = 0.05  # of those near any table, that tell of a flat surface beneath the densest
+_MUCH_BACKGROUND = 0.01  # of the known pixels
 _SAMPLE = 20_000  # pixels that are asked
 _NEAREST = 0.01  # m, in front of which a camera sees nothing
 
@@ -103,13 +123,13 @@ def table_roughness(frame: RGBDFrame, table_height: float) -> float:
     """Standard deviation in metres of the table's depth, once the frame is scaled to the table,
     from the median absolute deviation of all pixels near it; 0 where no table is seen. Depth in
     steps, as a Kinect's, has none: half of the table lies on one step."""
-    return _scale_and_roughness(frame, table_height)[1]
+    scale, spread = _scale_and_spread(_ratio_to_table(frame, table_height))
+    return spread * scale * middle_depth(frame) if spread else 0.0
 
 
-def _scale_and_roughness(frame: RGBDFrame, table_height: float) -> tuple[float, float]:
+def _scale_and_spread(asked: np.ndarray) -> tuple[float, float]:
     """The factor by which a frame's depth is corrected, 1 where it is trusted as it is, and the
-    roughness in metres of the table then."""
-    asked = _ratio_to_table(frame, table_height)
+    standard deviation of the table's depth as a share of it. asked: (N,) as of `_densest`."""
     scale = _densest(asked)
     if abs(scale - 1) <= TRUSTED_SCALE:
         scale = 1.0
@@ -117,8 +137,7 @@ def _scale_and_roughness(frame: RGBDFrame, table_height: float) -> tuple[float, 
     near = error[np.abs(error) < 4 * _BLUR]
     if len(near) <= _LEAST_SHARE * len(error):
         return scale, 0.0
-    spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    return scale, spread * scale * middle_depth(frame)
+    return scale, 1.4826 * float(np.median(np.abs(near - np.median(near))))
 
 
 def _ratio_to_table(frame: RGBDFrame, table_height: float) -> np.ndarray:

@@ -25,9 +25,9 @@ SMEAR = 0.0036  # m by which cameras that match windows smear depth over an edge
 # hole is, if its colour differs UNLIKE_OBJECT times as much from the nearest object's.
 LIKE_TABLE = 30.0
 UNLIKE_OBJECT = 2.0
-# A hole is at an edge where measured depths within EDGE_REACH pixels differ by EDGE_STEP metres. In
-# other holes may stand a thin part that was lost whole.
-EDGE_REACH = 3
+# A hole is at an edge where measured depths around it, EDGE_REACH metres and EDGE_PIXELS at least
+# away, differ by EDGE_STEP metres. In other holes may stand a thin part that was lost whole.
+EDGE_REACH, EDGE_PIXELS = 0.0035, 3
 EDGE_STEP = 0.012
 SURFACE_REACH = 0.012  # m around a hole's pixel in which a surface of its colour is looked for
 LIKE_SURFACE = 20.0  # by less than this differ the colours of one surface, three channels together
@@ -77,13 +77,14 @@ def _wide(unknown: np.ndarray, reach: int) -> np.ndarray:
     return cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
 
 
-def at_edges(depth: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels of a depth image (H, W), m, within EDGE_REACH pixels of measured depths
-    that differ by more than EDGE_STEP."""
-    known = known_depth(depth)
-    square = np.ones((2 * EDGE_REACH + 1, 2 * EDGE_REACH + 1), np.uint8)
-    farthest = cv2.dilate(np.where(known, depth, 0).astype(np.float32), square)
-    nearest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), square)
+def at_edges(frame: RGBDFrame) -> np.ndarray:
+    """(H, W) bool: pixels within EDGE_REACH metres, or EDGE_PIXELS where that is more, of measured
+    depths that differ by more than EDGE_STEP."""
+    known = known_depth(frame.depth)
+    reach = max(reach_in_pixels(frame, EDGE_REACH), EDGE_PIXELS)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    farthest = cv2.dilate(np.where(known, frame.depth, 0).astype(np.float32), square)
+    nearest = cv2.erode(np.where(known, frame.depth, np.inf).astype(np.float32), square)
     return farthest - nearest > EDGE_STEP
 
 
@@ -169,7 +170,7 @@ def surfaces_in_holes(frame: RGBDFrame) -> RGBDFrame:
     colours = np.pad(frame.rgb.astype(np.int32), ((reach, reach), (reach, reach), (0, 0)))
     colours = colours.reshape(-1, 3)
     filled = measured.copy()
-    left = np.flatnonzero(np.pad(~known & at_edges(frame.depth), reach))
+    left = np.flatnonzero(np.pad(~known & at_edges(frame), reach))
     for down, right in reversed(farthest_first(reach)):
         beside = left + down * width + right
         difference = ((colours[beside] - colours[left]) ** 2).sum(axis=1)

@@ -210,6 +210,11 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
+# Keys under which cameras' drivers and calibrations write the coefficients of a lens.
+DISTORTION = (
+    "coeffs", "D", "d", "dist", "dist_coeffs", "distortion", "distortion_coefficients",
+    "k1", "k2", "k3", "p1", "p2",
+)  # fmt: skip
 
 
 def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray:
@@ -249,7 +254,22 @@ def _intrinsics_in(path: Path) -> dict[str, float]:
         value = values.get(key, 0)
         if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
             raise UserError(f"{path}: {key} is {value!r:.40}, expected a number")
+    bent = [key for key in DISTORTION if key in values and np.any(_numbers_in(values[key]))]
+    if bent:
+        raise UserError(
+            f"{path}: {bent[0]} says that the lens distorts, and images are read as those of a "
+            "pinhole; undistort the colour and the depth image first, or leave the key out if that "
+            "is done"
+        )
     return values
+
+
+def _numbers_in(value: object) -> list[float]:
+    """The numbers of a value of a JSON file, however deep in lists and objects."""
+    if isinstance(value, (list, dict)):
+        parts = value.values() if isinstance(value, dict) else value
+        return [number for part in parts for number in _numbers_in(part)]
+    return [value] if isinstance(value, (int, float)) else []
 
 
 def intrinsics_matrix(

@@ -237,7 +237,7 @@ def without_holes(frame: RGBDFrame, workspace: Workspace) -> tuple[RGBDFrame, np
     cuts something off (`with_surroundings`), and are without the rows and columns in which nothing
     lies over the workspace or stands around it."""
     measured = known_depth(frame.depth)
-    hiding = ~measured & ~at_edges(frame.depth)
+    hiding = ~measured & ~at_edges(frame)
     if not measured.all():
         reach = reach_in_pixels(frame, HOLE_REACH)
         frame = replace(frame, depth=near_side(frame.depth, reach))

@@ -181,18 +181,23 @@ def _ransac(points: np.ndarray, tolerance: float, random: np.random.Generator) -
 
 # --- The table in a world -------------------------------------------------------------------
 
-LARGEST_TILT = 15.0  # degrees between the plane found and the world's horizontal
-DEEPEST = 0.05  # m that the typical point of a scene may lie below its table
+LARGEST_TILT, TRUSTED_TILT = 10.0, 2.0  # degrees between the plane found and the horizontal of W
+DEEPEST, SHALLOW = (
+    0.05,
+    0.2,
+)  # m that all but this share of a scene's points may lie below its table
 
 
 @dataclass(frozen=True)
 class Table:
     """T_WC: (4, 4) the camera in the world. height: z of the table in it, metres. share: of the
-    known points that lie on the table, or None if the user gave the height."""
+    known points that lie on the table, or None if the user gave the height. tilt: degrees of the
+    plane found from the horizontal; 0 where it defines the world, or none was searched."""
 
     T_WC: np.ndarray
     height: float
     share: float | None
+    tilt: float = 0.0
 
     def describe(self) -> str:
         """One line for the user."""
@@ -204,34 +209,44 @@ class Table:
             "from straight down"
         )
 
+    def remarks(self) -> list[str]:
+        """A remark on a plane that is not level in the world."""
+        if self.tilt <= TRUSTED_TILT:
+            return []
+        return [
+            f"the table found is tilted by {self.tilt:.0f} degrees in your world, and was taken "
+            "for level; is the camera's pose T_WC, from the optical frame to the world, and exact?"
+        ]
+
 
 def find_table(points: np.ndarray, T_WC: np.ndarray | None = None) -> Table:
     """The table in points (..., 3) of the camera's frame; rows of NaN are unknown.
 
     Without T_WC (4, 4) the plane itself defines the world, at height 0. With it, the plane has to
-    be level in the world; a pose in another convention is recognised by a UserError here.
+    be level in the world, else a UserError is raised. Not every pose in another convention is
+    found so: the inverse of that of a camera that looks straight down leaves the plane level, too.
     """
     plane = dominant_plane(points)
     if T_WC is None:
         return Table(plane.camera_pose(), 0.0, plane.share)
     up = T_WC[:3, :3] @ plane.normal
-    tilt = np.rad2deg(np.arccos(np.clip(up[2], -1, 1)))
+    tilt = float(np.rad2deg(np.arccos(np.clip(up[2], -1, 1))))
     if tilt > LARGEST_TILT:
         raise UserError(
             f"--camera-pose: the largest plane seen would be tilted by {tilt:.0f} degrees in the "
             "world; is the pose T_WC of the optical frame (x right, y down, z forward)? If the "
             "plane is not the table, give --table-height"
         )
-    return Table(T_WC, float(transform_points(T_WC, plane.centre)[2]), plane.share)
+    return Table(T_WC, float(transform_points(T_WC, plane.centre)[2]), plane.share, tilt)
 
 
 def table_at_height(height: float, points: np.ndarray, T_WC: np.ndarray) -> Table:
-    """The table at the user's height; UserError if most of the scene would lie under it."""
-    above = np.nanmedian(transform_points(T_WC, points)[..., 2]) - height
+    """The table at the user's height; UserError if nearly all of the scene would lie under it."""
+    above = np.nanquantile(transform_points(T_WC, points)[..., 2], 1 - SHALLOW) - height
     if above < -DEEPEST:
         raise UserError(
-            f"--table-height: the typical point seen lies {-above:.2f} m below the table at "
-            f"{height:g} m; check the height and the camera pose"
+            f"--table-height: {1 - SHALLOW:.0%} of what is seen lies {-above:.2f} m or more below "
+            f"the table at {height:g} m; check the height and the camera pose"
         )
     return Table(T_WC, height, None)
 

@@ -66,7 +66,10 @@ class Grasp:
         check_approach(approach)
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "approach", approach)
-        object.__setattr__(self, "angle", wrap_to_pi_range(self.angle))
+        object.__setattr__(self, "angle", wrap_to_pi_range(float(self.angle)))
+        # A planner may compute in float32 or in tensors, which no JSON file takes.
+        object.__setattr__(self, "width", float(self.width))
+        object.__setattr__(self, "quality", float(self.quality))
 
     @staticmethod
     def from_pose(T_WE: np.ndarray, width: float, quality: float) -> Grasp:
@@ -172,8 +175,8 @@ class RGBDFrame:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises UserError where an image, K or T_WC is none, and where the images differ in
-        size."""
+        """Raises UserError where an image, K, T_WC or a target is none, and where the images
+        differ in size. A target of numbers is True where it is not 0."""
         check_images(self.rgb, self.depth)
         K, T = np.asarray(self.K, dtype=float), np.asarray(self.T_WC, dtype=float)
         if K.shape != (3, 3):
@@ -186,6 +189,12 @@ class RGBDFrame:
             )
         if T.shape != (4, 4):
             raise UserError(f"T_WC: got an array of shape {T.shape}, expected a pose (4, 4)")
+        if not np.isfinite(T).all():
+            raise UserError("T_WC: the camera's pose holds a number that is not finite")
+        if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
+            raise UserError(
+                f"T_WC: its last row is {T[3].tolist()}, expected 0 0 0 1; is it transposed?"
+            )
         turn = T[:3, :3]
         if not (np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0):
             raise UserError(
@@ -193,6 +202,14 @@ class RGBDFrame:
             )
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "T_WC", T)
+        if self.target is not None:
+            target = np.asarray(self.target)
+            if target.shape != self.depth.shape:
+                raise UserError(
+                    f"target: got an array of shape {target.shape}, expected that of the depth "
+                    f"image, {self.depth.shape}"
+                )
+            object.__setattr__(self, "target", target != 0)
 
     def points(self) -> np.ndarray:
         """(H, W, 3) points in W; rows of NaN where the depth is unknown."""

@@ -8,6 +8,7 @@ the table; `check_view` refuses an image that shows too little for grasps to be 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from utils.depth_holes import check_rgbd, depth_of_plane
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import LABEL_FLOOR
+from utils.table_plane import TOLERANCE, Table, find_table, table_at_height
 from utils.transforms import RGBDFrame, deproject, known_depth, project
 
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
 SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
 LARGEST_SPAN, SMALLEST_SPAN = 3.0, 0.06  # m, of an image that a hand grasps from
+OFF_CENTRE = 0.3  # of half the image, a principal point from its middle
 FARTHEST_CAMERA = 50.0  # m from the world's origin; 5 cm in millimetres
 MARGIN = 0.02  # m around what stands on the table
 ROUGH = 0.002  # m, standard deviation of a table whose bumps are as high as what a hand grasps
@@ -72,6 +75,43 @@ def workspace_of(
     return Workspace(_pair(centre), LARGEST, table_height), [remark]
 
 
+def locate_table(image: RGBDFrame, T_WC: np.ndarray | None, height: float | None) -> Table:
+    """The table in an image whose world is the camera's frame.
+
+    T_WC: (4, 4) the camera in the user's world, height: z of the table in it, m. Without a height
+    the table is searched (`find_table`), and without T_WC it defines the world. Where a smaller
+    flat surface is seen beneath the plane found, that is the table: the plane is the top of
+    something wide, as of boxes side by side. Raises UserError.
+    """
+    check_rgbd(image.rgb, image.depth)
+    depth, width, tall = _span(image)
+    if min(width, tall) < SMALLEST_SPAN / 2:
+        raise UserError(
+            f"at the median depth of {depth:.3g} m the image spans {width:.2g} m x {tall:.2g} m, "
+            "too little for a hand's grasps; check the unit of the depth and the focal length"
+        )
+    if T_WC is not None and height is not None:
+        return table_at_height(height, image.points(), T_WC)
+    table = find_table(image.points(), T_WC)
+    frame = replace(image, T_WC=table.T_WC)
+    scale = scale_to_table(frame, table.height)
+    if abs(scale - 1) <= TRUSTED_SCALE:
+        return table
+    # Depths in which the table was searched say nothing about the camera's scale. What they ask for
+    # is a plane that is parallel, and 1 / scale times as far away.
+    deeper = (table.T_WC[2, 3] - table.height) * (1 / scale - 1)
+    if T_WC is None:  # the table is at z = 0
+        lower = table.T_WC.copy()
+        lower[2, 3] += deeper
+        table = replace(table, T_WC=lower)
+    else:
+        table = replace(table, height=table.height - deeper)
+    above = replace(image, T_WC=table.T_WC).points()[..., 2] - table.height
+    known = known_depth(image.depth)
+    near = np.abs(above[known]) < TOLERANCE * np.median(image.depth[known])
+    return replace(table, share=float(near.mean()))
+
+
 def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, list[str]]:
     """The frame as planners correct it by its table (`utils.depth_correction`), and remarks where
     all depths were scaled, or the table is rough: it may be the camera that is wrong, but also its
@@ -79,9 +119,9 @@ def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, li
     scale, after, remarks = scale_to_table(frame, table_height), corrected(frame, table_height), []
     if abs(scale - 1) > TRUSTED_SCALE:
         remarks.append(
-            f"all depths were multiplied by {scale:.3f}, so that the largest flat surface lies at "
-            f"the table's height of {table_height:g} m; check that height, the camera's pose and "
-            "the unit of the depth image"
+            f"all depths were multiplied by {scale:.3f}, so that the flat surface that was taken "
+            f"for the table lies at its height of {table_height:g} m; check that height, the "
+            "camera's pose and the unit of the depth image"
         )
     if after.roughness > ROUGH:
         remarks.append(
@@ -160,6 +200,11 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
             f"the principal point ({cx:g}, {cy:g}) lies outside the image of {width}x{height} "
             "pixels: right for a part of an image, wrong for intrinsics of another resolution"
         )
+    elif max(abs(2 * cx / width - 1), abs(2 * cy / height - 1)) > OFF_CENTRE:
+        remarks.append(
+            f"the principal point ({cx:g}, {cy:g}) is far from the middle of the image of "
+            f"{width}x{height} pixels; are the intrinsics those of another resolution?"
+        )
     if tilt > OBLIQUE:
         remarks.append(
             f"the camera looks {tilt:.0f} degrees off the table's normal; planners are measured up "
@@ -186,9 +231,7 @@ def _check_units(frame: RGBDFrame) -> list[str]:
     """Remarks on an image that spans far more or far less than a hand's workspace, and on a camera
     far from the world's origin: units may be wrong."""
     remarks = []
-    depth = float(np.median(frame.depth[known_depth(frame.depth)]))
-    rows, columns = frame.depth.shape
-    width, height = columns * depth / frame.K[0, 0], rows * depth / frame.K[1, 1]
+    depth, width, height = _span(frame)
     if max(width, height) > LARGEST_SPAN or min(width, height) < SMALLEST_SPAN:
         remarks.append(
             f"at the median depth of {depth:.3g} m the image spans {width:.3g} m x {height:.3g} m; "
@@ -200,6 +243,13 @@ def _check_units(frame: RGBDFrame) -> list[str]:
             "that is not so"
         )
     return remarks
+
+
+def _span(frame: RGBDFrame) -> tuple[float, float, float]:
+    """The median known depth, and how wide and high what the image shows is there; metres."""
+    depth = float(np.median(frame.depth[known_depth(frame.depth)]))
+    rows, columns = frame.depth.shape
+    return depth, columns * depth / frame.K[0, 0], rows * depth / frame.K[1, 1]
 
 
 def check_found(found: int, frame: RGBDFrame, workspace: Workspace) -> list[str]:
