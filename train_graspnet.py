@@ -66,7 +66,7 @@ from models.rectangle_folds import (
 )
 from utils.atomic_files import cannot_write, check_writable
 from utils.config import COMPUTE_KEYS, Config
-from utils.distributed import Team, run_folder, stop_on_interrupt, team
+from utils.distributed import Team, run_folder, stop_on_interrupt, team, without_initial
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_writable("--weights", options.weights)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
     check_place(options.resume or Path("runs/train_graspnet"))
-    check_network(config)  # before there is data
+    check_network(without_initial(config, "train", options.resume))  # before there is data
     photographs = open_target(config)
     with team(config.train.device, os.environ) as processes:
         if config.data.kind != "simulated":
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         data = make_data(config, processes, options.resume is not None)
         if photographs is not None:
             data = with_target(config, data, photographs)
-        trainer = make_trainer(config, data, processes)
+        trainer = make_trainer(without_initial(config, "train", options.resume), data, processes)
         with run_folder(
             "train_graspnet", config.train.name, config, options.resume, processes
         ) as run:
@@ -223,7 +223,7 @@ def train_folds(
     judged: dict[int, list[JudgedRectangle]] = {}
     for fold in folds:
         folder = run / f"fold{fold.number}"
-        trainer = make_trainer(config, fold.data, processes)
+        trainer = make_trainer(without_initial(config, "train", folder), fold.data, processes)
         if processes.is_main:
             folder.mkdir(exist_ok=True)
         processes.wait()

@@ -82,7 +82,7 @@ from models.ppo_rollouts import (
 )
 from utils.atomic_files import check_writable
 from utils.config import Config
-from utils.distributed import Team, run_folder, stop_on_interrupt, team
+from utils.distributed import Team, run_folder, stop_on_interrupt, team, without_initial
 from utils.errors import UserError
 from utils.runs import Stopwatch, check_resume, parse_args, run_script, this_python
 
@@ -112,7 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         team(config.rl.device, os.environ, "rl.device") as processes,
         training_envs(config, envs_of_each(config, processes)) as envs,
     ):
-        ppo = make_ppo(envs.observation_space, envs.action_space, config, processes)
+        initial = without_initial(config, "rl", options.resume)
+        ppo = make_ppo(envs.observation_space, envs.action_space, initial, processes)
         with run_folder("train_rl", config.rl.name, config, options.resume, processes) as run:
             history = load_progress(ppo, run / "last.pt")
             if processes.is_main:

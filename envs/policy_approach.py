@@ -44,6 +44,7 @@ class PolicyApproach:
 
     trained: sections env and camera of the config that the policy was trained with, as plain data;
         the rest of the config is the cell's, and so is the depth noise.
+    observations: the entries that the policy observes, whatever `trained` says.
     closed_at: the hand's pose when it closed, None until then.
 
     The approach ends when both fingers have gripped something for a quarter of a second and stand
@@ -55,10 +56,11 @@ class PolicyApproach:
         cell: Cell,
         policy: Callable[[dict[str, np.ndarray]], np.ndarray],
         trained: dict[str, dict[str, Any]],
+        observations: Sequence[str],
     ):
         # Reward and starts are not used, and the cell has its objects already.
         plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
-        plain |= {"near_share": 0.0, "missed_share": 0.0}
+        plain |= {"near_share": 0.0, "missed_share": 0.0, "observations": list(observations)}
         noise = cell.config.camera.model_dump(include={"depth_noise", "depth_noise_args"})
         config = with_settings(cell.config, "camera", trained["camera"] | noise)
         self.env = RobotGraspingEnv(config=config, cell=cell, **plain)
@@ -73,7 +75,7 @@ class PolicyApproach:
         try:
             observation, info = self.env.take_over()
             while not ended and gripped < _SURE:
-                action = self.policy({**info, **observation})
+                action = self.policy(observation)
                 observation, _, terminated, truncated, info = self.env.step(action)
                 ended = terminated or truncated
                 moved, before = abs(cell.robot.opening - before), cell.robot.opening
@@ -129,9 +131,7 @@ def check_learned(
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         _check_spaces(policy, config)
-        _check_knowledge(name, list(policy.observation_space.spaces))
-    else:
-        _check_knowledge(name, [part.key for part in policy.layout.state])
+    _check_knowledge(name, policy.observations)
     for scenario in scenarios:
         if scenario not in LEARNED_SCENARIOS:
             raise UserError(
@@ -191,6 +191,7 @@ def learned_approach(name: str, cell: Cell) -> PolicyApproach:
     policy = load_learned(name)
     if isinstance(policy, Sb3Policy):
         sections = {"env": cell.config.env, "camera": cell.config.camera}
-        return PolicyApproach(cell, policy, {key: sections[key].model_dump() for key in sections})
+        trained = {key: sections[key].model_dump() for key in sections}
+        return PolicyApproach(cell, policy, trained, policy.observations)
     with reading(name):
-        return PolicyApproach(cell, policy, policy.config)
+        return PolicyApproach(cell, policy, policy.config, policy.observations)

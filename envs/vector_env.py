@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from envs.evaluation_worker import load_objects
 from utils.config import YAML_ERRORS, Config, load_yaml
+from utils.config_schema import EnvConfig
 from utils.errors import UserError, one_line
 from utils.runs import REPOSITORY
 from utils.worker_process import leave_signals, worker_environment
@@ -242,6 +243,11 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
     if render_mode is not None:  # panda-gym does not take None
         arguments["render_mode"] = render_mode
     if settings.env_id in OWN_ENVS:
+        for name in arguments:
+            if name in EnvConfig.model_fields:  # which alone the policy is scored by later
+                raise UserError(
+                    f"rl.env_kwargs: {name} is a key of section env; set env.{name} instead"
+                )
         arguments["config"] = config
     no_pictures = UserError(f"rl.films: {settings.env_id} draws no pictures; use rl.films=0")
     try:

@@ -8,6 +8,7 @@ one from a checkpoint.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,6 +50,12 @@ __all__ = [
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 _SHIPPED = ("layout", "history", "rewards")  # of a checkpoint's other entries
 BOUNDS = ("action_low", "action_high")  # of an action space, perhaps infinite
+# What no shape of a weight tells of the function that weights stand for: of the network's
+# arguments, and the keys of section rl that set them.
+UNSHAPED = {
+    "activation": "activation", "squash": "squash", "normalise": "normalise_observations",
+}  # fmt: skip
+MEANING = ("control", "frame", "gripper")  # keys of section env that say what an action means
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
@@ -393,7 +400,7 @@ def make_ppo(
     network = policy_for(layout, action_space, settings)
     if settings.initial is None:
         return GraspPPO(network, layout, settings, team, config.seed)
-    extra = load_initial(network, layout, settings.initial)
+    extra = load_initial(network, layout, settings.initial, config)
     ppo = GraspPPO(network, layout, settings, team, config.seed)
     if "rewards" in extra:
         with reading(settings.initial):
@@ -402,15 +409,26 @@ def make_ppo(
 
 
 def load_initial(
-    network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str
+    network: GraspPolicyNetwork, layout: ObservationLayout, path: Path | str, config: Config
 ) -> dict[str, Any]:
-    """Load a checkpoint's weights, the deviation of its actions among them, into a network that
-    sees by `layout`, which keeps the bounds of its own actions. Returns the checkpoint's other
-    entries. Raises UserError where the checkpoint's policy sees something else, and for weights
-    that are not finite."""
+    """Load a checkpoint's weights, the deviation of its actions among them, into a network of this
+    config that sees by `layout`, which keeps the bounds of its own actions. Returns the
+    checkpoint's other entries. Raises UserError where the checkpoint's policy sees something else
+    or computes otherwise, and for weights that are not finite. Warns where its actions meant
+    something else."""
     checkpoint = load_checkpoint(path, KIND)
     with reading(path):
         seen = ObservationLayout.from_plain(checkpoint["extra"]["layout"])
+        for name, key in UNSHAPED.items():
+            both = checkpoint["model_args"], network.model_args
+            before, now = (str(args[name]).lower() for args in both)  # as a config has it
+            if before != now:
+                raise UserError(
+                    f"rl.initial {path}: its policy was trained with rl.{key}={before}, and this "
+                    f"one has {now}; set rl.{key}={before}, or rl.initial=null"
+                )
+        trained, env = checkpoint["config"].get("env", {}), config.env.model_dump()
+        others = [key for key in MEANING if trained.get(key, env[key]) != env[key]]
     if seen.entries() != layout.entries():
         raise UserError(
             f"rl.initial {path}: its policy sees {_listed(seen)}, this one {_listed(layout)}; set "
@@ -421,6 +439,14 @@ def load_initial(
     if not all(bool(weights[name].isfinite().all()) for name in weights.keys() - own.keys()):
         raise UserError(f"{path}: holds weights that are not finite; its training has diverged")
     load_weights(network, checkpoint | {"model": weights}, path)
+    if others:
+        warnings.warn(
+            f"rl.initial {path}: its policy was trained with "
+            f"{', '.join(f'env.{key}={trained[key]}' for key in others)}, and not with "
+            f"{', '.join(str(env[key]) for key in others)}, so that its actions mean something "
+            "else here",
+            stacklevel=2,
+        )
     return checkpoint["extra"]
 
 
@@ -439,6 +465,11 @@ class SavedPolicy(NamedTuple):
     layout: ObservationLayout
     extra: dict
     config: dict
+
+    @property
+    def observations(self) -> list[str]:
+        """The keys of what it sees."""
+        return [part.key for part in (*self.layout.images, *self.layout.state)]
 
     def __call__(self, observation: dict[str, np.ndarray] | np.ndarray) -> np.ndarray:
         """(A,) the deterministic action for one observation of one environment."""

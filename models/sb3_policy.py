@@ -12,6 +12,7 @@ import io
 import json
 import pickle
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,16 +22,31 @@ from gymnasium import spaces
 
 from utils.errors import UserError
 
+_VEC_NORMALIZE = (
+    "VecNormalize, whose statistics model.save leaves out; train without it, or put the "
+    "normalisation into the policy"
+)
+
 
 class Sb3Policy:
     """A deterministic policy: a callable from an observation, a dict of arrays, to an action (A,).
 
     observation_space, action_space: those of its training; images may be stored as (C, H, W).
+    last: what it saw last in its training, (N, ...) of each entry; empty where that is not known.
+    under_vec_normalize: whether the file tells that its training was; only those of PPO and A2C do.
     """
 
-    def __init__(self, path: Path, model: Any):
-        self.path, self.model = path, model
+    def __init__(
+        self, path: Path, model: Any, last: dict[str, np.ndarray], under_vec_normalize: bool
+    ):
+        self.path, self.model, self.last = path, model, last
+        self.under_vec_normalize = under_vec_normalize
         self.observation_space, self.action_space = model.observation_space, model.action_space
+
+    @property
+    def observations(self) -> list[str]:
+        """The keys of what it sees."""
+        return list(self.observation_space.spaces)
 
     def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         seen = {key: np.asarray(observation[key]) for key in self.observation_space.spaces}
@@ -38,13 +54,26 @@ class Sb3Policy:
         return action
 
     def check_spaces(self, observations: spaces.Dict, actions: spaces.Box) -> None:
-        """Raise UserError unless the policy can act in an environment with these spaces."""
+        """Raise UserError unless the policy can act in an environment with these spaces, on
+        observations like those of its training; warn where these were perhaps normalised."""
         theirs = self.observation_space
         if not isinstance(theirs, spaces.Dict):
             raise UserError(
                 f"{self.path}: the policy observes {theirs}, expected a Dict of "
                 f"{_described(observations)}; train it with MultiInputPolicy on the environment "
                 "without a wrapper that changes its observations"
+            )
+        for key, box in observations.spaces.items():
+            if key in self.last and _leaves(self.last[key], box):
+                raise UserError(
+                    f"{self.path}: what the policy last saw of {key!r} in its training is beyond "
+                    f"the bounds that the section env gives, as under {_VEC_NORMALIZE}"
+                )
+        if self.under_vec_normalize:
+            warnings.warn(
+                f"{self.path}: unless it normalised rewards alone, the policy is scored on other "
+                f"observations than it was trained on, under {_VEC_NORMALIZE}",
+                stacklevel=2,
             )
         fits = all(
             key in observations.spaces and _same_box(box, observations[key])
@@ -81,14 +110,23 @@ def load_sb3(path: Path) -> Sb3Policy:
         with zipfile.ZipFile(path) as archive:
             data = json.loads(archive.read("data"))
         module = data["policy_class"]["__module__"]
-        kind = module.split(".")[1]
+        package, kind = [*module.split("."), ""][:2]
+        if package != "stable_baselines3":
+            raise UserError(
+                f"sb3:{path}: the policy is of {package}, which is not supported; train with PPO, "
+                "A2C, SAC, TD3 or DDPG of stable_baselines3, and their own policies"
+            )
         if kind not in algorithms:
             raise UserError(
                 f"sb3:{path}: the policy is of {module}, which has no continuous actions; train "
                 "with PPO, A2C, SAC, TD3 or DDPG"
             )
         algorithm = getattr(stable_baselines3, algorithms[kind])
-        return Sb3Policy(path, algorithm.load(path, device="cpu", custom_objects=_replaced(data)))
+        model = algorithm.load(path, device="cpu", custom_objects=_replaced(data))
+        last = _unpickled(data["_last_obs"]) if data.get("_last_obs") else None
+        # Which algorithms of kind "common" keep for VecNormalize alone.
+        normalised = kind == "common" and bool(data.get("_last_original_obs"))
+        return Sb3Policy(path, model, last if isinstance(last, dict) else {}, normalised)
     except OSError as error:
         raise UserError(f"sb3:{path}: cannot read this file: {error.strerror}") from error
     except UserError:
@@ -144,6 +182,12 @@ class _NetworkUnpickler(pickle.Unpickler):
             if is_function or isinstance(found, type):
                 return found
         raise pickle.UnpicklingError(f"it holds {place}, which no policy needs")
+
+
+def _leaves(seen: np.ndarray, box: spaces.Box) -> bool:
+    """Whether a batch of observations leaves a box; not where their shapes differ."""
+    inside = (box.low <= seen) & (seen <= box.high) if seen.shape[1:] == box.shape else True
+    return not np.all(inside)
 
 
 def _same_box(theirs: spaces.Box, ours: spaces.Box) -> bool:

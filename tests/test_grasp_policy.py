@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import gymnasium
 import numpy as np
@@ -308,6 +309,40 @@ def test_a_policy_that_is_continued_keeps_the_unit_of_its_values(tmp_path):
         # 512 steps were seen, of which a rollout's worth still counts.
         rollout = after.settings.envs * after.settings.rollout_steps
         assert after.rewards.moments.count.item() == min(512, rollout)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("activation=relu", "trained with rl.activation=tanh, and this one has relu; set"),
+        ("squash=true", "rl.squash=false, and this one has true; set rl.squash=false, or"),
+        ("normalise_observations=false", "rl.normalise_observations=true, and this one has false"),
+    ],
+)
+def test_weights_of_another_function_are_not_continued(tmp_path, change, message):
+    """Though all their shapes fit."""
+    act, small = spaces.Box(-1.0, 1.0, (2,), np.float32), ["rl.hidden_dim=16"]
+    path = tmp_path / "policy.pt"
+    make_ppo(SEEN, act, load_config(None, small)).save(path)
+    config = load_config(None, [*small, f"rl.initial={path}", f"rl.{change}"])
+    with pytest.raises(UserError, match=f"rl.initial {path}: .*{message}"):
+        make_ppo(SEEN, act, config)
+
+
+def test_actions_that_meant_something_else_are_remarked_on(tmp_path):
+    act, small = spaces.Box(-1.0, 1.0, (2,), np.float32), ["rl.hidden_dim=16"]
+    trained = load_config(None, [*small, "env.frame=hand", "env.gripper=change"])
+    path = tmp_path / "policy.pt"
+    make_ppo(SEEN, act, trained).save(path, trained)
+    initial = f"rl.initial={path}"
+    with pytest.warns(UserWarning) as caught:
+        make_ppo(SEEN, act, load_config(None, [*small, initial, "env.gripper=change"]))
+    (warning,) = caught
+    assert "trained with env.frame=hand, and not with world, so that" in str(warning.message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_ppo(SEEN, act, load_config(None, [*small, initial, "env.frame=hand",
+                                               "env.gripper=change"]))  # fmt: skip
 
 
 @pytest.mark.parametrize("keys", [["depth", "rgb"], ["rgb"], ["state"], ["grey"]])

@@ -13,10 +13,10 @@ from envs.env_actions import ActionDecoder
 from envs.execution import execute_grasp
 from envs.grasping_env import RobotGraspingEnv
 from envs.objects import load_object_set
-from envs.policy_approach import PolicyApproach, foreign_objects, placeholder
+from envs.policy_approach import PolicyApproach, foreign_objects, learned_approach, placeholder
 from envs.simulators import make_cell
 from envs.vector_env import make_env
-from models.grasp_policy import load_policy
+from models.grasp_policy import load_policy, make_ppo
 from tests.helpers.simulators import move, needs_pybullet
 from utils.config import load_config
 from utils.errors import UserError
@@ -127,13 +127,42 @@ def test_moving_the_hidden_box_changes_nothing_but_the_image(box):
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("seen", "images"),
+    [(["state", "reachable"], 0), (["depth", "gripper"], 3)],
+)
+def test_in_a_cell_a_policy_observes_what_it_did_in_training(tmp_path, config, seen, images):
+    """Whatever env.observations says; a cell renders no image that the policy does not see."""
+    trained = load_config(
+        None,
+        [*ANYWHERE, "env.observations=[state]", f"rl.policy_observations=[{','.join(seen)}]",
+         "rl.privileged_observations=[grasped]", "env.max_steps=2"],
+    )  # fmt: skip
+    env = make_env(trained)
+    make_ppo(env.observation_space, env.action_space, trained).save(tmp_path / "new.pt", trained)
+    env.close()
+    observed = []
+    with make_cell(config) as cell:
+        approach = learned_approach(f"ppo:{tmp_path / 'new.pt'}", cell)
+        policy = approach.policy
+        approach.policy = lambda observation: observed.append(observation) or policy(observation)
+        objects = load_object_set("box", cache_dir=config.cache_folder)
+        cell.load(make_scene("isolated", objects, 0, config))
+        assert execute_grasp(cell, placeholder(None)[0], approach).reason == "stopped"
+        assert cell.observations == images, "at the start and after each of two actions"
+    own = {name: env.observation_space[name] for name in seen}
+    assert [set(one) for one in observed] == [set(seen)] * 2
+    assert all(own[name].contains(value) for one in observed for name, value in one.items())
+
+
 @needs_pybullet
 def test_the_policy_grasps_for_the_judge_of_planned_grasps(box, config):
     """In the cell of evaluate.py, whose own camera hangs overhead."""
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
     with make_cell(config) as cell:
-        approach, outcomes = PolicyApproach(cell, policy, policy.config), []
+        approach = PolicyApproach(cell, policy, policy.config, policy.observations)
+        outcomes = []
         for seed in range(3):
             cell.load(make_scene("isolated", objects, seed, config))
             (grasp,) = placeholder(cell.frame())
@@ -147,7 +176,7 @@ def test_a_policy_that_grips_nothing_is_stopped(box, config):
     policy = load_policy(box)
     objects = load_object_set("box", cache_dir=config.cache_folder, **config.objects.model_dump())
     with make_cell(config) as cell:
-        approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config)
+        approach = PolicyApproach(cell, lambda observation: np.zeros(5), policy.config, ["state"])
         cell.load(make_scene("isolated", objects, 0, config))
         outcome = execute_grasp(cell, placeholder(cell.frame())[0], approach)
         assert (outcome.reason, approach.closed_at) == ("stopped", None)
@@ -163,7 +192,7 @@ def test_a_grip_at_the_last_action_counts(box, config, monkeypatch):
     with make_cell(config) as cell:
         trained = policy.config | {"env": policy.config["env"] | {"max_steps": 12}}
         approach = PolicyApproach(
-            cell, lambda observation: np.array([0, 0, 1.0, 0, -0.15]), trained
+            cell, lambda observation: np.array([0, 0, 1.0, 0, -0.15]), trained, ["state"]
         )
         cell.load(make_scene("isolated", objects, 0, config))
         monkeypatch.setattr(cell.robot, "grips", lambda: cell.robot.encoder_pose()[2, 3] < 0.2)
@@ -183,12 +212,12 @@ def driven(cell, actions, seed=0):
     joint positions at the end."""
     objects = load_object_set("box", cache_dir=cell.config.cache_folder)
     trained = {
-        "env": cell.config.env.model_dump() | {"control": "ee_planar", "observations": ("state",)},
+        "env": cell.config.env.model_dump() | {"control": "ee_planar"},
         "camera": cell.config.camera.model_dump(),
     }
     trained["env"]["max_steps"] = len(actions)
     left = iter(actions)
-    approach = PolicyApproach(cell, lambda observation: next(left), trained)
+    approach = PolicyApproach(cell, lambda observation: next(left), trained, ["state"])
     sent = recorded(approach.env._actions)
     cell.load(make_scene("isolated", objects, seed, cell.config))
     execute_grasp(cell, placeholder(None)[0], approach)

@@ -118,6 +118,11 @@ def test_one_fold_of_jacquard_with_weights_and_an_initial_network(tmp_path, monk
     assert names == ["0_object1", "1_object1"]
     assert load_graspnet(weights).model.max_width == 0.25
 
+    # Its last.pt is there: resuming it needs the initial network no more.
+    initial.unlink()
+    assert train_graspnet.main(["--resume", str(folder)]) == 0
+    assert json.loads((folder / "results.json").read_text()) == results
+
 
 @pytest.mark.slow
 def test_bars_are_learned(tmp_path, monkeypatch):

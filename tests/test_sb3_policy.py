@@ -3,6 +3,7 @@
 import base64
 import builtins
 import json
+import warnings
 import zipfile
 
 import cloudpickle
@@ -21,6 +22,9 @@ from utils.config import load_config
 from utils.errors import UserError
 
 stable_baselines3 = pytest.importorskip("stable_baselines3")
+DummyVecEnv = stable_baselines3.common.vec_env.DummyVecEnv
+VecNormalize = stable_baselines3.common.vec_env.VecNormalize
+FEW = {"PPO": {"n_steps": 8, "batch_size": 8, "n_epochs": 1}, "SAC": {"learning_starts": 4}}
 SETTINGS = {"observations": ["state"], "control": "ee_planar", "max_steps": 4}
 CONFIG = load_config(
     None,
@@ -33,8 +37,7 @@ def files(tmp_path_factory):
     """The files of a PPO and a SAC policy, each trained for a few steps."""
     folder = tmp_path_factory.mktemp("sb3")
     env = gymnasium.make("RobotGrasping-v0", **SETTINGS)
-    few = {"PPO": {"n_steps": 8, "batch_size": 8, "n_epochs": 1}, "SAC": {"learning_starts": 4}}
-    for name, settings in few.items():
+    for name, settings in FEW.items():
         algorithm = getattr(stable_baselines3, name)
         model = algorithm("MultiInputPolicy", env, seed=0, device="cpu", **settings)
         model.learn(8).save(folder / f"{name}.zip")
@@ -99,10 +102,49 @@ def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
         check_learned(f"sb3:{tmp_path / 'knowing.zip'}", ["isolated"], ["open_loop"], knowing)
 
 
+def normalised(algorithm, settings, **arguments):
+    """A policy that was trained for some steps under VecNormalize."""
+    env = DummyVecEnv([lambda: gymnasium.make("RobotGrasping-v0", **SETTINGS)])
+    env = VecNormalize(env, **arguments)
+    model = algorithm("MultiInputPolicy", env, seed=0, device="cpu", **settings)
+    model.learn(16)
+    env.close()
+    return model
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC"])
+def test_a_policy_of_normalised_observations_is_refused(tmp_path, name):
+    """Its spaces are those of the environment: VecNormalize changes them for images alone."""
+    model = normalised(getattr(stable_baselines3, name), FEW[name])
+    model.save(tmp_path / "policy.zip")
+    with pytest.raises(UserError, match="'state' .* as under VecNormalize, whose statistics"):
+        check_learned(f"sb3:{tmp_path / 'policy.zip'}", ["isolated"], ["open_loop"], CONFIG)
+
+
+def test_a_policy_of_normalised_rewards_is_remarked_on(files, tmp_path):
+    model = normalised(stable_baselines3.PPO, FEW["PPO"], norm_obs=False)
+    model.save(tmp_path / "policy.zip")
+    with pytest.warns(UserWarning, match="unless it normalised rewards alone.*VecNormalize"):
+        check_learned(f"sb3:{tmp_path / 'policy.zip'}", ["isolated"], ["open_loop"], CONFIG)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in FEW:
+            check_learned(f"sb3:{files / name}.zip", ["isolated"], ["open_loop"], CONFIG)
+
+
+def test_a_normalised_image_is_refused(files):
+    policy = load_sb3(files / "PPO.zip")
+    policy.observation_space = spaces.Dict({"rgb": spaces.Box(-10, 10, (64, 48, 3), np.float32)})
+    policy.last = {"rgb": np.linspace(-1, 1, 64 * 48 * 3).reshape(1, 64, 48, 3)}
+    ours = spaces.Dict({"rgb": spaces.Box(0, 255, (64, 48, 3), np.uint8)})
+    with pytest.raises(UserError, match="'rgb' .* as under VecNormalize"):
+        policy.check_spaces(ours, policy.action_space)
+
+
 def test_images_may_have_their_channels_first(files):
     policy = load_sb3(files / "PPO.zip")
     policy.observation_space = spaces.Dict({"rgb": spaces.Box(0, 255, (3, 64, 48), np.uint8)})
-    ours = {"rgb": spaces.Box(0, 255, (64, 48, 3), np.uint8), "state": spaces.Box(0, 1, (15,))}
+    ours = {"rgb": spaces.Box(0, 255, (64, 48, 3), np.uint8), "state": spaces.Box(-9, 9, (15,))}
     policy.check_spaces(spaces.Dict(ours), policy.action_space)
     policy.observation_space = spaces.Box(0, 1, (15,))
     with pytest.raises(UserError, match="expected a Dict of rgb .64, 48, 3. uint8, state"):
@@ -147,6 +189,16 @@ def test_a_policy_with_discrete_actions_is_refused(tmp_path):
     stable_baselines3.DQN("MlpPolicy", env, device="cpu", buffer_size=8).save(tmp_path / "dqn.zip")
     with pytest.raises(UserError, match="dqn.policies, which has no continuous actions; train"):
         load_sb3(tmp_path / "dqn.zip")
+
+
+@pytest.mark.parametrize("module", ["sb3_contrib.tqc.policies", "mine"])
+def test_a_policy_of_another_package_is_refused(tmp_path, module):
+    path = tmp_path / "tqc.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data", json.dumps({"policy_class": {"__module__": module}}))
+    package = module.partition(".")[0]
+    with pytest.raises(UserError, match=f"is of {package}, which is not supported; train with PPO"):
+        load_sb3(path)
 
 
 def test_without_the_package_one_sentence_says_so(tmp_path, monkeypatch):

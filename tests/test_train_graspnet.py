@@ -207,12 +207,15 @@ def test_mistakes_are_refused_before_a_run_folder_is_made(
 def test_training_can_start_from_weights(finished, tmp_path, monkeypatch):
     run, arguments = finished
     monkeypatch.chdir(tmp_path)
-    initial = f"train.initial={run / 'graspnet.pt'}"
+    file = Path(shutil.copy(run / "graspnet.pt", "initial.pt"))
+    initial = f"train.initial={file}"
     assert train_graspnet.main([*arguments, initial, "train.lr=1e-12", "train.epochs=1"]) == 0
     (new,) = Path("runs/train_graspnet").iterdir()
     ours, theirs = (load_graspnet(f / "graspnet.pt").model.parameters() for f in (new, run))
     for value, initial in zip(ours, theirs):  # no learning rate to speak of
         torch.testing.assert_close(value, initial, rtol=0, atol=1e-8)
+    file.unlink()
+    assert train_graspnet.main(["--resume", str(new)]) == 0, "its last.pt holds later weights"
 
 
 # --- Several processes -------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import train_graspnet
 from utils.config import load_config
 from utils.distributed import ALONE
 from utils.errors import UserError
+from utils.runs import new_run_folder
 
 
 def no_data(*_) -> Path:
@@ -45,6 +46,20 @@ def test_the_check_of_the_network_says_nothing_of_its_widths(tmp_path, monkeypat
     with pytest.raises(AssertionError, match="no data"):
         train_graspnet.main(["train.device=cpu", f"train.initial={shipped}"])
     assert "widths" not in capsys.readouterr().out
+
+
+def test_the_file_of_the_first_weights_may_be_gone_where_there_are_later_ones(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_graspnet, "generate", no_data)
+    config = load_config(None, ["train.device=cpu", "train.initial=gone.pt"])
+    run = new_run_folder("train_graspnet", None, config)
+    with pytest.raises(UserError, match="gone.pt: cannot read"):
+        train_graspnet.main(["train.device=cpu", "train.initial=gone.pt"])
+    (run / "last.pt").touch()
+    with pytest.raises(AssertionError, match="no data"):
+        train_graspnet.main(["--resume", str(run)])
 
 
 def test_the_curves_are_closed_where_a_training_fails(tmp_path, monkeypatch):

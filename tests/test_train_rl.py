@@ -352,6 +352,23 @@ def test_a_training_can_start_from_weights(finished, tmp_path, monkeypatch):
     assert same(dict(ours), dict(theirs))
 
 
+def test_a_run_goes_on_without_the_file_of_its_first_weights(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    initial = Path(shutil.copy(finished / "best.pt", "initial.pt"))
+    started = [*POINT, f"rl.initial={initial}", "rl.total_steps=128"]
+    assert train_rl.main([*started, "rl.name=whole"]) == 0
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, GraspPPO, "update", lambda ppo: ppo.updates == 3)
+        assert train_rl.main([*started, "rl.name=halves"]) == 130
+    initial.unlink()
+    (whole,), (halves,) = (list(Path("runs/train_rl").glob(f"*-{n}")) for n in ("whole", "halves"))
+    assert train_rl.main(["--resume", str(halves)]) == 0
+    ours, theirs = (load_checkpoint(folder / "last.pt", KIND) for folder in (halves, whole))
+    for part in ("step", "model", "optimizer", "extra"):
+        assert same(ours[part], theirs[part]), part
+    assert load_config(halves / "config.yaml").rl.initial == initial
+
+
 # --- Mistakes and troubles ---------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from envs import vector_env
-from envs.vector_env import make_objects, start_method, training_envs
+from envs.vector_env import make_env, make_objects, start_method, training_envs
 from models.grasp_policy import make_ppo
 from tests.helpers.object_files import box_moments, urdf_box, urdf_inertia
 from tests.helpers.quick_envs import POINT
@@ -54,6 +54,17 @@ def test_env_kwargs_and_info_reach_the_environment():
     assert [(part.key, part.shape) for part in layout.privileged] == [("goal", (2,))]
     rng = np.random.default_rng(1)  # Gymnasium seeds its environments' generators like this
     np.testing.assert_allclose(first["goal"], rng.uniform(-1, 1, 2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("env_id", ["RobotGrasping-v0", "RandomizedGrasping-v0"])
+def test_env_kwargs_set_no_key_of_section_env(env_id):
+    """evaluate.py scores the policy by the section."""
+    config = load_config(
+        None, [f"rl.env_id={env_id}", "rl.env_kwargs=[position_step=0.02,max_steps=7]"]
+    )
+    message = "rl.env_kwargs: position_step is a key of section env; set env.position_step instead"
+    with pytest.raises(UserError, match=message):
+        make_env(config)
 
 
 def processes_of(env, index):

@@ -22,7 +22,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-from utils.config import Config
+from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.runs import open_run, run_of_job
 
@@ -195,6 +195,15 @@ def run_folder(
             again = run_of_job(script, config) if resume is None else None
             folder = again or opened.enter_context(open_run(resume, script, name, config))
         yield Path(processes.broadcast(str(folder)))
+
+
+def without_initial(config: Config, section: str, run: Path | None) -> Config:
+    """The config with which the training in a run's folder makes its network: without the weights
+    of SECTION.initial, whose file may be gone, where a last.pt holds later ones. run: None for a
+    new one."""
+    if run is None or not any(run.rglob("last.pt")):
+        return config
+    return with_settings(config, section, {"initial": None})
 
 
 @contextmanager
