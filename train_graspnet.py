@@ -30,7 +30,6 @@ import utils.installation  # noqa: F401 - ends in one sentence where a package i
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import argparse
-import tempfile
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -40,11 +39,11 @@ import torch
 from tqdm import tqdm
 
 from envs.cell import camera_intrinsics
-from envs.data_generation import generate
+from envs.data_generation import data_folder, generate
 from envs.registries import check_names
 from models.graspnet_adaptation import AdaptingTrainer, check_alone, open_target, with_target
 from models.graspnet_data import TrainingData, epoch_loader, simulated_data, steps_per_epoch
-from models.graspnet_io import load_graspnet, save_graspnet
+from models.graspnet_io import KIND, load_graspnet, save_graspnet
 from models.graspnet_scores import (
     check_graspable,
     closing_words,
@@ -64,12 +63,13 @@ from models.rectangle_folds import (
     real_folds,
     save_fold,
 )
-from utils.atomic_files import cannot_write, check_writable
+from utils.checkpoint import check_weights_file
 from utils.config import COMPUTE_KEYS, Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team, without_initial
 from utils.errors import UserError
 from utils.grasp_data import read_trials
 from utils.grasp_labels import label_truth
+from utils.run_checks import check_data, check_place, counted
 from utils.runs import check_resume, parse_args, resume_command, run_script, save_results
 
 WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
@@ -80,7 +80,7 @@ FREE_TO_CHANGE = (*COMPUTE_KEYS, "train.name", "train.device", "train.workers", 
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train GraspNet.", _add_options)
     check_names(config)
-    check_writable("--weights", options.weights)
+    check_weights_file("--weights", options.weights, KIND)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt", "fold*/last.pt"])
     check_place(options.resume or Path("runs/train_graspnet"))
     check_network(without_initial(config, "train", options.resume))  # before there is data
@@ -88,14 +88,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     with team(config.train.device, os.environ) as processes:
         if config.data.kind != "simulated":
             return cross_validate(config, options, processes)
+        learned = {"simulated images": data_folder(config).name}
         if photographs is not None:
             check_alone(processes)
+            learned["adaptation.target"] = counted(photographs.names)
+        check_data(options.resume, learned)  # before there are new data
         data = make_data(config, processes, options.resume is not None)
         if photographs is not None:
             data = with_target(config, data, photographs)
         trainer = make_trainer(without_initial(config, "train", options.resume), data, processes)
         with run_folder(
-            "train_graspnet", config.train.name, config, options.resume, processes
+            "train_graspnet", config.train.name, config, options.resume, processes, learned
         ) as run:
             history, finished = train(config, run, data, trainer)
 
@@ -112,15 +115,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, metavar="FILE", help=WEIGHTS)
-
-
-def check_place(folder: Path) -> None:
-    """Raise UserError if nothing can be written in a folder, or where it would be made."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    try:
-        os.rmdir(tempfile.mkdtemp(prefix=".", dir=there))
-    except OSError as error:
-        raise cannot_write(folder, error) from error
 
 
 def make_data(config: Config, processes: Team, resumed: bool) -> TrainingData:
@@ -212,7 +206,11 @@ def cross_validate(config: Config, options: argparse.Namespace, processes: Team)
     if options.weights is not None and config.data.fold is None:
         raise UserError("--weights: every fold has a network of its own; choose one by data.fold")
     folds, name = real_folds(config), config.train.name
-    with run_folder("train_graspnet", name, config, options.resume, processes) as run:
+    learned = {
+        f"fold {fold.number}": f"{counted(fold.train)}, tested on {counted(fold.test)}"
+        for fold in folds
+    }
+    with run_folder("train_graspnet", name, config, options.resume, processes, learned) as run:
         return train_folds(config, folds, run, options, processes)
 
 

@@ -49,7 +49,7 @@ from envs.vector_env import (
     make_objects,
     training_envs,
 )
-from models.grasp_policy import GraspPPO, load_policy, make_ppo
+from models.grasp_policy import KIND, GraspPPO, load_policy, make_ppo
 from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
     Curves,
@@ -80,7 +80,7 @@ from models.ppo_rollouts import (
     RolloutCollector,
     derived_seeds,
 )
-from utils.atomic_files import check_writable
+from utils.checkpoint import check_weights_file
 from utils.config import Config
 from utils.distributed import Team, run_folder, stop_on_interrupt, team, without_initial
 from utils.errors import UserError
@@ -102,7 +102,7 @@ STOPPING = "interrupted: stopping after the update under way, or within the eval
 def main(argv: Sequence[str] | None = None) -> int:
     config, options = parse_args(argv, "Train a policy by PPO.", _add_options)
     check_names(config)
-    check_writable("--weights", options.weights)
+    check_weights_file("--weights", options.weights, KIND)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
     if config.rl.films:  # one that draws no pictures is told of now
         make_env(config, render_mode="rgb_array").close()

@@ -38,12 +38,13 @@ from envs.critic_examples import (
     planner_of,
     usual_sets,
 )
+from envs.data_generation import content_of_sets
 from models.grasp_critic import INPUTS, KIND, SHIPPED, GraspCritic, load_critic
 from models.graspnet_io import SHIPPED as SHIPPED_NETWORK
 from models.planner_graspnet import JUDGED_FAN
-from utils.atomic_files import check_writable, write_json_atomic
+from utils.atomic_files import write_json_atomic
 from utils.calibration import calibration_error
-from utils.checkpoint import save_checkpoint
+from utils.checkpoint import check_weights_file, save_checkpoint
 from utils.config import Config
 from utils.distributed import choose_device
 from utils.errors import UserError
@@ -76,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if (chosen.output is None) == (chosen.folds is None):
         raise UserError("train_critic: give --output FILE.pt or --folds K")
     if chosen.output is not None:
-        check_writable("--output", chosen.output)
+        check_weights_file("--output", chosen.output, KIND)
     elif chosen.initial is None or chosen.more or not 2 <= chosen.folds <= chosen.scenes:
         raise UserError(
             f"--folds {chosen.folds}: give 2 or more, at most one for each scene, with "
@@ -93,6 +94,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(compared(initial, examples, config.seed, chosen.folds, device))
         return 0
     held_out = examples.scene % HELD_OUT == 0
+    if held_out.sum() < 1 or (~held_out).sum() < 2:
+        raise UserError(
+            f"{chosen.examples}: {len(held_out)} grasps were executed, {held_out.sum()} of them in "
+            "the tenth of the scenes that is held out, too few to learn from and to judge by; do "
+            "the objects fit the hand? Else give more --scenes"
+        )
     scores = {}
     if initial is not None:
         before = judged(initial, examples.where(held_out))
@@ -169,6 +176,9 @@ def check_same_settings(folder: Path, config: Config) -> None:
     settings |= {"seed": config.seed, "object_sets": usual_sets(config), "label": LABEL}
     settings |= {"candidates": PLANNERS, "generation": GENERATION}
     settings["simulator"] = config.simulator
+    own = content_of_sets(config, config.data.object_sets)
+    if own:  # so that examples of built-in sets of before there was this entry stay valid
+        settings["content of object_sets"] = own
     for name, weights in (("critic", SHIPPED), ("network", SHIPPED_NETWORK)):
         settings[name] = hashlib.sha256(weights.read_bytes()).hexdigest()
     note = folder / "settings.json"

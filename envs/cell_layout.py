@@ -21,7 +21,7 @@ from typing_extensions import Self
 from envs.object_files import FineVisual
 from envs.object_primitives import NativeShape
 from utils.config import Config
-from utils.geometry import ConvexSolid
+from utils.geometry import TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_WALL, ConvexSolid
 
 GRAVITY = 9.81  # m/s^2
 
@@ -32,8 +32,7 @@ TABLE_COLOUR = (0.62, 0.60, 0.57, 1.0)
 _X_MIN, _Y_MIN = (TABLE_CENTRE - TABLE_SIZE / 2).tolist()
 _X_MAX, _Y_MAX = (TABLE_CENTRE + TABLE_SIZE / 2).tolist()
 
-TRAY_CENTRE = np.array([0.42, -0.48])  # m in W; outside the overhead camera's view
-TRAY_HALF_SIZE, TRAY_HEIGHT, TRAY_WALL = 0.13, 0.08, 0.005  # m
+TRAY_HEIGHT = 0.08  # m
 TRAY_COLOUR = (0.25, 0.35, 0.45, 1.0)
 
 WALL_COLOUR = (0.8, 0.8, 0.8, 1.0)
@@ -203,8 +202,10 @@ class LayoutTable(ABC):
 
     models: the objects that may be put on it, each as often as it stands there. walls: of the
     scene, which stay (`Scene.walls`). Bodies are the table's own numbers. Entering takes everything
-    else off the table.
+    else off the table. least_checks: the fewest in a row after which `settle` takes bodies to rest.
     """
+
+    least_checks = 1
 
     @abstractmethod
     def __init__(

@@ -20,6 +20,7 @@ module knows no robot, camera or task.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,6 +32,7 @@ from envs.cell_layout import (
     ObjectModel,
     Placement,
     Scene,
+    rest_check_steps,
 )
 from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
@@ -66,7 +68,8 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
 
     Objects are drawn without repetition while the set has enough of them. A draw whose objects
     come to rest outside the workspace is thrown away and the next one taken from the same
-    generator; after 50 draws SceneError is raised.
+    generator; after 50 draws SceneError is raised, and at once where scene.settle_seconds is too
+    short for any.
     """
     if layout not in LAYOUTS:
         raise SceneError(f"unknown scene layout {layout!r}; allowed are {', '.join(LAYOUTS)}")
@@ -85,8 +88,9 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             chosen = rng.choice(len(objects), size=count, replace=count > len(objects))
         models = [objects[int(i)] for i in chosen]
         with make_layout_table(config, models, walls) as table:
-            bodies = arrange(table, models, rng, config)
             checks = STANDING_REST_CHECKS if layout == "packed" else 1
+            _check_settle_time(layout, max(checks, table.least_checks), config)
+            bodies = arrange(table, models, rng, config)
             if bodies is None or not table.settle(bodies, checks):
                 continue
             poses = [table.pose(body) for body in bodies]
@@ -105,6 +109,18 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
         f"inside the {config.workspace.size} m workspace{covering} in {_DRAWS} tries; use smaller "
         "objects (objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
     )
+
+
+def _check_settle_time(layout: str, checks: int, config: Config) -> None:
+    """Raise SceneError where scene.settle_seconds ends before so many checks for rest in a row."""
+    steps = checks * rest_check_steps(config.sim.frequency)
+    if int(config.scene.settle_seconds * config.sim.frequency) < steps:
+        least = math.ceil(100 * steps / config.sim.frequency) / 100
+        raise SceneError(
+            f"scene.settle_seconds={config.scene.settle_seconds:g} is too short for the layout "
+            f"{layout} in {config.scene.simulator}, whose objects have to rest for {least:g} s; "
+            f"use {least:g} or, because they have to come to rest before, more"
+        )
 
 
 def _stand_for_good(config: Config, models: Sequence[ObjectModel], poses) -> bool:

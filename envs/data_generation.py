@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_tray, execute_grasp
-from envs.objects import OBJECT_SETS, ObjectPart, ObjectSet, load_object_set
+from envs.objects import OBJECT_SETS, ObjectSet, load_object_set
 from envs.simulators import cell_class
 from utils.atomic_files import write_atomic
 from utils.config import Config, dump_config, load_config, with_settings
@@ -98,12 +98,7 @@ def _content(config: Config) -> str:
         "most_packed": _MOST_PACKED,
         "first_seed": _FIRST_SEED,
     }
-    files = named_files(config)
-    own = {
-        name: files.get(name) or _digest(Path(name).expanduser())
-        for name in config.data.object_sets
-        if name not in OBJECT_SETS
-    }
+    own = content_of_sets(config, config.data.object_sets)
     if own:
         chosen["files"] = own
     chosen["labels"] = json.loads(json.dumps(asdict(LabelSettings())))  # tuples become lists
@@ -114,12 +109,35 @@ def _content(config: Config) -> str:
     return yaml.safe_dump({"format_version": FORMAT_VERSION} | chosen)
 
 
-def _digest(folder: Path) -> str:
-    """SHA-256 of the names and contents of all files below a folder."""
+def content_of_sets(config: Config, names: Iterable[str]) -> dict[str, str]:
+    """A digest of what each set of a user's own is made of, by its name: the files below its
+    folder, the module of a plug-in, and the files that its objects are read from, wherever they
+    lie. Raises UserError for a set that cannot be loaded."""
+    modules, found = named_files(config), {}
+    for name in names:
+        if name in OBJECT_SETS:
+            continue
+        objects = _training_objects(config, name)
+        sources, parts = objects.sources(), [modules[name]] if name in modules else []
+        if sources or not parts:
+            parts.append(_digest(Path(name).expanduser(), sources))
+        doubles = len(_by_shape(objects)) < len(objects)
+        if sources and (doubles or config.objects.skip_broken):
+            parts.append("no shape in two splits")  # which older data may have
+        found[name] = " ".join(parts)
+    return found
+
+
+def _digest(folder: Path, sources: set[Path]) -> str:
+    """SHA-256 of the names and contents of all files below a folder, and of the `sources` that lie
+    elsewhere."""
+    below = sorted(path for path in folder.rglob("*") if path.is_file())
+    named = [(path, path.relative_to(folder).as_posix()) for path in below]
+    elsewhere = sources - {path.resolve() for path in below}
     digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path, name in [*named, *((path, path.name) for path in sorted(elsewhere))]:
         content = hashlib.sha256(path.read_bytes()).hexdigest()
-        digest.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+        digest.update(f"{name} {content}\n".encode())
     return digest.hexdigest()
 
 
@@ -252,22 +270,35 @@ def _make_shard(config: Config, folder: Path, shard: tuple[str, int]) -> int:
 def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
     """Return the training objects of each set by (set, split); no test object is among them."""
     parts = {}
-    settings = config.objects.model_dump() | {"split": "train"}
     for name in config.data.object_sets:
-        whole = load_object_set(
-            name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
-        )
-        if len(whole) < 2:
+        whole = _training_objects(config, name)
+        shapes = _by_shape(whole)
+        if len(shapes) < 2:
             raise UserError(
-                f"data.object_sets: {name} holds {len(whole)} object, but some have to be kept for "
-                "validation; give sets of two objects or more"
+                f"data.object_sets: {name} holds {len(shapes)} object, but some have to be kept "
+                "for validation; give sets of two objects or more, of different names"
             )
         # Drawn, because families of objects take turns: every tenth may be of one of ten families.
-        drawn = np.random.default_rng(len(whole)).permutation(len(whole))
-        count = math.ceil(len(whole) / HELD_OUT)
-        parts[name, "validation"] = ObjectPart(whole, sorted(drawn[:count].tolist()))
-        parts[name, "train"] = ObjectPart(whole, sorted(drawn[count:].tolist()))
+        drawn = np.random.default_rng(len(shapes)).permutation(len(shapes))
+        count = math.ceil(len(shapes) / HELD_OUT)
+        for split, chosen in (("validation", drawn[:count]), ("train", drawn[count:])):
+            parts[name, split] = whole.part(sorted(sum((shapes[i] for i in chosen), [])))
     return parts
+
+
+def _by_shape(objects: ObjectSet) -> list[list[int]]:
+    """The numbers of the objects, those of the same shape together."""
+    found: dict[Hashable, list[int]] = {}
+    for index in range(len(objects)):
+        found.setdefault(objects.shape_name(index), []).append(index)
+    return list(found.values())
+
+
+def _training_objects(config: Config, name: str) -> ObjectSet:
+    settings = config.objects.model_dump() | {"split": "train"}
+    return load_object_set(
+        name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
+    )
 
 
 _sets_of = kept(object_sets)

@@ -227,6 +227,8 @@ class MujocoTable(LayoutTable):
     them. A body's number is that of its object, or after these that of a wall.
     """
 
+    least_checks = CERTAIN_REST_CHECKS
+
     def __init__(self, config: Config, models: Sequence[ObjectModel], walls: Sequence[Box] = ()):
         self._config, self._models, self._standing = config, list(models), walls
         self._mujoco = load_mujoco()
@@ -284,7 +286,7 @@ class MujocoTable(LayoutTable):
             self._mujoco.mj_step(self._model, self._data, count * SUBSTEPS)
 
         speeds = [self._joint(body).dofadr[0] for body in bodies]
-        checks = max(checks, CERTAIN_REST_CHECKS)
+        checks = max(checks, self.least_checks)
         return settle(self._data, speeds, self._config, step, checks)
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -77,11 +78,11 @@ def _source(path: Path, root: Element, density: float) -> ObjectSource:
             mesh.file = ""
     geoms = spec.geoms
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
-    shown = [geom for geom in geoms if geom not in solid and geom.rgba[3] > 0] or solid
+    shown = [geom for geom in geoms if geom not in solid and _rgba(spec, geom)[3] > 0] or solid
     solid = solid or shown
     if not solid:
         raise ValueError("it has neither collision nor visual geometry; add some")
-    stated = _fill_in_densities(spec, root, solid, density)
+    stated, weighed = _fill_in_densities(spec, root, solid, density)
     for geom in geoms:
         geom.contype = geom.conaffinity = 0  # it spares MuJoCo the convex hulls
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
@@ -97,7 +98,7 @@ def _source(path: Path, root: Element, density: float) -> ObjectSource:
             [checked_mesh(shapes[geom.id], f"{path}, geom {geom.name!r}") for geom in solid]
         ),
         friction=float(solid[0].friction[0]),
-        inertial=_inertial(model, data) if stated else None,
+        inertial=replace(_inertial(model, data), from_density=not weighed) if stated else None,
         color=_color(spec, shown),
         visual=_single_visual(spec, model, data, shown, files),
         visual_mesh=trimesh.util.concatenate([shapes[geom.id] for geom in shown]),
@@ -215,22 +216,26 @@ def _check_one_body(spec: mujoco.MjSpec) -> None:
             raise ValueError(f"the mass of its body {body.name!r} is {body.mass}")
 
 
-def _fill_in_densities(spec: mujoco.MjSpec, root: Element, solid: list, density: float) -> bool:
+def _fill_in_densities(
+    spec: mujoco.MjSpec, root: Element, solid: list, density: float
+) -> tuple[bool, bool]:
     """Give a density to the geoms that state none, 0 to those that collide with nothing. Returns
-    whether the file states any mass."""
+    whether the file states any mass or density, and whether it states kilograms."""
     lowest, highest = spec.compiler.inertiagrouprange
     from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    stated = any("settotalmass" in compiler.attrib for compiler in root.iter("compiler"))
+    weighed = any("settotalmass" in compiler.attrib for compiler in root.iter("compiler"))
+    stated = weighed
     for body in spec.bodies:
         if body.explicitinertial and not from_geoms:
-            stated = True
+            stated = weighed = True
             continue
         for geom in body.geoms:
             if np.isnan(geom.mass) and geom.density == UNSTATED:
                 geom.density = density if geom in solid else 0.0
             elif lowest <= geom.group <= highest:  # what has no mass for the eye says nothing
                 stated |= geom in solid or (geom.density if np.isnan(geom.mass) else geom.mass) != 0
-    return stated
+                weighed |= not np.isnan(geom.mass) and geom.mass != 0
+    return stated, weighed
 
 
 def _inertial(model: mujoco.MjModel, data: mujoco.MjData) -> Inertial:
@@ -274,13 +279,20 @@ def _geom_pose(data: mujoco.MjData, geom) -> np.ndarray:
     return T
 
 
+def _rgba(spec: mujoco.MjSpec, geom) -> tuple[float, ...]:
+    """A geom's own, or its material's."""
+    rgba = tuple(geom.rgba.tolist())
+    if geom.material and rgba == UNCOLOURED:
+        rgba = tuple(spec.material(geom.material).rgba.tolist())
+    return rgba
+
+
 def _color(spec: mujoco.MjSpec, shown: list) -> tuple[float, float, float, float] | None:
-    for geom in shown:
-        rgba = tuple(geom.rgba.tolist())
-        if geom.material and rgba == UNCOLOURED:
-            rgba = tuple(spec.material(geom.material).rgba.tolist())
-        if rgba != UNCOLOURED:
-            return rgba
+    """Of the first geom with a colour that can be seen."""
+    for rgba in (_rgba(spec, geom) for geom in shown):
+        if rgba != UNCOLOURED and rgba[3] > 0:
+            red, green, blue, _ = rgba
+            return red, green, blue, 1.0
     return None
 
 

@@ -33,6 +33,10 @@ LEAST_PRODUCT = 0.01
 MIN_MASS = 0.02
 SMALLEST_OBJECT, LARGEST_OBJECT = 1e-4, 3.0  # m
 USUAL_OBJECT = 0.1  # m, to which a guess of a file's unit is to lead
+# Units of length, m. A scale of the user's tells more of them apart than a length can: of a box
+# that is 4 long, inches would be as likely as centimetres.
+GUESSED_UNITS = (0.001, 0.01, 100.0, 1000.0)
+SCALED_UNITS = (*GUESSED_UNITS, 0.0254, 0.1, 10.0)
 # kg/m3: foam has 10, platinum 21,500.
 LIGHTEST, DENSEST = 1.0, 25_000.0
 # A lever arm in metres, for round bodies, which would otherwise roll for ever. Others go without:
@@ -51,30 +55,32 @@ def load_object(
 ) -> ObjectModel:
     """One URDF (all its links at zero joint angles, as one rigid body), MJCF or mesh file.
 
-    scale, fit, density: as in `load_object_set`. A mass that the file states is scaled with the
-    volume; lengths beyond LARGEST_OBJECT are taken for the millimetres or centimetres of a body of
-    that mass. any_mass: take it even where no material is as heavy or as light. Raises ObjectError
-    naming the file.
+    scale, fit, density: as in `load_object_set`. A mass that the file states is that of the body
+    in the file's unit, see `_file_unit`, and is scaled with the volume. any_mass: take it even
+    where no material is as heavy or as light. Raises ObjectError naming the file.
     """
     path, cache_dir = Path(path), Path(cache_dir)
     name = path.parent.name if path.stem == "model" else path.stem  # many sets have NAME/model.xml
     source = read_object(path, density)
     side = float(np.ptp(source.mesh.vertices, axis=0).max())
+    unit = _file_unit(side, scale)
     if fit is not None:
         scale *= fit / float(np.sort(source.mesh.bounding_box_oriented.primitive.extents)[1])
     _check_size(path, scale * side, scale, fit)
     cut = decompose(source.mesh, cache_dir, str(path))
     stated = None
     if source.inertial is not None:
-        stated = in_unit(source.inertial, _unit_of(side) if side > LARGEST_OBJECT else 1.0)
+        # A density times a volume is in the file's unit already.
+        unit = 1.0 if source.inertial.from_density else unit
+        stated = in_unit(source.inertial, unit)
         if not any_mass:
-            _check_density(path, source.inertial.mass, stated.mass / cut.solid.volume)
+            _check_density(path, source.inertial, stated.mass / cut.solid.volume, unit)
     inertial = body_of(stated, cut.solid, source.mesh, density)
     parts = tuple(scale * (part - inertial.centre_of_mass) for part in cut.parts)
     mass = max(inertial.mass * scale**3, MIN_MASS)
     moments, principal = principal_moments(inertial.inertia)
     remarks = [cut.remark] if cut.remark else []
-    if stated is not None and inertial is not stated:
+    if stated is not None and stated.states_inertia and inertial is not stated:
         remarks.append(IMPOSSIBLE_INERTIA)
     return ObjectModel(
         name=name,
@@ -158,10 +164,17 @@ def principal_moments(
 # --- What a file states ---------------------------------------------------------------------------
 
 
+def _file_unit(side: float, scale: float) -> float:
+    """The unit of a file's lengths, m: the one nearest to a user's scale that is far from 1; else,
+    of a body longer than LARGEST_OBJECT, the one in which it is as large as things usually are."""
+    if not 0.1 < scale < 10:
+        return min(SCALED_UNITS, key=lambda unit: abs(math.log(scale / unit)))
+    return _unit_of(side) if side > LARGEST_OBJECT else 1.0
+
+
 def _unit_of(side: float) -> float:
     """The unit in which something of this length would be as large as things usually are."""
-    units = (0.001, 0.01, 100.0, 1000.0)
-    return min(units, key=lambda unit: abs(math.log(side * unit / USUAL_OBJECT)))
+    return min(GUESSED_UNITS, key=lambda unit: abs(math.log(side * unit / USUAL_OBJECT)))
 
 
 def _check_size(path: Path, side: float, scale: float, fit: float | None) -> None:
@@ -178,18 +191,22 @@ def _check_size(path: Path, side: float, scale: float, fit: float | None) -> Non
         )
 
 
-def _check_density(path: Path, mass: float, density: float) -> None:
-    """mass: kg, as stated. density: kg/m3, of that mass in the mesh."""
+def _check_density(path: Path, stated: Inertial, density: float, unit: float) -> None:
+    """density: kg/m3, of the stated mass in the file's mesh with its lengths in `unit`, m."""
     if not LIGHTEST <= density <= DENSEST:
         cause = (
             "in grams, or the mesh smaller than the body"
             if density > DENSEST
             else ("in tonnes, or the mesh larger than the body")
         )
+        what = (
+            "densities, which make" if stated.from_density else f"{stated.mass:g} kg, which makes"
+        )
+        lengths = "" if unit == 1.0 else f" with lengths in units of {unit:g} m"
         raise ObjectError(
-            f"object {path} states {mass:g} kg, which makes {density:.3g} kg/m3 in its mesh, "
-            f"expected {LIGHTEST:g} to {DENSEST:g}; the mass may be {cause}: correct the file, or "
-            "let it state none, so that objects.density counts"
+            f"object {path} states {what} {density:.3g} kg/m3 in its mesh{lengths}, expected "
+            f"{LIGHTEST:g} to {DENSEST:g}; the mass may be {cause}: correct the file, or let it "
+            "state none, so that objects.density counts"
         )
 
 
@@ -204,11 +221,11 @@ def body_of(
 ) -> Inertial:
     """Mass, centre of mass and inertia of an object as its file states them.
 
-    density: kg/m3 where it states no mass. Where the inertia is a placeholder, so may the centre of
-    mass be: both are then those of a solid of even density and of the stated mass.
+    density: kg/m3 where it states no mass. Where the inertia is a placeholder or none, so may the
+    centre of mass be: both are then those of a solid of even density and of the stated mass.
     """
     mass = density * solid.volume if stated is None else stated.mass
-    if stated is not None and is_possible(stated, solid, mesh):
+    if stated is not None and stated.states_inertia and is_possible(stated, solid, mesh):
         return stated
     return Inertial(mass, solid.centre_of_mass, mass / solid.volume * solid.inertia)
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -26,6 +27,7 @@ from envs.object_meshes import (
     checked_mesh,
     load_mesh,
     parse_xml,
+    stated_unit,
     surface_colour,
     write_mesh_obj,
 )
@@ -36,6 +38,9 @@ SUFFIXES = (".urdf", ".xml", *MESH_SUFFIXES)
 # mass over the volume of their convex parts.
 DEFAULT_FRICTION, DEFAULT_DENSITY = 0.7, 700.0
 MOST_GEOMETRIES = 300  # of a URDF, which yourdfpy reads in some ten seconds
+# How the names of the materials and textures of a mesh end, in whatever format it states them.
+_MATERIAL = re.compile(rb"\.(?:mtl|png|jpe?g|bmp|tga|tiff?|gif|webp)\b", re.IGNORECASE)
+_LONGEST_NAME = 200  # bytes, of such a file
 
 
 @dataclass(frozen=True)
@@ -55,11 +60,15 @@ class Inertial:
     """What a file states of all its links or bodies together, in the file's axes.
 
     mass: kg. centre_of_mass: (3,) m. inertia: (3, 3) kg m2 about the centre of mass.
+    states_inertia: whether all that has a mass has an inertia, too. from_density: whether the mass
+    is that of the file's volume, in its unit of length, and no number of kilograms.
     """
 
     mass: float
     centre_of_mass: np.ndarray
     inertia: np.ndarray
+    states_inertia: bool = True
+    from_density: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,9 +96,8 @@ def object_files(folder: Path, skip_broken: bool = False) -> list[Path]:
     Raises ObjectError for a folder that holds none, and for a URDF or MJCF that is not XML; the
     latter is listed with `skip_broken`, so that whoever reads it can say so.
     """
-    files = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
-    )
+    below = _files_below(folder)
+    files = sorted(path for path in below if path.suffix.lower() in SUFFIXES and path.is_file())
     referred: set[Path] = set()
     for path in files:
         try:
@@ -99,13 +107,60 @@ def object_files(folder: Path, skip_broken: bool = False) -> list[Path]:
                 raise
     files = [path for path in files if path.resolve() not in referred]
     if not files:
-        is_sdf = next(folder.rglob("*.sdf"), None) is not None
+        is_sdf = any(path.suffix == ".sdf" for path in below)
         raise ObjectError(
             f"objects: folder {folder} holds no object; "
             f"put in files ending in {', '.join(SUFFIXES)}"
             + (" (SDF becomes MJCF by sdf2mjcf of the package sdformat-mjcf)" if is_sdf else "")
         )
     return files
+
+
+def _files_below(folder: Path) -> list[Path]:
+    """What is no folder below a folder, also behind links to folders; behind each folder once, and
+    behind the links last, so that links in a circle end and what they double keeps its name."""
+    found: list[Path] = []
+    waiting, seen = [folder], set()
+    while waiting:
+        for place, folders, names in os.walk(waiting.pop(0)):
+            if os.path.realpath(place) in seen:
+                folders.clear()
+                continue
+            seen.add(os.path.realpath(place))
+            folders.sort()
+            found += [Path(place, name) for name in names]
+            waiting += [Path(place, name) for name in folders if Path(place, name).is_symlink()]
+    return found
+
+
+def files_of(path: Path) -> set[Path]:
+    """The files that an object is read from, resolved, as far as there are any: its own, those that
+    it refers to, wherever they lie, and the materials and textures of them all."""
+    found: set[Path] = set()
+    named = {path}
+    while named:
+        # os.path.isfile says no where the name is too long.
+        new = [file for file in named if os.path.isfile(file) and file.resolve() not in found]
+        found |= {file.resolve() for file in new}
+        named = {other for file in new for other in (*_references(file), *_materials(file))}
+    return found
+
+
+def _references(path: Path) -> set[Path]:
+    try:
+        return _referred_files(path)
+    except ObjectError:  # to be named when the object is asked for
+        return set()
+
+
+def _materials(path: Path) -> set[Path]:
+    """The files of materials and textures that a mesh or a material may name."""
+    if path.suffix.lower() not in (*MESH_SUFFIXES, ".mtl"):
+        return set()
+    data = path.read_bytes()
+    ends = (match.end() for match in _MATERIAL.finditer(data))
+    names = {re.split(rb"[\s\"'<>=]", data[max(end - _LONGEST_NAME, 0) : end])[-1] for end in ends}
+    return {path.parent / os.fsdecode(name) for name in names}
 
 
 def _referred_files(path: Path) -> set[Path]:
@@ -201,8 +256,9 @@ def _read_urdf(path: Path) -> ObjectSource:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of textures whose coordinates are no numbers, say
-            robot = yourdfpy.URDF.load(
-                str(path),
+            stated = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
+            robot = yourdfpy.URDF(
+                _in_metres(stated.robot, path),
                 build_collision_scene_graph=True,
                 load_collision_meshes=True,
                 filename_handler=lambda fname: _resolve_mesh(fname, path),
@@ -233,9 +289,19 @@ def _read_urdf(path: Path) -> ObjectSource:
     )
 
 
+def _in_metres(robot: yourdfpy.Robot, path: Path) -> yourdfpy.Robot:
+    """The robot, with meshes in a unit of their own scaled by it, which yourdfpy leaves out."""
+    for item in (item for link in robot.links for item in (*link.collisions, *link.visuals)):
+        mesh = item.geometry and item.geometry.mesh
+        unit = 1.0 if mesh is None else stated_unit(Path(_resolve_mesh(mesh.filename, path)))
+        if unit != 1.0:
+            mesh.scale = unit * (1.0 if mesh.scale is None else mesh.scale)
+    return robot
+
+
 def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
     """The sum over all links. Raises ValueError for a mass below 0."""
-    stated = []
+    stated, states_inertia = [], True
     for link in robot.robot.links:
         if link.inertial is None or link.inertial.mass is None:
             continue
@@ -245,8 +311,9 @@ def _inertial(robot: yourdfpy.URDF) -> Inertial | None:
         if link.inertial.origin is not None:
             T = T @ link.inertial.origin
         own = np.zeros((3, 3)) if link.inertial.inertia is None else link.inertial.inertia
+        states_inertia &= mass == 0 or link.inertial.inertia is not None
         stated.append((mass, T[:3, 3], T[:3, :3] @ np.asarray(own, float) @ T[:3, :3].T))
-    return combined(stated) if stated else None
+    return replace(combined(stated), states_inertia=states_inertia) if stated else None
 
 
 def combined(stated: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> Inertial:
@@ -266,15 +333,14 @@ def combined(stated: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> Inertial
 
 
 def _urdf_color(shown, robot: yourdfpy.URDF) -> tuple[float, float, float, float] | None:
-    """Raises ValueError for a colour that is not four numbers."""
+    """Of the first visual with a colour that can be seen."""
     named = {material.name: material for material in robot.robot.materials}
     for _, item in shown:
         material = item.material and named.get(item.material.name, item.material)
         color = (item.material and item.material.color) or (material and material.color)
-        if color is not None:
-            if len(color.rgba) != 4 or not np.isfinite(color.rgba).all():
-                raise ValueError(f"the colour of a visual is {color.rgba}, expected four numbers")
-            return tuple(float(c) for c in color.rgba)
+        if color is not None and color.rgba[3] > 0:
+            red, green, blue, _ = map(float, color.rgba)
+            return red, green, blue, 1.0
     return None
 
 
@@ -284,6 +350,6 @@ def _single_visual(shown, robot: yourdfpy.URDF, path: Path):
     link, item = shown[0]
     file = Path(_resolve_mesh(item.geometry.mesh.filename, path))
     scale = item.geometry.mesh.scale
-    scale = np.broadcast_to(1.0 if scale is None else scale, 3)
+    scale = np.broadcast_to(1.0 if scale is None else scale, 3) / stated_unit(file)
     origin = np.eye(4) if item.origin is None else item.origin
     return file, scale, robot.get_transform(link.name) @ origin

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +61,8 @@ class Decomposition:
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """Read all geometry of a mesh file as one mesh, in the file's own units and axes.
+    """Read all geometry of a mesh file as one mesh, in the file's own axes and units; in metres
+    where it states its unit, see `stated_unit`.
 
     Raises ObjectError for a file that is missing, unreadable, empty, flat or non-finite.
     """
@@ -69,8 +71,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         raise ObjectError(f"mesh {path} does not exist")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"mesh {path} is none of {', '.join(MESH_SUFFIXES)}; convert it")
-    if path.suffix.lower() == ".dae":
-        parse_xml(path)
+    unit = stated_unit(path)
     try:
         # Materials name other files, which nothing here needs.
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
@@ -79,7 +80,30 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     except Exception as error:  # each of trimesh's readers raises errors of its own kind
         reason = f"mesh {path} cannot be read ({error}); re-export or remove it"
         raise ObjectError(reason) from error
+    if unit != 1.0:
+        mesh.apply_scale(unit)
     return checked_mesh(mesh, str(path))
+
+
+def stated_unit(path: Path) -> float:
+    """The unit of length that a mesh file states, m, which DAE files do; else 1.
+
+    Raises ObjectError for a DAE that is no XML, and for a unit that is no length.
+    """
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    found = parse_xml(path).find("{*}asset/{*}unit")
+    text = "1" if found is None else found.get("meter", "1")
+    try:
+        unit = float(text)
+    except ValueError:
+        unit = math.nan
+    if not 0 < unit < math.inf:
+        raise ObjectError(
+            f"mesh {path} states a unit of {text!r} metres, expected a number above 0; correct "
+            "<unit meter=...> or re-export it"
+        )
+    return unit
 
 
 def surface_colour(path: Path) -> tuple[float, float, float, float] | None:
@@ -89,7 +113,11 @@ def surface_colour(path: Path) -> tuple[float, float, float, float] | None:
     try:
         scene = trimesh.load_scene(path, process=False)
         _check_size(scene)
-        parts = [(mesh.area_faces, _face_colours(mesh)) for mesh in scene.dump()]
+        # Of each mesh where it stands there is a copy, whose textures do not tell their format.
+        parts = [
+            (mesh.area_faces, _face_colours(scene.geometry[mesh.metadata["name"]]))
+            for mesh in scene.dump()
+        ]
     except Exception:  # of trimesh's readers, on materials: shape and mass do not need them
         return None
     parts = [(area, colours) for area, colours in parts if colours is not None]

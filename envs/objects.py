@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from envs.cell_layout import ObjectModel
 from envs.object_bodies import compound_object, load_object, native_object
-from envs.object_files import DEFAULT_DENSITY, object_files
+from envs.object_files import DEFAULT_DENSITY, files_of, object_files
 from envs.object_meshes import ObjectError
 from envs.object_primitives import (
     FAMILIES,
@@ -84,6 +84,19 @@ class ObjectSet(ABC, Sequence[ObjectModel]):
     def _build(self, index: int) -> ObjectModel:
         """Make the object; raises ObjectError if it cannot be made."""
 
+    def part(self, indices: Sequence[int]) -> ObjectSet:
+        """The objects of these numbers alone; nothing takes their place that is not among them."""
+        return ObjectPart(self, indices)
+
+    def shape_name(self, index: int) -> Hashable:
+        """What objects of the same shape have in common, so that all go to one split."""
+        return index
+
+    def sources(self) -> set[Path]:
+        """The files that the objects are read from (`envs.object_files.files_of`); none where they
+        are computed."""
+        return set()
+
     def by_width(self, widest: float) -> list[int]:
         """Numbers of the objects that are at most `widest` metres wide where they are narrowest,
         the narrowest first. The first call makes all objects."""
@@ -115,6 +128,15 @@ class ObjectPart(ObjectSet):
 
     def __len__(self) -> int:
         return len(self._indices)
+
+    def part(self, indices: Sequence[int]) -> ObjectSet:
+        return self._whole.part([self._indices[index] for index in indices])
+
+    def shape_name(self, index: int) -> Hashable:
+        return self._whole.shape_name(self._indices[index])
+
+    def sources(self) -> set[Path]:
+        return self._whole.sources()
 
     def _build(self, index: int) -> ObjectModel:
         return self._whole[self._indices[index]]
@@ -162,8 +184,8 @@ def load_object_set(
     max_opening: m, of the gripper; a warning names the first object of a folder that is far too
         large for it.
     cache_dir: where convex parts are kept.
-    skip_broken: of a folder, let another file take the place of one that cannot be used; a warning
-        names it.
+    skip_broken: of a folder, let another file take the place of one that cannot be used (in a part
+        of the set, one of the same part); a warning names it.
     Raises UserError for an unknown name, a missing or empty folder, a plug-in that cannot be used,
     a split or number that is not allowed; a broken mesh raises it when its object is asked for.
     """
@@ -353,10 +375,23 @@ class FileSet(ObjectSet):
         self.files, self.scale, self.any_mass = tuple(files), scale, any_mass
         self.fit, self.density = settings.fit, settings.density
         self.max_opening, self.cache_dir = settings.max_opening, settings.cache_dir
-        self.skip_broken = settings.skip_broken
+        self.skip_broken, self.is_part = settings.skip_broken, False
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def part(self, indices: Sequence[int]) -> FileSet:
+        """So that another file of the part, and none of the others, takes a broken one's place."""
+        part = copy.copy(self)  # what the user has been told is one for all parts
+        part.files, part.is_part = tuple(self.files[index] for index in indices), True
+        part._models, part._order, part._notes = {}, None, dict(self._notes)
+        return part
+
+    def shape_name(self, index: int) -> Hashable:
+        return self.files[index].with_suffix("")  # as of bowl.obj and bowl.stl
+
+    def sources(self) -> set[Path]:
+        return set().union(*map(files_of, self.files))
 
     def _build(self, index: int) -> ObjectModel:
         reasons = []
@@ -370,7 +405,8 @@ class FileSet(ObjectSet):
                 reasons.append(str(error))
         more = len(reasons) - _REASONS
         raise ObjectError(
-            f"objects {self.name}: none of {len(self.files)} files can be used: "
+            f"objects {self.name}: none of {len(self.files)} files "
+            f"{'of a part (training or validation) ' * self.is_part}can be used: "
             + "; ".join([*reasons[:_REASONS], *([f"and {more} more"] if more > 0 else [])])
         )
 

@@ -15,13 +15,15 @@ from envs.object_meshes import ObjectError
 class _Numbers(NamedTuple):
     """What an attribute of the elements at a path below <robot> holds, if it is there. counts: how
     many numbers; more than the first ones are left out by yourdfpy. needed: whether it has to be
-    there."""
+    there. lowest, highest: what each number may be."""
 
     place: str
     attribute: str
     counts: Sequence[int]
     words: str
     needed: bool = True
+    lowest: float = -math.inf
+    highest: float = math.inf
 
 
 _NUMBERS = (
@@ -32,6 +34,18 @@ _NUMBERS = (
     _Numbers("link/*/geometry/mesh", "scale", (0, 1, 3), "one number or three", needed=False),
     _Numbers("link/inertial/mass", "value", (1,), "a number of kilograms"),
     _Numbers("link/contact/lateral_friction", "value", (1,), "a number of 0 or more"),
+    *(
+        _Numbers(
+            f"{place}material/color",
+            "rgba",
+            (4,),
+            "four numbers of 0 to 1",
+            needed=False,
+            lowest=0.0,
+            highest=1.0,
+        )
+        for place in ("link/visual/", "")
+    ),
     *(
         _Numbers("link/inertial/inertia", name, (1,), "a number of kg m2", needed=False)
         for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -73,7 +87,8 @@ def check_urdf(xml: ElementTree.Element, path: Path) -> None:
             if text is None and not wanted.needed:
                 continue
             found = _numbers(text)
-            if found is None or len(found) not in wanted.counts:
+            bad = found is None or len(found) not in wanted.counts
+            if bad or not all(wanted.lowest <= one <= wanted.highest for one in found or ()):
                 raise ObjectError(
                     f"URDF {path}: the {wanted.attribute} of a <{element.tag}> is {text!r}, "
                     f"expected {wanted.words}; repair it"

@@ -164,7 +164,15 @@ def steps_per_epoch(config: Config, images: int) -> int:
 def epoch_loader(
     config: Config, data: TrainingData, team: Team, epoch: int, skip: int
 ) -> DataLoader:
-    """Return this process's part of the batches of one epoch, without the first `skip`."""
+    """Return this process's part of the batches of one epoch, without the first `skip`. Raises
+    UserError where the epoch has not so many."""
+    steps = steps_per_epoch(config, len(data.train))
+    if not 0 <= skip <= steps:  # of a checkpoint that was saved with another number of images
+        raise UserError(
+            f"the checkpoint lies {skip} steps from the beginning of epoch {epoch + 1}, expected 0 "
+            f"to {steps}: the number of images has changed since; bring back those of then, or "
+            "start a new run"
+        )
     # Imported before the workers are forked: each would import it in every epoch.
     import torchvision.transforms.v2  # noqa: F401
 

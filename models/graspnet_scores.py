@@ -181,8 +181,13 @@ def row_in_words(row: Mapping[str, float]) -> str:
 def closing_words(scores: Mapping[str, float], network: Path) -> str:
     """Lines about the best network, whose file is `network`, and what to do with it next."""
     python = this_python()
+    adapted = (
+        "(of simulated images, with the batch norms' statistics of simulated ones; the file holds\n"
+        "those of the photographs)\n"
+    )
     return (
         f"best after epoch {scores['epoch']:.0f}: {describe_scores(scores)}\n"
+        f"{adapted if 'information' in scores else ''}"
         f"the same on test objects: {python} -m benchmarks.bench_graspnet --checkpoint {network}\n"
         "with the planner's search, which makes up for much that a weak network misses:\n"
         f"  {python} evaluate.py evaluate.policies=heuristic,{network}"

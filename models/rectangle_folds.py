@@ -7,6 +7,7 @@ split. `utils.real_data.FORMATS` has the data sets, their views and the sizes of
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,10 +168,28 @@ def real_folds(config: Config) -> list[Fold]:
     dataset = open_real_data(settings.kind, settings.root)
     splits = folds_of(dataset.object_ids, settings.split, settings.folds, config.seed)
     numbers = range(settings.folds) if settings.fold is None else [settings.fold]
+    _check_size(dataset[0], settings.kind)
     view = FORMATS[settings.kind].view
     samples = Changed(dataset, view.levelled) if view.slanted else dataset
     samples = list(samples) if len(dataset) <= IN_MEMORY else samples
     return [_fold(config, number, splits[number], samples, dataset.names) for number in numbers]
+
+
+def _check_size(sample: RealSample, kind: str) -> None:
+    """Warn of images of another size than those of their format, of which the view sees another
+    part; raise UserError where it sees no label of this one."""
+    form, (rows, columns) = FORMATS[kind], sample.depth.shape
+    if (rows, columns) == form.size:
+        return
+    beside = [np.abs(one.centre - np.array([columns, rows]) / 2).max() for one in sample.positives]
+    told = (
+        f"data.root: {sample.name} has {columns} x {rows} px, and data.kind={kind} means "
+        f"{form.size[1]} x {form.size[0]}: the network sees the middle {form.view.side} px of each "
+        "side"
+    )
+    if min(beside) > form.view.side / 2:
+        raise UserError(f"{told}, where this image has no label; crop or resize the images")
+    warnings.warn(f"{told}, and takes a pixel to span what one of that size does", stacklevel=2)
 
 
 def _fold(

@@ -477,7 +477,10 @@ def test_the_diagram_has_a_line_for_each_name() -> None:
 
 
 @pytest.mark.parametrize("text, message", [
-    (None, "does not exist, .*: git checkout checkpoints"),
+    (None, "does not exist, .* by git checkout checkpoints, .* by python -m benchmarks.calibrate"),
+    ('{"planners": {"my:P": {"offset": 1}}}', "no chances of success by planner: .*slope"),
+    ('{"planners": {"my:P": null}}', "holds no chances of success"),
+    ('{"planners": ["my:P"]}', "holds no chances of success"),
     ("{", "holds no chances of success"),
     ('{"planner": {}}', "holds no chances of success"),
 ])  # fmt: skip

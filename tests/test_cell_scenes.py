@@ -297,6 +297,24 @@ def test_one_layout_table_of_pybullet_at_a_time(config):
         pass
 
 
+@pytest.mark.parametrize(
+    ("layout", "simulator", "short", "least"),
+    [
+        ("packed", "pybullet", 0.99, "1"),
+        ("packed", "mujoco", 0.99, "1"),
+        ("isolated", "mujoco", 0.24, "0.25"),
+        ("isolated", "pybullet", 0.04, "0.05"),
+    ],
+)
+def test_too_short_a_time_to_rest_is_named(box_set, config, layout, simulator, short, least):
+    if simulator not in INSTALLED:
+        pytest.skip(f"needs {simulator}")
+    hasty = with_settings(config, "scene", {"simulator": simulator, "settle_seconds": short})
+    expected = f"settle_seconds={short} is too short for .* {simulator}, .* rest for {least} s;"
+    with pytest.raises(SceneError, match=expected):
+        make_scene(layout, box_set, 0, hasty)
+
+
 def test_impossible_scene_is_refused(box_set, config):
     crowded = with_settings(config, "scene", {"count": 50})
     with pytest.raises(SceneError, match="scene.count"):

@@ -13,6 +13,7 @@ from utils.checkpoint import (
     FORMAT_VERSION,
     MAGIC,
     build_model,
+    check_weights_file,
     load_checkpoint,
     load_weights,
     reading,
@@ -109,6 +110,18 @@ def refused(path, kind: str = "test", **expected) -> str:
 def test_a_missing_file_and_a_folder(tmp_path) -> None:
     assert "No such file" in refused(tmp_path / "none.pt")
     assert "directory" in refused(tmp_path)
+
+
+def test_only_a_checkpoint_of_its_kind_is_replaced(tmp_path) -> None:
+    config, policy = tmp_path / "mine.yaml", tmp_path / "policy.pt"
+    config.write_text("seed: 1\n")
+    save(policy)
+    check_weights_file("--weights", tmp_path / "new.pt", "test")
+    check_weights_file("--weights", policy, "test")
+    for kind, path in (("test", config), ("critic", policy)):
+        with pytest.raises(UserError, match=f"{path}: would replace a file that holds no {kind}"):
+            check_weights_file("--weights", path, kind)
+    assert config.read_text() == "seed: 1\n"
 
 
 def test_another_kind_version_or_architecture(tmp_path) -> None:

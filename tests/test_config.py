@@ -144,6 +144,13 @@ def test_override_values(text, expected):
         ("camera={view: side, mount: wrist}", ["camera: view=side places the overhead camera"]),
         ("env={near_share: 0.6, missed_share: 0.5}", ["must not be more than 1 together"]),
         ("env={missed_share: 0.1, scenario: pile}", ["missed_share is for one object"]),
+        (
+            "workspace={center: [0.45, -0.33], size: 0.25}",
+            [
+                "workspace must not overlap the tray, which takes x from 0.285 to 0.555 m and y "
+                "from -0.615 to -0.345 m: move workspace.center"
+            ],
+        ),
         ("data.fold=0", ["data: fold is one of photographs, and kind is simulated"]),
         ("gripper={max_opening: 0.02, least_held: 0.02}", ["least_held (0.02) must be smaller"]),
         ("camera=3", ["camera: got 3", "a section with the keys mount, width"]),

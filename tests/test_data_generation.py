@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
 
 from envs import data_generation
@@ -21,6 +22,7 @@ from envs.cell_appearance import Appearance, Texture, draw_camera
 from envs.cell_scenes import SceneError
 from envs.data_generation import (
     SPLITS,
+    content_of_sets,
     data_folder,
     draw_scene,
     execute_pairs,
@@ -75,6 +77,56 @@ def test_the_files_of_an_own_set_matter_wherever_its_folder_is_named(tmp_path):
     assert len(seen) == 4
     other.unlink()
     assert folder_of(f"data.object_sets={tmp_path / 'meshes'}") in seen
+
+
+def test_the_meshes_of_an_own_set_matter_wherever_they_lie(tmp_path, monkeypatch):
+    """A folder of URDFs that name meshes outside, a plug-in that names the folder, and a part of
+    it; the texture of a mesh, too."""
+    (tmp_path / "urdf").mkdir()
+    (tmp_path / "meshes").mkdir()
+    for name in ("one", "two"):
+        geometry = f'<geometry><mesh filename="../meshes/{name}.obj"/></geometry>'
+        (tmp_path / "urdf" / f"{name}.urdf").write_text(
+            f'<robot name="{name}"><link name="a"><visual>{geometry}</visual></link></robot>'
+        )
+        (tmp_path / "meshes" / f"{name}.obj").write_text("mtllib paint.mtl\nv 0 0 0\n")
+    (tmp_path / "my_folder_of_urdfs.py").write_text(
+        "from envs.objects import ObjectPart, load_object_set\n"
+        f"named = {str(tmp_path / 'urdf')!r}\n"
+        "def some(settings):\n"
+        "    whole = load_object_set(named, cache_dir=settings.cache_dir)\n"
+        "    return ObjectPart(whole, range(2))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    plug_in = "my_folder_of_urdfs"
+    for name in (str(tmp_path / "urdf"), f"{plug_in}:named", f"{plug_in}:some"):
+        own, seen = f"data.object_sets={name}", []
+        for file, text in (
+            ("one.obj", "mtllib paint.mtl\nv 0 0 0\n"),
+            ("one.obj", "mtllib paint.mtl\nv 0 0 1\n"),
+            ("paint.mtl", "map_Kd wood.png\n"),
+            ("wood.png", "pixels"),
+            ("wood.png", "other pixels"),
+        ):
+            (tmp_path / "meshes" / file).write_text(text)
+            seen.append(folder_of(own))
+        assert len({*seen}) == 5, name
+        (tmp_path / "meshes" / "unused.obj").write_text(text)
+        assert folder_of(own) == seen[-1]
+        for file in ("paint.mtl", "wood.png", "unused.obj"):
+            (tmp_path / "meshes" / file).unlink()
+        (tmp_path / "meshes" / "one.obj").write_text("mtllib paint.mtl\nv 0 0 0\n")
+        assert folder_of(own) == seen[0]
+
+
+def test_data_of_built_in_sets_and_of_plain_folders_made_before_stay_valid(tmp_path):
+    """Digests as they were before the meshes outside a folder counted."""
+    (tmp_path / "part").mkdir()
+    (tmp_path / "cube.obj").write_text("v 0 0 0")
+    (tmp_path / "part" / "cube.mtl").write_text("Kd 1 0 0")
+    config = load_config(None, [f"data.object_sets={tmp_path},primitives"])
+    before = "d6955bc5c560f0540ae8a42ea53f4f36ffcf7b93424de9366c721a8101005e05"
+    assert content_of_sets(config, config.data.object_sets) == {str(tmp_path): before}
 
 
 @pytest.mark.parametrize(
@@ -323,6 +375,73 @@ def test_validation_keeps_a_tenth_of_the_training_objects_and_no_test_object(con
     assert not used["train"] & used["validation"]
     # 900 and above are for testing
     assert all(int(name[-4:]) < 900 for names in used.values() for name in names)
+
+
+def some_broken(folder: Path, broken: tuple[int, ...]) -> str:
+    """Twelve boxes, of which numbers 1 and 4 are for validation; some are no meshes."""
+    folder.mkdir()
+    for number in range(12):
+        box = trimesh.creation.box((0.03, 0.04, 0.05 + 0.001 * number))
+        box.export(folder / f"o{number:02d}.stl")
+        if number in broken:
+            (folder / f"o{number:02d}.stl").write_text("no mesh")
+    return str(folder)
+
+
+def test_a_broken_files_place_is_taken_within_its_own_split(tmp_path, config):
+    own = some_broken(tmp_path / "own", broken=(1, 5))
+    given = load_config(None, [f"data.object_sets={own}", "objects.skip_broken=true"])
+    parts = object_sets(given)
+    with pytest.warns(UserWarning, match="leaves out") as said:
+        names = {split: [model.name for model in parts[own, split]] for split in SPLITS}
+    assert names["validation"] == ["o04", "o04"]
+    assert names["train"] == [f"o{number:02d}" for number in (0, 2, 3, 6, 6, 7, 8, 9, 10, 11)]
+    assert len(said) == 2
+
+
+def test_a_split_of_broken_files_alone_is_refused(tmp_path):
+    own = some_broken(tmp_path / "own", broken=(1, 4))
+    given = load_config(None, [f"data.object_sets={own}", "objects.skip_broken=true"])
+    none = r"own: none of 2 files of a part \(training or validation\) can be used: .*o01.*o04"
+    with pytest.raises(ObjectError, match=none):
+        object_sets(given)[own, "validation"][0]
+
+
+@pytest.mark.parametrize("plug_in", [False, True])
+def test_files_of_one_name_are_in_one_split(tmp_path, monkeypatch, plug_in):
+    own = Path(some_broken(tmp_path / "own", broken=()))
+    (own / "kitchen").mkdir()
+    for mesh in own.glob("*.stl"):
+        shutil.copy(mesh, mesh.with_suffix(".ply"))
+        shutil.copy(mesh, own / "kitchen")
+    (tmp_path / "my_boxes.py").write_text(
+        "from envs.objects import ObjectPart, load_object_set\n"
+        "def boxes(settings):\n"
+        f"    return ObjectPart(load_object_set({str(own)!r}, cache_dir='.'), range(36))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    name = "my_boxes:boxes" if plug_in else str(own)
+    parts = object_sets(load_config(None, [f"data.object_sets={name}"]))
+    files = {split: parts[name, split].files for split in SPLITS}
+    assert len({*files["train"], *files["validation"]}) == 36
+    train, validation = ({file.with_suffix("") for file in files[split]} for split in SPLITS)
+    assert len(validation) == 3 and not train & validation
+    (tmp_path / "two").mkdir()
+    for suffix in ("stl", "ply"):
+        shutil.copy(own / "o00.stl", tmp_path / "two" / f"one.{suffix}")
+    with pytest.raises(UserError, match="holds 1 object, .* two objects or more, of different nam"):
+        object_sets(load_config(None, [f"data.object_sets={tmp_path / 'two'}"]))
+
+
+def test_older_data_that_may_have_a_shape_in_both_splits_are_made_anew(tmp_path):
+    own = some_broken(tmp_path / "own", broken=())
+    usual = [f"data.object_sets={own}"]
+    mark = "no shape in two splits"
+    assert mark not in data_generation._content(load_config(None, usual))
+    skipping = load_config(None, [*usual, "objects.skip_broken=true"])
+    assert mark in data_generation._content(skipping)
+    shutil.copy(Path(own, "o00.stl"), Path(own, "o00.ply"))
+    assert mark in data_generation._content(load_config(None, usual))
 
 
 @pytest.mark.parametrize("name, families", [("thin", 4), ("household", 10), ("primitives", 11)])

@@ -15,6 +15,7 @@ from tests.helpers.compare import same
 from utils.augmentation import Augmentation, LabelledImage
 from utils.config import load_config
 from utils.distributed import ALONE
+from utils.errors import UserError
 
 BINS = 18
 
@@ -59,6 +60,16 @@ def test_processes_that_load_leave_sigterm_to_the_main_process():
     data = SimpleNamespace(train=SentSigterm(range(6)))
     batches = list(epoch_loader(config, data, ALONE, 0, 0))
     assert sorted(torch.cat(batches).tolist()) == list(range(6))
+
+
+def test_a_checkpoint_of_another_number_of_images_is_not_gone_on_with():
+    """Of 10 images an epoch of five steps was half done; there are 30 now, or fewer."""
+    config = load_config(None, ["train.batch_size=2", "train.workers=0"])
+    data = SimpleNamespace(train=range(6))
+    for skip in (-2, 4):
+        with pytest.raises(UserError, match=f"lies {skip} steps .* epoch 2, expected 0 to 3: "):
+            epoch_loader(config, data, ALONE, 1, skip)
+    assert len(epoch_loader(config, data, ALONE, 1, 3)) == 0  # stopped in its last step
 
 
 def blocks(seed: int, side: int = 64) -> LabelledImage:

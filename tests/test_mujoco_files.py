@@ -43,6 +43,21 @@ def test_a_density_is_that_of_a_box(tmp_path, scale):
     assert model.extents == pytest.approx(np.multiply(SIDES, scale)) and not model.remarks
 
 
+@pytest.mark.parametrize(
+    ("stated", "density"),
+    [('density="300"', 300), ('mass="0.036"', 300), ('density="2e8"', None)],
+)
+def test_a_density_counts_as_it_stands_where_lengths_are_millimetres(tmp_path, stated, density):
+    geom = f'<geom type="box" size="20 25 30" {stated}/>'
+    if density is None:
+        with pytest.raises(ObjectError, match="states densities, which make 2e[+]08 kg/m3"):
+            load(tmp_path, geom, scale=0.001)
+        return
+    model = load(tmp_path, geom, scale=0.001)
+    assert model.mass == pytest.approx(density * VOLUME)
+    assert model.inertia == pytest.approx(box_moments(density * VOLUME))
+
+
 def test_fit_scales_mass_and_inertia(tmp_path):
     model = load(tmp_path, BOX.format('mass="0.4"'), fit=0.04)  # its middle side is 5 cm
     assert model.mass == pytest.approx(0.4 * 0.8**3)
@@ -212,6 +227,19 @@ def test_geometry_without_collision_is_solid_and_a_mesh_with_a_frame_is_drawn_in
     assert model.mass == pytest.approx(700 * VOLUME) and model.color == (1, 0, 0, 1)
     drawn = trimesh.load_mesh(model.fine_visual.path).bounds + model.fine_visual.position
     assert drawn == pytest.approx(np.array([[-0.5], [0.5]]) * SIDES, abs=1e-6)
+
+
+@pytest.mark.parametrize("where", ["geom", "material"])
+def test_a_geom_that_cannot_be_seen_gives_no_colour_and_no_picture(tmp_path, where):
+    rgba = 'rgba="1 0 0 0"'
+    assets = f'<asset><material name="clear" {rgba if where == "material" else ""}/></asset>'
+    clear = 'material="clear"' if where == "material" else rgba
+    hidden = f'<geom type="box" size="1 1 1" contype="0" conaffinity="0" {clear}/>'
+    model = load(tmp_path, BOX.format('rgba="0 0 1 0.5"') + hidden, assets)
+    assert model.color == (0, 0, 1, 1)
+    shown = trimesh.load_mesh(model.fine_visual.path)
+    assert shown.extents == pytest.approx(SIDES, abs=1e-6)
+    assert load(tmp_path, BOX.format(clear), assets).color[3] == 1
 
 
 # --- Folders --------------------------------------------------------------------------------------

@@ -124,6 +124,35 @@ def test_a_mass_stays_that_of_the_body_where_lengths_are_millimetres(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("sides", "mass", "scale"),
+    [
+        ((8, 3, 3), 0.5, 0.0254),  # a box in inches
+        ((2.5, 2.5, 2.5), 0.03, 0.01),  # a die in centimetres, shorter than 3
+        ((45, 8, 8), 2.0, 0.01),  # a long box in centimetres, which might be millimetres
+        ((1.0, 0.8, 0.6), 0.4, 0.1),  # in decimetres
+    ],
+)
+def test_a_scale_far_from_1_is_the_unit_of_the_lengths(tmp_path, sides, mass, scale):
+    path = urdf_box(tmp_path, str(mass), "", sides=sides)
+    model = load_object(path, scale=scale, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(mass)
+    a, b, c = np.square(np.multiply(sides, scale))
+    assert model.inertia == pytest.approx(mass / 12 * np.array([b + c, a + c, a + b]))
+
+
+def test_the_unit_that_was_taken_is_named_where_no_material_is_as_dense(tmp_path):
+    path = urdf_box(tmp_path, "500", "", sides=(8, 3, 3))
+    with pytest.raises(ObjectError, match="in its mesh with lengths in units of 0.0254 m, exp"):
+        load_object(path, scale=0.0254, cache_dir=tmp_path)
+
+
+def test_an_inertia_that_is_not_stated_is_that_of_even_density_without_a_remark(tmp_path):
+    model = load_object(urdf_box(tmp_path, "0.4", ""), cache_dir=tmp_path)
+    assert model.mass == pytest.approx(0.4) and not model.remarks
+    assert model.inertia == pytest.approx(box_moments(0.4))
+
+
+@pytest.mark.parametrize(
     ("mass", "message"),
     [
         ("0", "box.urdf .*0 kg in all"),

@@ -6,8 +6,8 @@ import trimesh
 from PIL import Image
 
 from envs.object_bodies import load_object
-from envs.object_files import read_object
-from envs.object_meshes import ObjectError, surface_colour
+from envs.object_files import object_files, read_object
+from envs.object_meshes import ObjectError, load_mesh, surface_colour
 from envs.objects import load_object_set
 
 MISSING_MESH = """<robot name="r"><link name="l"><collision><geometry>
@@ -70,7 +70,11 @@ def test_a_bad_urdf_is_named(tmp_path, content, message):
         read_object(path)
 
 
-COLOUR = '<material name="m"><color rgba="1 0 0"/></material>'
+def colour(rgba: str) -> str:
+    return f'<material name="{rgba}"><color rgba="{rgba}"/></material>'
+
+
+RGBA = "bad.urdf.* rgba of a <color> is '{}', expected four numbers of 0 to 1"
 
 
 @pytest.mark.parametrize(
@@ -81,7 +85,9 @@ COLOUR = '<material name="m"><color rgba="1 0 0"/></material>'
             "",
             r"bad.urdf.* scale of a <mesh> is '1 1', expected one number or three",
         ),
-        ('filename="box.obj"', COLOUR, r"bad.urdf .* colour of a visual is \[1. 0. 0.\]"),
+        ('filename="box.obj"', colour("1 0 0"), RGBA.format("1 0 0")),
+        ('filename="box.obj"', colour("200 100 50 255"), RGBA.format("200 100 50 255")),
+        ('filename="box.obj"', colour("0 0 -1 1"), RGBA.format("0 0 -1 1")),
         (f'filename="{300 * "b"}.obj"', "", "b.obj does not exist"),
         (f'filename="package://{300 * "b"}/other.obj"', "", "other.obj does not exist"),
     ],
@@ -99,6 +105,31 @@ def test_a_bad_visual_is_named_and_can_be_skipped(tmp_path, mesh, material, mess
     objects = load_object_set(str(tmp_path), cache_dir=tmp_path / "cache", skip_broken=True)
     with pytest.warns(UserWarning, match=message):
         assert objects[0].name != "bad"
+
+
+def test_a_colour_that_cannot_be_seen_is_none(tmp_path):
+    """The next one counts, opaque, or that of the name."""
+    found = []
+    for rest in ("", colour("0 1 0 0.5"), ""):
+        path = tmp_path / "box.urdf"
+        box = "<geometry><box size='0.04 0.05 0.06'/></geometry>"
+        visuals = [f"<visual>{box}{one}</visual>" for one in (colour("1 0 0 0"), rest)]
+        path.write_text(f"<robot name='r'><link name='l'>{''.join(visuals)}</link></robot>")
+        found.append(load_object(path, cache_dir=tmp_path).color)
+    assert found[1] == (0, 1, 0, 1)
+    assert found[0] == found[2] != (1, 0, 0, 0) and found[0][3] == 1
+
+
+def test_objects_behind_links_to_folders_are_found_once(tmp_path):
+    """Also where links run in a circle, or to what is there anyway."""
+    sets, chosen = tmp_path / "sets", tmp_path / "chosen"
+    for folder in (sets / "mugs", chosen / "b"):
+        folder.mkdir(parents=True)
+        trimesh.creation.box((0.04, 0.05, 0.06)).export(folder / "box.stl")
+    (chosen / "mugs").symlink_to(sets / "mugs")
+    (chosen / "a").symlink_to(chosen / "b")
+    (sets / "mugs" / "back").symlink_to(chosen)
+    assert object_files(chosen) == [chosen / "b" / "box.stl", chosen / "mugs" / "box.stl"]
 
 
 def test_a_urdf_with_collision_geometry_alone_is_shown_by_it(tmp_path):
@@ -156,6 +187,93 @@ def test_an_object_has_the_mean_colour_of_its_texture(tmp_path):
         '<material name="m"><color rgba="1 1 1 1"/></material></visual></link></robot>'
     )
     assert load_object(urdf, cache_dir=tmp_path).color == pytest.approx((red, 0, blue, 1))
+
+
+def test_a_textured_glb_has_the_mean_colour_of_its_texture(tmp_path):
+    trimesh.load_scene(write_textured(tmp_path), process=False).export(tmp_path / "box.glb")
+    expected = surface_colour(tmp_path / "box.obj")
+    assert surface_colour(tmp_path / "box.glb") == pytest.approx(expected)
+
+
+def numbers(text: str, start: str) -> str:
+    """Those of the lines of an OBJ file that begin so."""
+    found = [line.split(maxsplit=1)[1] for line in text.splitlines() if line.startswith(start)]
+    return " ".join(found)
+
+
+def write_dae(folder, unit=""):
+    """The pyramid of `write_textured` as a DAE file."""
+    write_textured(folder)
+    corners = [int(one) - 1 for one in numbers(TEXTURED, "f ").replace("/", " ").split()]
+    sources = "".join(
+        f"""<source id="{name}"><float_array id="{name}s" count="{count * len(axes)}">
+        {numbers(TEXTURED, start)}</float_array><technique_common><accessor source="#{name}s"
+        count="{count}" stride="{len(axes)}">
+        {"".join(f'<param name="{axis}" type="float"/>' for axis in axes)}
+        </accessor></technique_common></source>"""
+        for name, start, count, axes in (("place", "v ", 5, "XYZ"), ("uv", "vt ", 2, "ST"))
+    )
+    (folder / "box.dae").write_text(
+        f"""<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+        <asset>{unit}</asset>
+        <library_images><image id="image"><init_from>picture.png</init_from></image>
+        </library_images>
+        <library_effects><effect id="effect"><profile_COMMON>
+        <newparam sid="surface"><surface type="2D"><init_from>image</init_from></surface></newparam>
+        <newparam sid="sampler"><sampler2D><source>surface</source></sampler2D></newparam>
+        <technique sid="common"><lambert><diffuse><texture texture="sampler" texcoord="UV"/>
+        </diffuse></lambert></technique></profile_COMMON></effect></library_effects>
+        <library_materials><material id="material"><instance_effect url="#effect"/></material>
+        </library_materials>
+        <library_geometries><geometry id="box"><mesh>{sources}
+        <vertices id="vertices"><input semantic="POSITION" source="#place"/></vertices>
+        <triangles material="symbol" count="{len(corners) // 6}">
+        <input semantic="VERTEX" source="#vertices" offset="0"/>
+        <input semantic="TEXCOORD" source="#uv" offset="1" set="0"/>
+        <p>{" ".join(map(str, corners))}</p></triangles></mesh></geometry></library_geometries>
+        <library_visual_scenes><visual_scene id="scene"><node><instance_geometry url="#box">
+        <bind_material><technique_common><instance_material symbol="symbol" target="#material"/>
+        </technique_common></bind_material></instance_geometry></node></visual_scene>
+        </library_visual_scenes><scene><instance_visual_scene url="#scene"/></scene></COLLADA>"""
+    )
+    return folder / "box.dae"
+
+
+def test_a_textured_dae_has_the_mean_colour_of_its_texture(tmp_path):
+    path = write_dae(tmp_path)
+    assert surface_colour(path) == pytest.approx(surface_colour(tmp_path / "box.obj"))
+
+
+INCH = '<unit name="inch" meter="0.0254"/>'
+
+
+def test_a_dae_is_as_large_as_its_unit_says(tmp_path):
+    plain = load_mesh(write_dae(tmp_path)).vertices
+    assert plain.min(axis=0) == pytest.approx(0) and plain.max() == pytest.approx(0.06)
+    metre = load_mesh(write_dae(tmp_path, '<unit name="meter" meter="1"/>')).vertices
+    assert metre.tobytes() == plain.tobytes()
+    inch = load_mesh(write_dae(tmp_path, INCH)).vertices
+    assert inch == pytest.approx(0.0254 * plain)
+    for wrong in ("inch", "0", "-1", "nan"):
+        with pytest.raises(ObjectError, match=f"box.dae states a unit of '{wrong}' metres, expec"):
+            load_mesh(write_dae(tmp_path, f'<unit meter="{wrong}"/>'))
+
+
+@pytest.mark.parametrize("scale", ["", "scale='30 20 20'"])
+@pytest.mark.parametrize("kinds", [["visual"], ["visual", "collision"], ["visual"] * 2])
+def test_a_urdf_takes_a_dae_as_large_as_its_unit_says(tmp_path, kinds, scale):
+    """To grasp, and in the picture."""
+    write_dae(tmp_path, INCH)
+    urdf = tmp_path / "box.urdf"
+    items = (
+        f"<{one}><geometry><mesh filename='box.dae' {scale}/></geometry></{one}>" for one in kinds
+    )
+    urdf.write_text(f"<robot name='r'><link name='l'>{''.join(items)}</link></robot>")
+    sides = 0.0254 * np.array([0.06, 0.04, 0.05]) * ([30, 20, 20] if scale else 1)
+    assert read_object(urdf).mesh.extents == pytest.approx(sides)
+    visual = load_object(urdf, cache_dir=tmp_path).fine_visual
+    shown = trimesh.load_mesh(visual.path)
+    assert shown.extents * visual.scale == pytest.approx(sides, rel=1e-4)
 
 
 def test_an_object_has_the_colour_of_its_faces(tmp_path):

@@ -13,7 +13,7 @@ import trimesh
 
 from envs.object_bodies import load_object
 from envs.object_primitives import FAMILIES, HOUSEHOLD_MASSES, UNSEEN_FAMILIES
-from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, load_object_set, prepare
+from envs.objects import BROKEN_RANDOM_URDFS, ObjectError, ObjectPart, load_object_set, prepare
 from envs.pybullet_files import data_folder
 from tests.helpers.object_files import box_moments, urdf_box, urdf_inertia
 from tests.helpers.simulators import needs_pybullet, pybullet
@@ -362,6 +362,17 @@ def test_a_set_of_broken_files_alone_is_refused(tmp_path):
     objects = load_object_set(str(tmp_path / "set"), skip_broken=True, cache_dir=tmp_path)
     with pytest.raises(ObjectError, match=r"none of 5 files can .*a\.obj.*b\.obj.*; and 2 more"):
         objects[0]
+
+
+def test_a_part_of_files_is_a_part_of_them_again(tmp_path):
+    """As of a plug-in that takes some objects of a folder, which are then split."""
+    _write_bad_folder(tmp_path / "set")
+    whole = load_object_set(str(tmp_path / "set"), skip_broken=True, cache_dir=tmp_path)
+    some = ObjectPart(whole, [1, 3, 4])  # b, d and e, of which d is broken
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert [model.name for model in some.part([0, 1])] == ["b", "b"]
+        assert [model.name for model in some.part([1, 2])] == ["e", "e"]
 
 
 # --- errors ---------------------------------------------------------------------------------

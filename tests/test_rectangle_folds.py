@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import train_graspnet
 from models.graspnet import create_model
 from models.graspnet_io import SHIPPED, load_graspnet, save_graspnet
-from models.rectangle_folds import folds_of, image_folds, object_folds, real_folds
-from tests.helpers.real_images import write_cornell, write_jacquard
+from models.rectangle_folds import _check_size, folds_of, image_folds, object_folds, real_folds
+from tests.helpers.real_images import sample, write_cornell, write_jacquard
 from utils.config import load_config
 from utils.errors import UserError
 from utils.real_data import FORMATS
+from utils.rectangles import GraspRectangle
 
 QUICK = ("train.backbone=ggcnn", "train.epochs=1", "train.workers=0", "train.precision=float32")
 
@@ -135,6 +137,15 @@ def test_bars_are_learned(tmp_path, monkeypatch):
     )  # fmt: skip
     results = json.loads((folder / "results.json").read_text())
     assert results["accuracy"] >= 0.8
+
+
+def test_images_of_another_size_are_told_of_or_refused(tmp_path):
+    bar = GraspRectangle(np.array([1000.0, 200.0]), 0.0, 24.0, 12.0)
+    with pytest.raises(UserError, match=r"1280 x 720 px, .* means 640 x 480: .* has no label"):
+        _check_size(sample(bar, (720, 1280)), "cornell")
+    middle = GraspRectangle(np.array([640.0, 360.0]), 0.0, 24.0, 12.0)
+    with pytest.warns(UserWarning, match="1280 x 720 px"):
+        _check_size(sample(middle, (720, 1280)), "cornell")
 
 
 def test_root_has_to_be_named_and_there(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import train_critic
 from benchmarks.train_critic import (
     collect,
     compared,
@@ -143,6 +144,21 @@ def test_a_stopped_collection_goes_on(tmp_path, monkeypatch) -> None:
         collect(config, 120, tmp_path)
 
 
+def test_grasps_of_other_meshes_are_not_taken(tmp_path) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "cube.obj").write_text("v 0 0 0")
+    config = load_config(None, [f"data.object_sets={own}"])
+    train_critic.check_same_settings(tmp_path, config)
+    train_critic.check_same_settings(tmp_path, config)
+    (own / "cube.obj").write_text("v 0 0 1")
+    with pytest.raises(UserError, match="grasps of another content of object_sets; give another"):
+        train_critic.check_same_settings(tmp_path, config)
+    built_in = load_config(None, ["data.object_sets=primitives"])
+    train_critic.check_same_settings(tmp_path / "built_in", built_in)
+    assert "content" not in (tmp_path / "built_in" / "settings.json").read_text()
+
+
 def test_a_critic_goes_on_from_another_ones_weights(known) -> None:
     """Of a rule that is known already, few examples take nothing away."""
     few = made_up(20, 2)
@@ -151,6 +167,13 @@ def test_a_critic_goes_on_from_another_ones_weights(known) -> None:
     tested = made_up(100, 1)
     assert judged(again, tested)["graspnet6d by critic"] > 0.8
     assert judged(anew, tested)["graspnet6d by critic"] < 0.7
+
+
+def test_scenes_without_grasps_are_one_sentence(tmp_path, monkeypatch) -> None:
+    few = made_up(3, 1)
+    monkeypatch.setattr(train_critic, "collect", lambda *_: few.where(few.scene < 0))
+    with pytest.raises(UserError, match="0 grasps were executed, 0 of them in the tenth"):
+        train(["--scenes", "10", "--output", str(tmp_path / "critic.pt")])
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path) -> None:

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import train_graspnet
 from models.graspnet import create_model
-from models.graspnet_io import KIND, load_graspnet, save_graspnet
+from models.graspnet_io import KIND, SHIPPED, load_graspnet, save_graspnet
 from models.graspnet_scores import LabelScores
 from models.graspnet_training import Trainer
 from tests.helpers.compare import halved, same
@@ -117,7 +117,7 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     """
     straight, arguments = finished
     shipped = tmp_path / "shipped.pt"
-    shipped.write_text("the good old ones")
+    shipped.write_bytes(SHIPPED.read_bytes())
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
         interrupt_after(patch, Trainer, "train_step", lambda trainer: trainer.step == stop)
@@ -129,7 +129,7 @@ def test_ctrl_c_and_resume_end_as_if_nothing_had_happened(
     first_epoch_is_over = stop > 4
     for name in ("results.json", "graspnet.pt"):
         assert (run / name).exists() == first_epoch_is_over
-    assert shipped.read_text() == "the good old ones"
+    assert shipped.read_bytes() == SHIPPED.read_bytes()
 
     assert (
         train_graspnet.main(["--resume", str(run), "train.workers=2", f"--weights={shipped}"]) == 0

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import trimesh
+from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 import train_graspnet
+from models.photographs import K
+from tests.helpers.real_images import write_cornell, write_jacquard
+from utils.atomic_files import write_json_atomic
 from utils.config import load_config
 from utils.distributed import ALONE
 from utils.errors import UserError
-from utils.runs import new_run_folder
+from utils.runs import begun_with, new_run_folder
+from utils.table_plane import distances
 
 
 def no_data(*_) -> Path:
@@ -60,6 +68,80 @@ def test_the_file_of_the_first_weights_may_be_gone_where_there_are_later_ones(
     (run / "last.pt").touch()
     with pytest.raises(AssertionError, match="no data"):
         train_graspnet.main(["--resume", str(run)])
+
+
+# --- Data that have changed ------------------------------------------------------------------
+
+
+def of_an_older_version(run: Path) -> None:
+    """Which did not note what a run learns from."""
+    facts = begun_with(run)
+    del facts["data"]
+    write_json_atomic(run / "environment.json", facts)
+
+
+@pytest.mark.filterwarnings("ignore:data.root")
+def test_folds_of_other_images_are_not_gone_on_with(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_graspnet, "train", lambda *_: ([], False))  # stopped in fold 0
+    write_jacquard(Path("images"), objects=5)
+    call = ["data.kind=jacquard", "data.root=images", "data.folds=2", "train.device=cpu"]
+    assert train_graspnet.main([*call, "train.batch_size=2"]) == 130
+    (run,) = Path("runs/train_graspnet").iterdir()
+    (run / "fold0").mkdir(exist_ok=True)
+    (run / "fold0" / "last.pt").touch()
+    again = ["--resume", str(run)]
+    assert train_graspnet.main(again) == 130
+    write_jacquard(Path("images"), objects=15)
+    changed = (
+        r"other data, fold 0: \d images \(.{8}\), tested on \d images .*, and would go on with 1\d "
+        "images .*; bring back what was there .* or start a new run"
+    )
+    with pytest.raises(UserError, match=changed):
+        train_graspnet.main(again)
+    of_an_older_version(run)
+    assert train_graspnet.main(again) == 130
+    shutil.rmtree("images")
+    write_jacquard(Path("images"), objects=5)
+    with pytest.raises(UserError, match="other data"):
+        train_graspnet.main(again)
+
+
+def test_other_photographs_and_meshes_are_not_gone_on_with(tmp_path, monkeypatch):
+    """And are told of before images are made of the meshes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_graspnet, "make_data", lambda *_: None)
+    monkeypatch.setattr(train_graspnet, "with_target", lambda *_: None)
+    monkeypatch.setattr(train_graspnet, "make_trainer", lambda *_: SimpleNamespace(step=0))
+    monkeypatch.setattr(train_graspnet, "train", lambda *_: ([], False))
+
+    def photographs(count: int) -> None:
+        write_cornell(Path("photographs"), count, shape=(480, 640))
+        for file in Path("photographs").glob("*d.tiff"):
+            depth = np.asarray(Image.open(file))
+            Image.fromarray(distances(depth, K).astype(np.float32)).save(file)
+
+    Path("own").mkdir()
+    for name in ("one", "two"):
+        trimesh.creation.box((0.03, 0.04, 0.05)).export(Path("own", f"{name}.stl"))
+    photographs(6)
+    call = ["adaptation.target=photographs", "data.object_sets=own", "train.device=cpu"]
+    assert train_graspnet.main(call) == 130
+    (run,) = Path("runs/train_graspnet").iterdir()
+    (run / "last.pt").touch()
+    again = ["--resume", str(run)]
+    assert train_graspnet.main(again) == 130
+    monkeypatch.setattr(train_graspnet, "make_data", no_data)
+    photographs(7)
+    changed = r"data, adaptation\.target: 6 images .{10}, and would go on with 7 images"
+    with pytest.raises(UserError, match=changed):
+        train_graspnet.main(again)
+    trimesh.creation.box((0.03, 0.04, 0.06)).export("own/one.stl")
+    with pytest.raises(UserError, match=r"data, simulated images: simulated-\w{8}, and would"):
+        train_graspnet.main(again)
+    of_an_older_version(run)
+    with pytest.raises(AssertionError, match="no data"):
+        train_graspnet.main(again)
 
 
 def test_the_curves_are_closed_where_a_training_fails(tmp_path, monkeypatch):

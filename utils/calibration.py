@@ -188,23 +188,24 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
     """Those of a file by planner. Raises UserError for a file that is missing or is none."""
     try:
         planners: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["planners"]
+        return {
+            name: Calibration(
+                one["slope"],
+                one["offset"],
+                one.get("penalty", 0.0),
+                one.get("doubt", 0.0),
+                one.get("upper", 0.0),
+            )
+            for name, one in planners.items()
+        }
     except FileNotFoundError:
         raise UserError(
-            f"{path} does not exist, without which no planner states chances of success; bring it "
-            "back from the repository: git checkout checkpoints"
+            f"{path} does not exist, without which no planner states chances of success; the "
+            "shipped one comes back by git checkout checkpoints, one of your own by "
+            "python -m benchmarks.calibrate"
         ) from None
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} holds no chances of success by planner: {error!r}") from None
-    return {
-        name: Calibration(
-            one["slope"],
-            one["offset"],
-            one.get("penalty", 0.0),
-            one.get("doubt", 0.0),
-            one.get("upper", 0.0),
-        )
-        for name, one in planners.items()
-    }
 
 
 def unlikely_ones(grasps: Sequence[Grasp], named: str = "grasps") -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from utils.atomic_files import write_atomic
+from utils.atomic_files import check_writable, write_atomic
 from utils.errors import UserError, one_line
 
 MAGIC = "robot-grasping checkpoint"
@@ -81,6 +81,21 @@ def _halved(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         name: value.half() if value.dim() > 1 and bool((value.abs() < most).all()) else value
         for name, value in weights.items()
     }
+
+
+def check_weights_file(option: str, path: Path | None, kind: str) -> None:
+    """Raise UserError if a checkpoint of this kind could not be written at the end to the file that
+    an option names, or would replace a file that is none of this kind."""
+    check_writable(option, path)
+    if path is None or not path.exists():
+        return
+    try:
+        load_checkpoint(path, kind)
+    except UserError as error:
+        raise UserError(
+            f"{option} {path}: would replace a file that holds no {kind} of this program; give "
+            "another name"
+        ) from error
 
 
 def load_checkpoint(

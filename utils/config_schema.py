@@ -45,7 +45,7 @@ from utils.config_types import (
 )
 from utils.depth import DepthNoise, make_depth_noise
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_WALL, GripperGeometry, Workspace
 from utils.transforms import look_at
 
 
@@ -153,6 +153,18 @@ class WorkspaceConfig(Section):
         if np.hypot(x, y) > 0.8 or self.center[0] - self.size / 2 < 0.2:
             raise ValueError(
                 "the workspace must lie within 0.8 m of the robot and at least 0.2 m in front of it"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _beside_the_tray(self) -> WorkspaceConfig:
+        half = TRAY_HALF_SIZE + TRAY_WALL
+        if (abs(self.center - TRAY_CENTRE) < half + self.size / 2).all():
+            (x, y), (far_x, far_y) = TRAY_CENTRE - half, TRAY_CENTRE + half
+            raise ValueError(
+                f"the workspace must not overlap the tray, which takes x from {x:g} to {far_x:g} m "
+                f"and y from {y:g} to {far_y:g} m: move workspace.center or make workspace.size "
+                "smaller"
             )
         return self
 

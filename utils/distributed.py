@@ -24,6 +24,7 @@ from torch import nn
 
 from utils.config import Config, with_settings
 from utils.errors import UserError
+from utils.run_checks import check_data, keep_data
 from utils.runs import open_run, run_of_job
 
 MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
@@ -180,13 +181,15 @@ def choose_device(name: str, local_rank: int = 0, key: str = "train.device") -> 
 
 @contextmanager
 def run_folder(
-    script: str, name: str | None, config: Config, resume: Path | None, processes: Team
-) -> Iterator[Path]:
+    script: str, name: str | None, config: Config, resume: Path | None, processes: Team,
+    data: Mapping[str, str] | None = None,
+) -> Iterator[Path]:  # fmt: skip
     """The folder of a training's run, in every process of it; no other training works there within
     this context, see `utils.runs.open_run`.
 
     resume: the folder to go on with; None for a new one, or the one that the processes have made
-    before `torchrun` started them again, because one was lost or others joined.
+    before `torchrun` started them again, because one was lost or others joined. data: what the
+    training learns from, which must be what the run was begun with (`utils.run_checks`).
     """
     with ExitStack() as opened:
         folder = resume
@@ -194,6 +197,9 @@ def run_folder(
             # torchrun has ended those before; a machine that was lost may hold its lock for long.
             again = run_of_job(script, config) if resume is None else None
             folder = again or opened.enter_context(open_run(resume, script, name, config))
+            if data is not None:
+                check_data(folder, data)
+                keep_data(folder, data)
         yield Path(processes.broadcast(str(folder)))
 
 

@@ -14,6 +14,9 @@ from scipy.spatial import ConvexHull
 from utils.errors import UserError
 from utils.transforms import transform_points
 
+# The tray into which picked objects go, beside the workspace.
+TRAY_CENTRE = np.array([0.42, -0.48])  # m in W; outside the overhead camera's view
+TRAY_HALF_SIZE, TRAY_WALL = 0.13, 0.005  # m
 HANGS_FROM = 0.05  # m over the table, of the lowest point of what hangs over it
 
 

@@ -9,6 +9,7 @@ module knows no network and no simulator.
 from __future__ import annotations
 
 import re
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -86,7 +87,8 @@ class CornellDataset(RealDataset):
 
     The object of each image comes from `z.txt` or `processedData/z.txt` under the root (rows of
     image number, object number, description); without it from the table of folder 01, else from
-    blocks of `IMAGES_PER_OBJECT` consecutive numbers, a guess whose borders may cut an object.
+    blocks of `IMAGES_PER_OBJECT` consecutive numbers, a guess whose borders may cut an object; a
+    warning tells of it.
     """
 
     SUFFIXES = ("r.png", "d.tiff", "cpos.txt", "cneg.txt")
@@ -141,11 +143,12 @@ class JacquardDataset(RealDataset):
 class RealFormat:
     """A format of real data with labels.
 
-    open: makes the data set of a folder. view: what a network sees of its images. crop: side of a
-    training example, pixels of the view.
+    open: makes the data set of a folder. size: (rows, columns) of its images. view: what a network
+    sees of them. crop: side of a training example, pixels of the view.
     """
 
     open: Callable[[str | Path], RealDataset]
+    size: tuple[int, int]
     view: View
     crop: int
 
@@ -156,6 +159,7 @@ FORMATS = {
     # all of a cereal box at once.
     "cornell": RealFormat(
         CornellDataset,
+        (480, 640),
         View(side=400, size=240, metres_per_pixel=1.2 / 525 * 400 / 240, slanted=True),
         crop=128,
     ),
@@ -163,6 +167,7 @@ FORMATS = {
     # (ShapeNet's are scaled at random): a pixel is taken to span what one of Cornell does.
     "jacquard": RealFormat(
         JacquardDataset,
+        (1024, 1024),
         View(side=1024, size=300, metres_per_pixel=1.2 / 525 * 400 / 300),
         crop=160,
     ),
@@ -342,6 +347,14 @@ def _cornell_objects(root: Path, numbers: Sequence[int]) -> dict[int, str]:
             objects[number] = f"from{start:04d}"
         else:
             objects[number] = f"block{number // IMAGES_PER_OBJECT * IMAGES_PER_OBJECT:04d}"
+    if set(numbers) != set(FOLDER_01):
+        warnings.warn(
+            f"{root}: no z.txt tells which images show the same object; 100 to 179 were taken for "
+            f"those of Cornell's folder 01, of others each {IMAGES_PER_OBJECT} numbers for one "
+            "object. Where that is wrong, folds by object share objects: write z.txt, a row of "
+            "image number, object number and description for each image",
+            stacklevel=2,
+        )
     return objects
 
 

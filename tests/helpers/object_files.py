@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,16 @@ import numpy as np
 SIDES = (0.04, 0.05, 0.06)
 
 
-def urdf_box(folder: Path, mass: str, inertia: str, origin: str = "") -> Path:
-    """A URDF of the box, about the origin, that states an inertial."""
-    path, size = folder / "box.urdf", " ".join(map(str, SIDES))
+def urdf_box(
+    folder: Path, mass: str, inertia: str, origin: str = "", sides: Sequence[float] = SIDES
+) -> Path:
+    """A URDF of the box, about the origin, that states an inertial; without <inertia> where
+    `inertia` is empty. sides: as the file states them."""
+    path, size = folder / "box.urdf", " ".join(map(str, sides))
+    inertia = inertia and f"<inertia {inertia}/>"
     path.write_text(
         f"""<robot name="box"><link name="a"><inertial>{origin}<mass value="{mass}"/>
-        <inertia {inertia}/></inertial>
+        {inertia}</inertial>
         <visual><geometry><box size="{size}"/></geometry></visual>
         <collision><geometry><box size="{size}"/></geometry></collision></link></robot>"""
     )
