@@ -2,9 +2,9 @@
 
 An action changes the commanded pose of the hand a little. `ActionDecoder` decides how much of the
 change the arm may carry out, within joint limits, speeds, workspace and safety, and sends the
-commands. `checked_options` reads the options of `reset`. `near_pose`, `missed_state` and
-`pretraining_state` draw where the hand is when an episode does not begin at home; their poses are
-not yet checked for the arm's reach.
+commands. `checked_options` reads the options of `reset`. `near_pose` and `pretraining_state` draw
+where the hand is when an episode does not begin at home; their poses are not yet checked for the
+arm's reach.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from envs.robot_kinematics import (
 )
 from utils.config import Config
 from utils.errors import UserError, unknown_choice
-from utils.geometry import GripperGeometry
 
 # What each entry of an action means, by `env.control`.
 ACTION_ENTRIES = {
@@ -38,7 +37,7 @@ ACTION_ENTRIES = {
     "joint": (*(f"joint {number}" for number in range(1, 8)), "gripper"),
 }
 
-STARTS = ("home", "near", "missed", "pretraining")  # of an episode
+STARTS = ("home", "near", "pretraining")  # of an episode
 
 _HIGHEST_TIP = 0.50  # m
 _MARGIN = 0.08  # m that E may leave the workspace sideways
@@ -182,9 +181,6 @@ _GRASP_SHARE = 0.4  # of the states: on the way down to a grasp
 _MOVING_SHARE, _LARGEST_OPENING_ERROR = 0.5, 0.02  # of the states: while the fingers close; m
 _GRASP_SIDE, _GRASP_TURN, _GRASP_HEIGHT = 0.008, math.radians(8), 0.06
 _HALF_TURN, _ANY_TURN = math.pi, math.pi / 2
-# After a grasp that missed: with closed fingers, and beside the object instead of over it.
-_CLOSED_SHARE, _BESIDE_SHARE = 0.7, 0.7
-_MISSED_SIDE, _MISSED_HEIGHT, _GAP = 0.04, 0.03, 0.004  # m, largest room; least room
 _START_SLACK = 0.01  # rad or m
 
 
@@ -248,35 +244,6 @@ def near_pose(
     side = random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
     height = top + random.uniform(*_NEAR_HEIGHT)
     return _hand(T_home, object_place + side, height, random.uniform(-_NEAR_TURN, _NEAR_TURN))
-
-
-def missed_state(
-    T_home: np.ndarray, points: np.ndarray, gripper: GripperGeometry, random: np.random.Generator
-) -> tuple[np.ndarray, float]:
-    """A state that a grasp which missed leaves: the hand low over an object or beside it, mostly
-    closed, turned anyhow, and touching nothing: (4, 4) T_WE, and the opening in metres.
-
-    T_home: (4, 4) T_WE at home. points: (V, 3) m in W, of the object.
-    """
-    closed = random.random() < _CLOSED_SHARE
-    opening = 0.0 if closed else random.uniform(0, gripper.max_opening)
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    top = float(points[:, 2].max())
-    if random.random() < _BESIDE_SHARE:
-        direction = random.uniform(-math.pi, math.pi)
-        away = np.array([math.cos(direction), math.sin(direction)])
-        middle = (low + high) / 2
-        # However the hand is turned, no corner of a finger is farther from E than this.
-        fingers = math.hypot(opening / 2 + gripper.finger_outline[-1][0], gripper.finger_half_width)
-        reach = float(((points[:, :2] - middle) @ away).max())
-        place = middle + (reach + fingers + _GAP + random.uniform(0, _MISSED_SIDE)) * away
-        # The palm, which is wider, may be over the object.
-        under_palm = gripper.palm_height - gripper.tip_below_centre - _GAP
-        height = max(LOWEST_TIP, top - under_palm)
-    else:
-        place, height = random.uniform(low, high), top + gripper.tip_below_centre + _GAP
-    height += random.uniform(0, _MISSED_HEIGHT)
-    return _hand(T_home, place, height, random.uniform(-_ANY_TURN, _ANY_TURN)), opening
 
 
 def pretraining_state(

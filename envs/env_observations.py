@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from envs.cell import Cell, PhysicsError, camera_intrinsics, wrist_mount
 from envs.env_rewards import GraspGoals, Outline
-from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, wrist_room
+from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY
 from utils.config import Config
 from utils.depth import seeded_noise
 from utils.errors import unknown_choice
@@ -23,8 +23,7 @@ from utils.random_streams import Stream
 
 # Entries of info that can be observed, and their sizes.
 INFO_OBSERVATIONS = {
-    "end_effector_position": 3, "wrist_angle": 1, "gripper": 2, "opening_error": 1, "reachable": 1,
-    "grasped": 1,
+    "end_effector_position": 3, "gripper": 2, "opening_error": 1, "reachable": 1, "grasped": 1,
     "object_position": 3, "object_offset": 6, "object_outline": 9, "grasp_goal": 11,
 }  # fmt: skip
 OBSERVATIONS = ("rgb", "depth", "state", *INFO_OBSERVATIONS)
@@ -113,7 +112,7 @@ class Observer:
             leaning = not self.grasped and self.goals.tilt(T_WO) > _LEANING
             if leaning and cell.speed(nearest) < _STILL:
                 self.goals = self._find_goals()
-            self.goal_view = self.goals.seen_from(T_WO, self.T_WE, wrist_room(self.state[:7]))
+            self.goal_view = self.goals.seen_from(T_WO, self.T_WE)
 
     @property
     def opening(self) -> float:
@@ -137,7 +136,6 @@ class Observer:
             "gripper": np.array([self.state[14], commanded_opening]),
             "opening_error": np.array([self.state[14] - commanded_opening]),
             "end_effector_position": self.tip,
-            "wrist_angle": self.state[6:7],
             "grasped": self.grasped,
             "reachable": reachable,
         }

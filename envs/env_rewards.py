@@ -68,10 +68,6 @@ class Outline:
         points = np.concatenate(parts)
         self._points = points[ConvexHull(points).vertices]
 
-    def points(self, T_WO: np.ndarray) -> np.ndarray:
-        """(V, 3) m in W, the outer points of the object at T_WO (4, 4)."""
-        return self._points @ T_WO[:3, :3].T + T_WO[:3, 3]
-
     def seen_from(self, T_WO: np.ndarray, T_WE: np.ndarray) -> OutlineView:
         """The object at T_WO (4, 4) relative to a hand at T_WE (4, 4)."""
         x, y = T_WE[0, 1], T_WE[1, 1]  # of the closing line
@@ -197,19 +193,13 @@ class GraspGoals:
         openings = float(self._narrow[index]), float(self._wide[index])
         return GraspGoal(position, math.atan2(line[1], line[0]), *openings)
 
-    def seen_from(
-        self, T_WO: np.ndarray, T_WE: np.ndarray, room: tuple[float, float] = (-math.pi, math.pi)
-    ) -> GoalView:
-        """The goal nearest to a hand at T_WE (4, 4), for the object at T_WO (4, 4). room: rad, how
-        far the hand can turn about E's z either way; what is farther is the other way round."""
+    def seen_from(self, T_WO: np.ndarray, T_WE: np.ndarray) -> GoalView:
+        """The goal nearest to a hand at T_WE (4, 4), for the object at T_WO (4, 4)."""
         T_EO_R = T_WE[:3, :3].T @ T_WO[:3, :3]
         offset = self._positions @ T_EO_R.T + T_WE[:3, :3].T @ (T_WO[:3, 3] - T_WE[:3, 3])
         lines = self._lines @ T_EO_R[:2].T
         turn = np.arctan2(-lines[:, 0], lines[:, 1])  # about z of E, from y of E
         turn -= math.pi * np.rint(turn / math.pi)
-        # At its limit a hand that is nearly turned has turned.
-        beyond = turn - np.clip(turn, *room)
-        turn -= math.pi * np.sign(beyond) * (abs(beyond) > _TURN_SLACK)
         price = np.hypot(offset[:, 0], offset[:, 1]) + _TURN * abs(turn) + self._price
         best = int(price.argmin())
         up = T_WO[2]
@@ -222,10 +212,10 @@ class GraspGoals:
 class GoalView:
     """A goal relative to the hand.
 
-    offset: (3,) m from E to the goal along E's axes. turn: rad about E's z from the closing line to
-    the goal's, within a quarter turn where the wrist has room for it. narrow, wide: m, the openings
-    between which the hand can come down. top, hand: m, heights in W of the object's highest point
-    and of E. rise: m in W, of the goal over E.
+    offset: (3,) m from E to the goal along E's axes. turn: rad in (-pi/2, pi/2] about E's z from
+    the closing line to the goal's. narrow, wide: m, the openings between which the hand can come
+    down. top, hand: m, heights in W of the object's highest point and of E. rise: m in W, of the
+    goal over E.
     """
 
     def __init__(

@@ -25,7 +25,6 @@ from envs.env_actions import (
     ActionDecoder,
     action_entries,
     checked_options,
-    missed_state,
     near_pose,
     pretraining_state,
 )
@@ -114,7 +113,6 @@ class RobotGraspingEnv(gymnasium.Env):
     | `is_success`, `reason`  |      |             | success; why the episode ended, or None          |
     | `scene_seed`            |      |             | what the scene was made from                     |
     | `end_effector_position` | 3    | m, W        | E                                                |
-    | `wrist_angle`           | 1    | rad         | of the last joint, which turns the hand          |
     | `gripper`               | 2    | m           | opening, commanded opening                       |
     | `opening_error`         | 1    | m           | opening - commanded: the fingers move or hold something |
     | `reachable`             | 1    |             | false where the arm could not follow the action  |
@@ -132,12 +130,10 @@ class RobotGraspingEnv(gymnasium.Env):
     in this cell, which its owner loads scenes into and closes; `take_over` replaces `reset`.
 
     **Options of reset**: `scene_seed` asks for one scene. `start` says where the hand begins:
-    "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it in x and in y, easier;
-    "missed", low over it or beside it, mostly closed, as after a grasp that missed; or
+    "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it in x and in y, easier; or
     "pretraining", in any state that an episode may lead to, to train a state estimator: without a
-    seed up to 16 such states in a row are at the same scene. Without `start` shares `near_share`
-    and `missed_share` of the episodes begin so. The attribute `start` is the option that begins
-    there again.
+    seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share`
+    of the episodes begins near. The attribute `start` is the option that begins there again.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
@@ -211,7 +207,8 @@ class RobotGraspingEnv(gymnasium.Env):
         drawn = int(self.np_random.integers(2**31))
         asked, start = checked_options(options, self.config.gripper.max_opening)
         if start is None:
-            start = self._drawn_start()
+            share = self.settings.near_share
+            start = "near" if share > 0 and self.np_random.random() < share else "home"
         again = start == "pretraining" and seed is None and asked is None
         self._states_left = self._states_left - 1 if again else 0
         if self._states_left <= 0:
@@ -227,15 +224,6 @@ class RobotGraspingEnv(gymnasium.Env):
             q, opening, command = np.array(start["q"]), start["opening"], start["command"]
         self.cell.robot.place(q, opening)
         return self._begin(q, command)
-
-    def _drawn_start(self) -> str:
-        """Where an episode begins that no option tells. Nothing is drawn where all begin at home,
-        so that scenes do not depend on whether this can be chosen."""
-        near, missed = self.settings.near_share, self.settings.missed_share
-        if near + missed == 0:
-            return "home"
-        drawn = self.np_random.random()
-        return "near" if drawn < near else "missed" if drawn < near + missed else "home"
 
     def _make_scene(self, seed: int) -> None:
         self._scene_seed = seed
@@ -271,28 +259,22 @@ class RobotGraspingEnv(gymnasium.Env):
         return self._seen.observation(info), info
 
     def _initial_state(self, start: str) -> tuple[np.ndarray, float, float]:
-        """Joint positions (7,), opening and commanded opening of a start other than "home"; the arm
-        is at home where it does not reach the pose that was drawn."""
+        """Joint positions (7,), opening and commanded opening of a start "near" or "pretraining";
+        the arm is at home where it does not reach the pose that was drawn."""
         T_home = forward_kinematics(self.cell.home)
         outlines, goals = self._seen.outlines, self._seen.goals
         index = int(self.np_random.integers(len(outlines)))
         T_WO = self.cell.object_pose(index)
-        points, widest = outlines[index].points(T_WO), self.config.gripper.max_opening
-        top, missed = float(points[:, 2].max()), self.settings.missed_share
-        if start == "pretraining" and missed > 0 and self.np_random.random() < missed:
-            start = "missed"
+        top = outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
         if start == "near":
             T = near_pose(T_home, T_WO[:2, 3], top, self.np_random)
-            opening = command = widest
-        elif start == "missed":
-            T, opening = missed_state(T_home, points, self.cell.gripper, self.np_random)
-            command = opening
+            opening = command = self.config.gripper.max_opening
         else:
             goal = None
             if goals is not None:
                 goal = goals.goal(self.np_random.integers(len(goals)), T_WO)
             T, opening, command = pretraining_state(
-                T_home, T_WO[:2, 3], top, goal, widest, self.np_random
+                T_home, T_WO[:2, 3], top, goal, self.config.gripper.max_opening, self.np_random
             )
             T[:3, 3] = np.clip(T[:3, 3], self._actions.lowest, self._actions.highest)
         try:

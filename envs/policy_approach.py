@@ -29,8 +29,7 @@ from utils.transforms import Grasp, RGBDFrame
 from utils.worker_process import kept
 
 KNOWN_TO_A_ROBOT = (
-    "rgb", "depth", "state", "end_effector_position", "wrist_angle", "gripper", "opening_error",
-    "reachable",
+    "rgb", "depth", "state", "end_effector_position", "gripper", "opening_error", "reachable",
 )  # fmt: skip
 _SURE = 3  # observations in a row with something gripped: a first touch may slip
 _STILL = 0.001  # m between two observations: fingers that move may push without holding
@@ -60,7 +59,7 @@ class PolicyApproach:
     ):
         # Reward and starts are not used, and the cell has its objects already.
         plain = trained["env"] | {"reward": "sparse", "goal": "object", "objects": "box"}
-        plain |= {"near_share": 0.0, "missed_share": 0.0, "observations": list(observations)}
+        plain |= {"near_share": 0.0, "observations": list(observations)}
         noise = cell.config.camera.model_dump(include={"depth_noise", "depth_noise_args"})
         config = with_settings(cell.config, "camera", trained["camera"] | noise)
         self.env = RobotGraspingEnv(config=config, cell=cell, **plain)

@@ -142,8 +142,6 @@ def test_override_values(text, expected):
         ("camera.mount=overhed", ["one of overhead, wrist", "did you mean overhead?"]),
         ("camera.near=5", ["camera: near (5.0) must be smaller than far (2.0)", "command line"]),
         ("camera={view: side, mount: wrist}", ["camera: view=side places the overhead camera"]),
-        ("env={near_share: 0.6, missed_share: 0.5}", ["must not be more than 1 together"]),
-        ("env={missed_share: 0.1, scenario: pile}", ["missed_share is for one object"]),
         (
             "workspace={center: [0.45, -0.33], size: 0.25}",
             [

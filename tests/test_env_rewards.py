@@ -78,25 +78,6 @@ def test_a_brick_is_taken_across_its_short_side():
         assert view.top == pytest.approx(0.05, abs=1e-9) and view.hand == pytest.approx(0.2)
 
 
-def test_a_goal_beyond_the_limit_of_the_wrist_is_turned_to_the_other_way_round():
-    """Half a turn changes nothing for two fingers: 0.25 rad one way are pi - 0.25 the other. What
-    is no more than the slack of a turned hand beyond the limit is left as it is."""
-    goals, T_WE = brick(), hand([*PLACE[:2], 0.2], YAW + 0.25)
-
-    def seen(low: float, high: float) -> GoalView:
-        return goals.seen_from(pose(), T_WE, (low, high))
-
-    assert seen(-3.0, 0.3).turn == pytest.approx(0.25, abs=0.02)
-    assert seen(-3.0, 0.1).turn == seen(-3.0, 0.3).turn, "0.15 rad are less than 12 degrees"
-    limited = seen(-3.0, 0.0)
-    assert limited.turn == pytest.approx(seen(-3.0, 0.3).turn - math.pi)
-    np.testing.assert_allclose(limited.vector(), seen(-3.0, 0.3).vector(), atol=1e-9)
-    there = hand([*PLACE[:2], 0.2], YAW)
-    assert abs(goals.seen_from(pose(), there, (-5.0, -0.1)).turn) < 0.02, "overshot, and turned"
-    other = goals.seen_from(pose(), hand([*PLACE[:2], 0.2], YAW - 0.25), (0.0, 3.0))
-    assert other.turn == pytest.approx(math.pi - 0.25, abs=0.02)
-
-
 def test_goals_go_with_their_object():
     goals = brick()
     before = goals.seen_from(pose(), hand([0.52, 0.07, 0.2], 0.4))

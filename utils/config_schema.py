@@ -373,23 +373,11 @@ class EnvConfig(Section):
     joint_step: Positive
     gripper_step: Positive
     near_share: Annotated[float, Field(ge=0, le=1)]
-    missed_share: Annotated[float, Field(ge=0, le=1)]
 
     @model_validator(mode="after")
-    def _shares_of_starts(self) -> EnvConfig:
-        if self.near_share + self.missed_share > 1:
-            raise ValueError(
-                f"near_share ({self.near_share}) and missed_share ({self.missed_share}) must not "
-                "be more than 1 together"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _for_one_object(self) -> EnvConfig:
+    def _goals_of_one_object(self) -> EnvConfig:
         if self.goal == "grasp" and self.scenario != "isolated":
             raise ValueError("goal 'grasp' is for one object: it needs scenario 'isolated'")
-        if self.missed_share > 0 and self.scenario != "isolated":
-            raise ValueError("missed_share is for one object: it needs scenario 'isolated'")
         return self
 
 
