@@ -53,6 +53,7 @@ from utils.result_formats import aligned
 from utils.runs import git_state, parse_args, run_script
 
 HELD_OUT = 10  # every tenth scene
+CONTENT = "content of object_sets"  # of settings.json
 SHARD, SHARDS = 50, "scenes-*.npz"  # scenes of a file, at most, and the files' names
 EPOCHS, BATCH, RATE, DECAY = 8, 256, 1e-3, 1e-2
 FURTHER_RATE = 3e-4  # from weights that are given: at the rate above they forget what they know
@@ -178,7 +179,7 @@ def check_same_settings(folder: Path, config: Config) -> None:
     settings["simulator"] = config.simulator
     own = content_of_sets(config, config.data.object_sets)
     if own:  # so that examples of built-in sets of before there was this entry stay valid
-        settings["content of object_sets"] = own
+        settings[CONTENT] = own
     for name, weights in (("critic", SHIPPED), ("network", SHIPPED_NETWORK)):
         settings[name] = hashlib.sha256(weights.read_bytes()).hexdigest()
     note = folder / "settings.json"
@@ -187,6 +188,7 @@ def check_same_settings(folder: Path, config: Config) -> None:
         return
     try:
         known = json.loads(note.read_text(encoding="utf-8"))
+        known.setdefault(CONTENT, own)  # which examples of before did not note
         other = [name for name, value in settings.items() if known.get(name) != value]
     except (OSError, ValueError, AttributeError) as error:
         raise UserError(f"{note}: cannot be read ({error}); give another --examples") from error

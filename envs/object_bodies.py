@@ -70,8 +70,11 @@ def load_object(
     cut = decompose(source.mesh, cache_dir, str(path))
     stated = None
     if source.inertial is not None:
-        # A density times a volume is in the file's unit already.
-        unit = 1.0 if source.inertial.from_density else unit
+        # A density times a volume is in the file's unit already, and a mass that makes sense in
+        # metres is of a body in metres, which a scale only shrinks.
+        density_in_metres = source.inertial.mass / cut.solid.volume
+        in_metres = side <= LARGEST_OBJECT and LIGHTEST <= density_in_metres <= DENSEST
+        unit = 1.0 if in_metres or source.inertial.from_density else unit
         stated = in_unit(source.inertial, unit)
         if not any_mass:
             _check_density(path, source.inertial, stated.mass / cut.solid.volume, unit)

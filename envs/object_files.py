@@ -39,7 +39,7 @@ SUFFIXES = (".urdf", ".xml", *MESH_SUFFIXES)
 DEFAULT_FRICTION, DEFAULT_DENSITY = 0.7, 700.0
 MOST_GEOMETRIES = 300  # of a URDF, which yourdfpy reads in some ten seconds
 # How the names of the materials and textures of a mesh end, in whatever format it states them.
-_MATERIAL = re.compile(rb"\.(?:mtl|png|jpe?g|bmp|tga|tiff?|gif|webp)\b", re.IGNORECASE)
+_MATERIAL = re.compile(rb"\.[mpjbtgw][a-z]{2,3}\b", re.IGNORECASE)  # .mtl, .png, ... .webp
 _LONGEST_NAME = 200  # bytes, of such a file
 
 

@@ -388,7 +388,7 @@ class FileSet(ObjectSet):
         return part
 
     def shape_name(self, index: int) -> Hashable:
-        return self.files[index].with_suffix("")  # as of bowl.obj and bowl.stl
+        return self.files[index].resolve().with_suffix("")  # as of bowl.obj and bowl.stl
 
     def sources(self) -> set[Path]:
         return set().union(*map(files_of, self.files))

@@ -369,4 +369,5 @@ def must_flip(T_WE: np.ndarray, home: np.ndarray, q: np.ndarray) -> bool:
 
 def _wrist_room(q: np.ndarray) -> float:
     """Radians from the last joint to the nearer one of its limits."""
-    return float(min(q[-1] - JOINT_LOWER[-1], JOINT_UPPER[-1] - q[-1]))
+    low, high = wrist_room(q)
+    return min(-low, high)

@@ -246,7 +246,8 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         for name in arguments:
             if name in EnvConfig.model_fields:  # which alone the policy is scored by later
                 raise UserError(
-                    f"rl.env_kwargs: {name} is a key of section env; set env.{name} instead"
+                    f"rl.env_kwargs: {name} is a key of section env; set env.{name} instead (a "
+                    "run that was begun so cannot go on)"
                 )
         arguments["config"] = config
     no_pictures = UserError(f"rl.films: {settings.env_id} draws no pictures; use rl.films=0")

@@ -177,19 +177,16 @@ def real_folds(config: Config) -> list[Fold]:
 
 def _check_size(sample: RealSample, kind: str) -> None:
     """Warn of images of another size than those of their format, of which the view sees another
-    part; raise UserError where it sees no label of this one."""
+    part."""
     form, (rows, columns) = FORMATS[kind], sample.depth.shape
-    if (rows, columns) == form.size:
-        return
-    beside = [np.abs(one.centre - np.array([columns, rows]) / 2).max() for one in sample.positives]
-    told = (
-        f"data.root: {sample.name} has {columns} x {rows} px, and data.kind={kind} means "
-        f"{form.size[1]} x {form.size[0]}: the network sees the middle {form.view.side} px of each "
-        "side"
-    )
-    if min(beside) > form.view.side / 2:
-        raise UserError(f"{told}, where this image has no label; crop or resize the images")
-    warnings.warn(f"{told}, and takes a pixel to span what one of that size does", stacklevel=2)
+    if (rows, columns) != form.size:
+        warnings.warn(
+            f"data.root: {sample.name} has {columns} x {rows} px, and data.kind={kind} means "
+            f"{form.size[1]} x {form.size[0]}: the network sees the middle {form.view.side} px of "
+            "each side, loses labels beside them, and takes a pixel to span what one of that size "
+            "does; crop or resize the images",
+            stacklevel=2,
+        )
 
 
 def _fold(

@@ -55,6 +55,15 @@ def test_scale_is_the_inverse_of_the_camera_s(scale: float, tilt: float) -> None
     assert scale_to_table(measured, 0.0) == pytest.approx(1 / scale, abs=1e-5)
 
 
+def test_a_scale_is_measured_where_a_tenth_of_the_image_lies_beneath_the_table() -> None:
+    """A plate 3 cm over a bench of which a tenth is seen; the camera measures 2 % too near."""
+    frame = scene()
+    depth = frame.depth.copy()
+    depth[: SIZE // 10] = EYE + 0.03
+    measured = replace(frame, depth=depth * np.float32(0.98))
+    assert scale_to_table(measured, 0.0) == pytest.approx(1 / 0.98, abs=1e-4)
+
+
 def test_scale_of_a_noisy_table() -> None:
     """Dex-Net's noise: 5 mm at 0.8 m is 0.6 %, of some 10,000 pixels of which 1 / 12 are
     independent, hence 2e-4."""

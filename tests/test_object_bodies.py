@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from envs.object_bodies import load_object
+from envs.object_bodies import MIN_MASS, load_object
 from envs.object_meshes import ObjectError
 from tests.helpers.object_files import box_moments, urdf_box, urdf_inertia
 
@@ -138,6 +138,14 @@ def test_a_scale_far_from_1_is_the_unit_of_the_lengths(tmp_path, sides, mass, sc
     assert model.mass == pytest.approx(mass)
     a, b, c = np.square(np.multiply(sides, scale))
     assert model.inertia == pytest.approx(mass / 12 * np.array([b + c, a + c, a + b]))
+
+
+@pytest.mark.parametrize("scale", [0.11, 0.1, 0.05])
+def test_a_scale_only_shrinks_what_makes_sense_in_metres(tmp_path, scale):
+    """A chair of 40 kg/m3."""
+    path = urdf_box(tmp_path, "9", "", sides=(0.5, 0.5, 0.9))
+    model = load_object(path, scale=scale, cache_dir=tmp_path)
+    assert model.mass == pytest.approx(max(9 * scale**3, MIN_MASS))
 
 
 def test_the_unit_that_was_taken_is_named_where_no_material_is_as_dense(tmp_path):

@@ -84,8 +84,8 @@ def _densest(asked: np.ndarray) -> float:
 
     Those of the table ask for the same one. It is the densest of all, weighted by how likely a
     camera is to be that wrong, because the top of a box asks alike, too. But nothing lies under a
-    table: where a flat surface is seen beneath that one, even a small one, it is the table, and
-    what asked alike was the top of something wide.
+    table: where a flat surface is seen beneath that one, it is the table, and what asked alike was
+    the top of something wide; a small one counts only where it is at the table's height already.
     """
     least = _LEAST_SHARE * len(asked)
     asked = asked[np.abs(asked - 1) < SCALE_REACH]
@@ -98,9 +98,12 @@ def _densest(asked: np.ndarray) -> float:
     best = float(middle[(density * np.exp(-(((middle - 1) / SCALE_SPREAD) ** 2) / 2)).argmax()])
     peaks = middle[1:-1][(density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])]
     for lower in peaks[peaks < best - 2 * _BLUR]:  # the farthest first
-        if (np.abs(asked - lower) < 2 * _BLUR).sum() > _LOWER_SHARE * len(asked):
+        count = (np.abs(asked - lower) < 2 * _BLUR).sum()
+        if count > least:
             best = float(lower)
             break
+        if count > _LOWER_SHARE * len(asked) and abs(lower - 1) < 2 * _BLUR:
+            return 1.0  # too little to measure the scale by, and right as it is
     for _ in range(_REFITS):
         alike = asked[np.abs(asked - best) < 2 * _BLUR]
         if len(alike) <= least:

@@ -12,6 +12,7 @@ import itertools
 import json
 import math
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -212,7 +213,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
 INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
 # Keys under which cameras' drivers and calibrations write the coefficients of a lens.
 DISTORTION = (
-    "coeffs", "D", "d", "dist", "dist_coeffs", "distortion", "distortion_coefficients",
+    "coeffs", "D", "dist_coeffs", "distortion", "distortion_coefficients",
     "k1", "k2", "k3", "p1", "p2",
 )  # fmt: skip
 
@@ -256,10 +257,10 @@ def _intrinsics_in(path: Path) -> dict[str, float]:
             raise UserError(f"{path}: {key} is {value!r:.40}, expected a number")
     bent = [key for key in DISTORTION if key in values and np.any(_numbers_in(values[key]))]
     if bent:
-        raise UserError(
+        warnings.warn(
             f"{path}: {bent[0]} says that the lens distorts, and images are read as those of a "
-            "pinhole; undistort the colour and the depth image first, or leave the key out if that "
-            "is done"
+            "pinhole; undistort the colour and the depth image first, if that is not done",
+            stacklevel=2,
         )
     return values
 
@@ -269,7 +270,7 @@ def _numbers_in(value: object) -> list[float]:
     if isinstance(value, (list, dict)):
         parts = value.values() if isinstance(value, dict) else value
         return [number for part in parts for number in _numbers_in(part)]
-    return [value] if isinstance(value, (int, float)) else []
+    return [value] if type(value) in (int, float) else []
 
 
 def intrinsics_matrix(
