@@ -108,6 +108,18 @@ def test_a_floor_that_fills_most_of_the_image_counts_as_table(far) -> None:
     assert remarks == []
 
 
+def test_a_floor_that_is_taken_for_the_table_is_told_of() -> None:
+    small = replace(scene((0.0, 0.0, 0.06)), T_WC=np.eye(4))
+    depth = np.full_like(small.depth, 2.2)
+    depth[80:400, 80:400] = small.depth[80:400, 80:400]  # 44 % of the image
+    image = replace(small, depth=depth)
+    table = locate_table(image, None, None)
+    assert table.T_WC[2, 3] == pytest.approx(2.2)
+    remark = check_view(replace(image, T_WC=table.T_WC), Workspace((0.0, 0.0)))[-1]
+    assert remark.startswith("a flat surface 0.7") and "holds 4" in remark
+    assert check_view(scene((0.0, 0.0, 0.3), height=0.4), Workspace((0.0, 0.0))) == []
+
+
 def test_what_lies_above_the_horizon_is_unknown() -> None:
     level = look_at((0.0, 0.0, UP), (1.0, 0.0, UP - 0.3), (0.0, 0.0, 1.0))
     frame = replace(scene(), T_WC=level, depth=np.full((SIDE, SIDE), 3.0, np.float32))

@@ -23,6 +23,9 @@ from utils.transforms import RGBDFrame, deproject, known_depth, project
 LOWEST = 0.006  # m: least height over the table of matter that a hand grasps
 SMALLEST, LARGEST = 0.30, 1.0  # m, sides of a workspace; height maps have up to 580 x 580 cells
 LARGEST_SPAN, SMALLEST_SPAN = 3.0, 0.06  # m, of an image that a hand grasps from
+# What is so much (m) over the table, and holds this share of the known pixels in two layers (m),
+# may be the table, and what was taken for it the floor.
+HIGH_TABLE, WIDE_TABLE, LAYER = 0.25, 0.2, 0.02
 OFF_CENTRE = 0.3  # of half the image, a principal point from its middle
 FARTHEST_CAMERA = 50.0  # m from the world's origin; 5 cm in millimetres
 MARGIN = 0.02  # m around what stands on the table
@@ -193,7 +196,7 @@ def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
             f"the view is too oblique: the camera looks {tilt:.0f} degrees off the table's normal, "
             f"at most {MOST_OBLIQUE:g} are allowed; look more from above"
         )
-    remarks = _check_units(frame)
+    remarks = [*_check_units(frame), *_check_table(frame, workspace.table_height)]
     (height, width), (cx, cy) = frame.depth.shape, frame.K[:2, 2]
     if not (0 <= cx < width and 0 <= cy < height):
         remarks.append(
@@ -243,6 +246,25 @@ def _check_units(frame: RGBDFrame) -> list[str]:
             "that is not so"
         )
     return remarks
+
+
+def _check_table(frame: RGBDFrame, table_height: float) -> list[str]:
+    """A remark on a wide flat surface far over the table, which may be a floor then."""
+    known = known_depth(frame.depth)
+    over = frame.points()[known][:, 2] - table_height
+    high = over[over > HIGH_TABLE]
+    layers = np.floor((high - HIGH_TABLE) / LAYER).astype(int)
+    counts = np.bincount(layers, minlength=2)
+    pairs = counts[:-1] + counts[1:]  # a surface may lie on the border of two
+    share = float(pairs.max() / len(over))
+    if share < WIDE_TABLE:
+        return []
+    lower = int(pairs.argmax())
+    height = np.median(high[(layers == lower) | (layers == lower + 1)])
+    return [
+        f"a flat surface {height:.2f} m over the table holds {share:.0%} of the image; if that is "
+        "the table, crop the image to it, or give --camera-pose and --table-height"
+    ]
 
 
 def _span(frame: RGBDFrame) -> tuple[float, float, float]:
