@@ -50,12 +50,6 @@ def area(heights, cells: np.ndarray) -> float:
     return float(cells.sum()) * heights.cell**2
 
 
-def test_a_target_of_another_size_than_the_image_is_refused() -> None:
-    frame = replace(two_boxes(), target=np.ones((10, 10), bool))
-    with pytest.raises(UserError, match=r"is \(10, 10\), expected the image's \(224, 224\)"):
-        HeuristicPlanner(GripperGeometry(), Workspace())(frame)
-
-
 # --- The height map -------------------------------------------------------------------------
 
 

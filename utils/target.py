@@ -37,10 +37,6 @@ def only_target(heights: HeightMap, frame: RGBDFrame) -> HeightMap:
     """
     if frame.target is None:
         return heights
-    if frame.target.shape != frame.depth.shape:
-        raise UserError(
-            f"frame.target: is {frame.target.shape}, expected the image's {frame.depth.shape}"
-        )
     mine = _target_cells(heights, frame)
     label = np.where(heights.label >= 0, OTHER_LABEL, heights.label)
     if not mine.any():
