@@ -40,17 +40,18 @@ def fill_holes(depth: np.ndarray) -> np.ndarray:
     return depth if known.all() or not known.any() else nearest_values(depth, known)
 
 
-def nearest_values(values: np.ndarray, of: np.ndarray) -> np.ndarray:
+def nearest_values(values: np.ndarray, of: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
     """(H, W, ...) at each pixel the value of the nearest pixel in the mask `of` (H, W) bool.
 
-    The mask has to hold at least one pixel.
+    at: (H, W) bool, the N pixels for which alone it is asked; the result is (N, ...) then. The mask
+    `of` has to hold at least one pixel.
     """
     _, label = cv2.distanceTransformWithLabels(
         (~of).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     value = np.zeros((label.max() + 1, *values.shape[2:]), values.dtype)
     value[label[of]] = values[of]
-    return value[label]
+    return value[label if at is None else label[at]]
 
 
 def near_side(depth: np.ndarray, reach: int) -> np.ndarray:
@@ -144,7 +145,7 @@ def table_in_holes(frame: RGBDFrame, table_height: float) -> RGBDFrame:
     holes = ~known & ~_wide(~known, reach_in_pixels(frame, HOLE_REACH))
     colours = frame.rgb[holes].astype(float)
     table, item = (
-        np.linalg.norm(colours - nearest_values(smooth, of)[holes], axis=-1) if of.any() else np.inf
+        np.linalg.norm(colours - nearest_values(smooth, of, holes), axis=-1) if of.any() else np.inf
         for of in (known & ~high, inside)
     )
     depth = frame.depth.copy()
@@ -173,8 +174,9 @@ def surfaces_in_holes(frame: RGBDFrame) -> RGBDFrame:
     left = np.flatnonzero(np.pad(~known & at_edges(frame), reach))
     for down, right in reversed(farthest_first(reach)):
         beside = left + down * width + right
-        difference = ((colours[beside] - colours[left]) ** 2).sum(axis=1)
-        alike = (measured[beside] > 0) & (difference < LIKE_SURFACE**2)
+        difference = colours[beside] - colours[left]
+        alike = np.einsum("ij,ij->i", difference, difference) < LIKE_SURFACE**2
+        alike &= measured[beside] > 0
         filled[left[alike]] = measured[beside[alike]]
         left = left[~alike]
     depth = filled.reshape(-1, width)[reach:-reach, reach:-reach]

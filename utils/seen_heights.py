@@ -340,22 +340,26 @@ def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
 def _surface_points(
     frame: RGBDFrame, origin: np.ndarray, cell: float, split: int
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns, rows and z (H, W) of points, split x split times: each pixel stands for that many
-    points of its square (`subpixels`). Without a depth, z is -inf.
+    """Columns, rows and z (...) of points, split x split times: each pixel stands for that many
+    points of its square (`subpixels`). Without a depth, a pixel stands for none, or z is -inf.
     """
     depth = frame.depth.astype(float)
     unknown = ~known_depth(depth)
+    v, u = np.indices(depth.shape, dtype=float, sparse=True)
+    if 2 * np.count_nonzero(unknown) > unknown.size:  # the few others are quicker by themselves
+        known = ~unknown
+        v, u = (place.astype(float) for place in np.nonzero(known))
+        depth, unknown = depth[known], unknown[known]
     depth[unknown] = 0
     to_cells = np.diag([1 / cell, 1 / cell, 1.0])
     start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
     # A ray is the sum of three parts: for the pixel's column, for its row, and the optical axis.
     by_u, by_v, axis = (to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)).T
-    v, u = (np.arange(count, dtype=float) for count in depth.shape)
     sub = (np.arange(split) + 0.5) / split - 0.5
     for dv, du in itertools.product(sub, sub):
         points = []
         for a, b, c, d in zip(by_u, by_v, axis, start):
-            along = (a * (u + du) + c) + (b * (v + dv))[:, None]
+            along = (a * (u + du) + c) + b * (v + dv)
             along *= depth
             along += d
             points.append(along)
