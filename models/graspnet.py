@@ -255,11 +255,14 @@ class GraspLoss(nn.Module):
     pixel. Averaging image by image makes every image count alike, and makes the mean over processes
     with batches of equal size the loss of the joint batch.
 
-    The default weights 1, 1, 10 are the tutorial's; configs/default.yaml trains with 10, 1, 50.
+    The default weights of quality, angle and width are 1, 1, 10 (the tutorial's are 1, 1, 0.5);
+    configs/default.yaml trains with 10, 1, 50. All are given by name: the tutorial's first argument
+    is another one, the weight of the angle.
     """
 
     def __init__(
         self,
+        *,
         quality_weight: float = 1.0,
         angle_weight: float = 1.0,
         width_weight: float = 10.0,

@@ -102,10 +102,10 @@ class Trainer:
         self.trained = model if trained is None else trained.to(team.device)
         self._parallel = DistributedDataParallel(self.trained) if team.ranks > 1 else self.trained
         self.loss = GraspLoss(
-            settings.quality_weight,
-            settings.angle_weight,
-            settings.width_weight,
-            settings.centre_weight,
+            quality_weight=settings.quality_weight,
+            angle_weight=settings.angle_weight,
+            width_weight=settings.width_weight,
+            centre_weight=settings.centre_weight,
         )
         self.optimizer = torch.optim.AdamW(
             self.trained.parameters(), lr=settings.lr, weight_decay=settings.weight_decay

@@ -18,7 +18,10 @@ from benchmarks.results import FIGURES
 from utils.config import load_config
 from utils.runs import REPOSITORY
 
-READMES = (REPOSITORY / "README.md", REPOSITORY / "README.zh-CN.md")
+READMES, TUTORIAL_NAMES = (
+    (REPOSITORY / f"{page}.md", REPOSITORY / f"{page}.zh-CN.md")
+    for page in ("README", "docs/tutorial_names")
+)
 DOCUMENTS = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")])
 # Files that a reader brings or a run leaves.
 READERS_OWN = re.compile(
@@ -67,11 +70,13 @@ def test_readme_is_short():
     assert len(text_of(READMES[1]).splitlines()) <= 150
 
 
-def test_both_languages_have_the_same_commands_links_names_and_figures():
-    english, chinese = map(text_of, READMES)
+@pytest.mark.parametrize("pages", [READMES, TUTORIAL_NAMES], ids=lambda pages: pages[0].name)
+def test_both_languages_have_the_same_commands_links_names_and_figures(pages):
+    english, chinese = map(text_of, pages)
     assert code(english) == code(chinese)
     links = [re.findall(r"\]\(([^)]+)\)", text)[1:] for text in (english, chinese)]
-    assert links[0] == links[1]  # but the first, which leads to the other language
+    # But the first, which leads to the other language; the others to the own one, where it exists.
+    assert links[0] == [link.replace(".zh-CN.md", ".md") for link in links[1]]
     for pattern in (r"(?<!`)`([^`\n]+)`(?!`)", r"\d[\d,.]*\d|\d"):
         prose = [
             sorted(set(re.findall(pattern, re.sub(r"```.*?```", "", text, flags=re.DOTALL))))

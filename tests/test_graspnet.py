@@ -172,7 +172,8 @@ def test_loss_against_numpy() -> None:
     targets = targets_from_labels(quality, width, valid, graspable_from=0.5)
     torch.manual_seed(1)
     q, a, w = torch.randn(2, 1, 5, 7), torch.randn(2, BINS, 5, 7), 0.08 * torch.rand(2, 1, 5, 7)
-    total, parts = GraspLoss(2.0, 3.0, 5.0)(q, a, w, targets)
+    loss = GraspLoss(quality_weight=2.0, angle_weight=3.0, width_weight=5.0)
+    total, parts = loss(q, a, w, targets)
 
     sums = np.zeros(3)
     for image in range(2):

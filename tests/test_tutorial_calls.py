@@ -24,7 +24,7 @@ CAMERA = {"intrinsics": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])}
 SEEN = [(300, 200), (340, 200), (340, 260), (300, 260)]
 WANTED = [(310, 210), (350, 210), (350, 270), (310, 270)]
 DEPTH = np.full((480, 640), 0.5)
-TABLE = REPOSITORY / "docs" / "tutorial_names.md"
+TABLES = [REPOSITORY / "docs" / f"tutorial_names{language}.md" for language in ("", ".zh-CN")]
 
 
 def test_the_graspnet_listing_runs_as_printed():
@@ -89,11 +89,21 @@ def test_the_policy_and_the_adaptation_network_are_made_as_printed():
             "3 channels, the network has 4",
         ),
         (lambda: DomainAdaptationNetwork()(torch.rand(2, 3, 32, 32), 0.5), "reversal"),
+        (lambda: DomainAdaptationNetwork()(torch.rand(2, 3, 32, 32), 1.0), "reversal"),
         (
             lambda: train_domain_adaptation(
                 torch.rand(2, 3, 8, 8), torch.rand(2, 3, 8, 8), DomainAdaptationNetwork()
             ),
             r"\(images, labels\)",
+        ),
+        (
+            lambda: train_domain_adaptation(
+                (torch.rand(2, 3, 8, 8), torch.zeros(2)),
+                torch.rand(2, 3, 8, 8),
+                DomainAdaptationNetwork(),
+                100,
+            ),
+            r"AdaptationSettings\(steps=",
         ),
         (lambda: DomainRandomizer(0), "expected a cell"),
     ],
@@ -105,10 +115,17 @@ def test_a_call_that_cannot_be_accepted_ends_with_one_sentence(call, message):
     assert "\n" not in sentence and len(sentence) < 400
 
 
-def test_the_table_names_only_what_is_there():
+def test_weights_of_the_loss_without_names_are_no_others():
+    """The tutorial's first one is the angle's, this loss's own is the quality's."""
+    with pytest.raises(TypeError, match="positional argument"):
+        GraspLoss(1.0, 0.5)
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_table_names_only_what_is_there(table):
     """Dotted names of modules in the table's second column can be found, and what is called there,
     or in the first column of a row that says "same", is defined in one of the modules."""
-    text = TABLE.read_text(encoding="utf-8")
+    text = table.read_text(encoding="utf-8")
     dotted = re.findall(r"`((?:models|utils|envs)\.\w+)\.(\w+)", text)
     assert len(dotted) == 2
     for module, name in dotted:
@@ -116,7 +133,7 @@ def test_the_table_names_only_what_is_there():
     called = set()
     for row in re.findall(r"^\| (.*) \|$", text, re.MULTILINE):
         tutorial, here, *_ = row.split(" | ")
-        told = tutorial + here if here.startswith("same") else here
+        told = tutorial + here if here.startswith(("same", "相同")) else here
         for code in re.findall(r"`([^`]+)`", told):
             called |= set(re.findall(r"(\w+)\(", code))
     called -= {"model", "policy"}  # variables of the table

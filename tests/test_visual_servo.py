@@ -284,7 +284,8 @@ def test_what_is_no_pose_is_refused(T):
      lambda: ImageBasedVisualServo(CAMERA | {"widht": 640}), lambda: AdaptiveGain(1, 2),
      lambda: ImageBasedVisualServo(CAMERA | {"width": 640}),
      lambda: ImageBasedVisualServo(CAMERA | {"mounting": "ceiling"}),
-     lambda: DepthFromMotion(0.0)],
+     lambda: DepthFromMotion(0.0), lambda: DepthFromMotion(1.0, noise=0),
+     lambda: DepthFromMotion(1.0, noise=np.nan), lambda: DepthFromMotion(1.0, noise=-1)],
 )  # fmt: skip
 def test_impossible_settings_are_refused(make):
     with pytest.raises(UserError):

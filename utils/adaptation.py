@@ -172,7 +172,8 @@ class DomainAdaptationNetwork(nn.Module):
 
         reversal: the weight of the reversed gradient, the tutorial's `alpha`.
         """
-        if domain not in (SOURCE, TARGET):
+        # The tutorial's alpha, a float, stands here in its call; its 1.0 equals TARGET.
+        if isinstance(domain, float) or domain not in (SOURCE, TARGET):
             raise ValueError(
                 f"domain: got {domain!r}, expected SOURCE (0) or TARGET (1); the tutorial's alpha "
                 "is the argument `reversal`"
@@ -280,9 +281,11 @@ def train_domain_adaptation(
 
     Without an adversary (`settings.adversarial` 0) the target's images only update the statistics
     of its batch norms, and the source score alone chooses. Raises UserError if a domain has too few
-    images, or if the source has no labels, as in the tutorial's call.
+    images, and for the tutorial's call: a source without labels, or a number of epochs as settings.
     """
-    settings = settings or AdaptationSettings()
+    settings = AdaptationSettings() if settings is None else settings
+    if not isinstance(settings, AdaptationSettings):
+        raise UserError(f"settings: got {settings!r}, expected AdaptationSettings(steps=...)")
     rng = np.random.default_rng(seed)
     score = source_score or _accuracy
     if isinstance(source, torch.Tensor):

@@ -168,7 +168,9 @@ def _depths(
     """(count,) the depths of a view, or else those that the servo knows, metres."""
     depths = known if given is None else given
     if depths is None:
-        raise DepthError("depths: the view has none; give depths, or `depth` to the servo")
+        raise DepthError(
+            "depths: none given; give Z (or depths in the view), or `depth` to the servo"
+        )
     return check_depths(depths, count)
 
 
