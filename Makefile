@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 REQUIREMENTS := $(if $(LOCKED),requirements.lock,requirements.txt)
 INSTALLED := $(VENV)/.installed$(if $(LOCKED),-locked)
 
+# What a .venv whose Python is gone, as after an upgrade of the system, had installed is to be installed again.
+$(shell test -x $(BIN)/python || rm -f $(VENV)/.installed*)
+
 CHECK_PYTHON := import sys; sys.version_info >= (3, 10) or sys.exit('error: Python ' + sys.version.split()[0] + \
 	' is too old, 3.10 or newer is needed; name one, such as: make run PYTHON=python3.12')
 

@@ -94,7 +94,7 @@ def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int
     comparisons = compare(outcome.rounds, config.seed)
     print(format_scores(rows, stop_reasons(outcome.rounds), comparisons))
     unfinished, device = interruption(len(outcome.rounds), config), describe_workers(config)
-    results = rows, comparisons, config, device, unfinished is None
+    results = rows, comparisons, config, device, unfinished is None, run
     write_results(run / "results.json", *results)
     write_csv(run / "results.csv", rows)
     gallery = balanced(outcome.gallery, config.evaluate.gallery)
@@ -177,7 +177,7 @@ def report_comparison(options: argparse.Namespace) -> int:
     if options.results is not None:
         content = {"runs": [str(run) for run in options.compare]}
         content["comparisons"] = [asdict(pair) for pair in comparisons]
-        save_results(options.results, content)
+        save_results(options.results, content, None)
     return 0
 
 
@@ -212,7 +212,7 @@ def report_transfer(config: Config, options: argparse.Namespace) -> int:
     rows, columns = config.transfer.policies, columns_of(config)
     if options.csv is not None or options.latex is not None:
         raise UserError("--csv, --latex: the transfer report has no paired differences; omit them")
-    evaluations = evaluations_of(config)
+    evaluations = evaluations_of(config, options.overrides)
     for evaluation in evaluations:
         check_everything(evaluation.config, "transfer.policies")
     samples = photographs(config.transfer.cornell) if config.transfer.cornell else []

@@ -194,7 +194,7 @@ def save_best(
     scores = best.extra["history"][-1]
     for path in filter(None, [network, weights]):
         save_graspnet(path, best.model, best.metres_per_pixel, best.config, scores=scores)
-    save_results(run / "results.json", {"best": scores, "history": history})
+    save_results(run / "results.json", {"best": scores, "history": history}, run)
     draw_curves(run / "curves.png", history, scores["epoch"])
     for name, images in data.pictured().items():
         draw_predictions(run / f"{name}.png", best.model, images)
@@ -236,7 +236,7 @@ def train_folds(
             save_fold(config, folder, fold, judged[fold.number], trainer.model, options.weights)
             draw_curves(folder / "curves.png", history)
             print(describe_fold(fold, judged[fold.number]), flush=True)
-            save_results(run / "results.json", cross_validation_results(folds, judged))
+            save_results(run / "results.json", cross_validation_results(folds, judged), run)
         processes.wait()
     if processes.is_main:
         print(describe_folds(config, judged))

@@ -73,7 +73,9 @@ def bench_step(config: Config, repeats: int) -> list[Metric]:
     against nothing but the physics steps in it; with a free hand and with one that holds the box.
     """
     # With 10 s to hold the box no episode ends in success before the actions do.
-    ours = RobotGraspingEnv(config=config, observations=["state"], substeps=20, hold_seconds=10)
+    ours = RobotGraspingEnv(
+        config=config, observations=["state"], substeps=20, hold_seconds=10, max_steps=200
+    )
     peer = gymnasium.make("PandaPickAndPlace-v3").unwrapped
     physics_seconds: list[float] = []
     advance = ours.cell.step

@@ -145,7 +145,7 @@ def fits_of(path: Path) -> dict[str, Any]:
 
 def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
     """The rounds of a run folder. Raises UserError where there are none, and where fits would be
-    written that saw other objects than those of the training."""
+    written that saw other objects than those of the training, or not the chances of the arm."""
     if not (run / "rounds.jsonl").exists():
         raise UserError(f"{run}: has no rounds.jsonl; give a run folder of evaluate.py")
     config = load_config(run / "config.yaml")
@@ -159,6 +159,18 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
             f"{run}: not all grasps may have been tried; play it with evaluate.abstain=0, or omit "
             "--output"
         )
+    # Planners of a user's own may have a hand of their own.
+    ours = any(policy in PLANNERS for policy in config.evaluate.policies)
+    for other, key, value in (
+        (config.robot.arm == "none", "robot.arm", "panda"),
+        (config.evaluate.randomise, "evaluate.randomise", "false"),
+        (ours and config.gripper != load_config().gripper, "the section gripper", "the default"),
+    ):
+        if output is not None and other:
+            raise UserError(
+                f"{run}: planners state the chances of the nominal cell's arm and hand, and {key} "
+                f"is not {value}: play it with that, or omit --output"
+            )
     return read_rounds(run / "rounds.jsonl", config.camera.depth_noise)
 
 

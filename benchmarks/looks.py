@@ -55,7 +55,7 @@ def add_look(folder: Path, part: Figures) -> None:
 
 def _looks(folder: Path) -> dict[str, list[Figures]]:
     file = folder / FILE
-    return json.loads(file.read_text()) if file.exists() else {}
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def _is_begun(look: Figures, part: Figures) -> bool:

@@ -151,7 +151,7 @@ def with_tables(text: str, folder: Path, chinese: bool = False) -> str:
         parts, draw = TABLES[match[2]]
         files = [folder / f"{part}.json" for part in parts]
         if all(file.exists() for file in files):
-            body = draw(say, *(json.loads(file.read_text()) for file in files))
+            body = draw(say, *(json.loads(file.read_text(encoding="utf-8")) for file in files))
         else:
             make = "soak" if parts == ("reliability",) else f"results PARTS={','.join(parts)}"
             body = f"*{say('not measured yet')}: `make {make}`*"
@@ -338,7 +338,8 @@ def clutter15(say: Say, part: Figures) -> str:
 
 def noise(say: Say, part: Figures, scoreboard: Figures) -> str:
     """Success with each depth noise: those of the scoreboard, and those by which the part's
-    commands are named, on the same scenes."""
+    commands are named, on scenes of the same seeds. Where the two were measured at other commits,
+    which stand below the table, scenes and planners may differ."""
     cells: dict[tuple[str, str, str], dict[str, str]] = {}
     for name, command in part["commands"].items():
         for row in command["rows"]:

@@ -26,6 +26,7 @@ import argparse
 import hashlib
 import json
 import math
+import os
 import platform
 import shlex
 import subprocess
@@ -81,6 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_parts(parts, options.scale)
         return 0
     if not options.write:
+        if options.commit is None:
+            check_sources(parts, folders)
         commit = code_commit() if options.commit is None else commit_named(options.commit)
         for part in parts:
             if options.commit is not None and not is_finished(part, commit, options.scale):
@@ -91,9 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 for name in missing:
                     print(f"{part.name}: skipped, because no --{name} names {SOURCES[name]}")
             else:
-                if writes_docs(options) and not is_finished(part, commit, options.scale):
-                    note_look(part, commit, options.scale)
-                measure(part, commit, options.scale, folders)
+                measure(part, commit, options.scale, folders, noted=writes_docs(options))
                 if writes_docs(options):
                     publish(part, commit, options.scale)
                     write_tables(FIGURES)
@@ -118,11 +119,15 @@ def _parser() -> argparse.ArgumentParser:
         help="with a scale below 1, too, play the sealed scenes and write the docs",
     )
     for name, what in SOURCES.items():
-        parser.add_argument(f"--{name}", type=Path, help=f"folder of {what}")
+        parser.add_argument(f"--{name}", type=_folder, help=f"folder of {what}")
     parser.add_argument("--list", action="store_true", help="print the parts and measure nothing")
     parser.add_argument("--write", action="store_true", help="only write the tables again")
     parser.add_argument("--commit", metavar="HASH", help="write what runs/ holds of that commit")
     return parser
+
+
+def _folder(text: str) -> Path:
+    return Path(os.path.expanduser(text))  # as make gives it: NAME=~/folder
 
 
 def writes_docs(options: argparse.Namespace) -> bool:
@@ -177,31 +182,38 @@ def _git(*arguments: str) -> str:
 # --- Measuring --------------------------------------------------------------------------------
 
 
-def measure(part: Part, commit: str, scale: float, folders: Folders = NOWHERE) -> None:
-    """Run a part's commands that are not finished yet. Raises UserError where one was measured, or
-    begun, with another folder of SOURCES, and where the code changes while one runs."""
+def measure(
+    part: Part, commit: str, scale: float, folders: Folders = NOWHERE, noted: bool = False
+) -> None:
+    """Run a part's commands that are not finished yet. noted: as a look, before the first of them.
+    Raises UserError where one was measured, or begun, with another folder of SOURCES, and where the
+    code changes while one runs."""
+    for command in part.commands:
+        check_folders(command, finished_file(part, command, commit, scale), folders)
+    if noted and not is_finished(part, commit, scale):
+        note_look(part, commit, scale)
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
-        run = latest_run(Path(command.program).stem, file.stem)
-        if run is not None:
-            check_folders(command, run, file, folders)
-        used = folders_of(command, folders)
-        if file.exists():
-            before = json.loads(file.read_text()).get("folders", used)
-            if before != used:
-                raise UserError(
-                    f"results: {file} holds figures with {', '.join(before.values())}, not with "
-                    f"{', '.join(used.values())}; give the folder of before, or delete the file"
-                )
-        else:
-            figures = run_command(part, command, scale, commit, folders) | {"folders": used}
-            if (now := code_commit()) != commit:
-                set_aside(command, file.stem)
-                raise UserError(
-                    f"results: the code went from commit {commit[:10]} to {now[:10]} while "
-                    f"{part.name} was measured, so that its figures are of neither; start again"
-                )
-            write_json_atomic(file, figures)
+        if not file.exists():
+            figures = run_command(part, command, scale, commit, folders)
+            check_code(part, command, commit, file.stem)
+            write_json_atomic(file, figures | {"folders": folders_of(command, folders)})
+
+
+def check_code(part: Part, command: Command, commit: str, name: str) -> None:
+    """Set a run aside, and raise UserError, where the code has changed since it began."""
+    try:
+        now = code_commit()
+        if now == commit:
+            return
+        change = f"went from commit {commit[:10]} to {now[:10]}"
+    except UserError as error:
+        change = f"was changed ({error})"
+    set_aside(command, name)
+    raise UserError(
+        f"results: the code {change} while {part.name} was measured, so that its figures are of "
+        "no commit; start again"
+    )
 
 
 def folders_of(command: Command, folders: Folders) -> dict[str, str]:
@@ -214,10 +226,10 @@ def folders_of(command: Command, folders: Folders) -> dict[str, str]:
 
 
 def set_aside(command: Command, name: str) -> None:
-    """Rename a run of two commits, so that no later call goes on with it."""
+    """Rename a run of code that changed, so that no later call goes on with it."""
     run = latest_run(Path(command.program).stem, name)
     if run is not None:
-        run.rename(run.with_name(f"{run.name}-of-two-commits"))
+        run.rename(run.with_name(f"{run.name}-of-changed-code"))
 
 
 def note_look(part: Part, commit: str, scale: float) -> None:
@@ -233,7 +245,7 @@ def publish(part: Part, commit: str, scale: float) -> None:
     measured: dict[str, Any] = {}
     for command in part.commands:
         file = finished_file(part, command, commit, scale)
-        figures = json.loads(file.read_text())
+        figures = json.loads(file.read_text(encoding="utf-8"))
         figures.pop("folders", None)
         # Files of older versions hold no date: the day on which they were written.
         figures.setdefault("date", str(date.fromtimestamp(file.stat().st_mtime)))
@@ -245,7 +257,7 @@ def publish(part: Part, commit: str, scale: float) -> None:
                     f"{file} and measure {part.name} again"
                 )
             if command.kept:
-                keep_rounds(part, command, run)
+                keep_rounds(part, command, run, commit)
         measured[command.name] = figures
     content = {
         "part": part.name, "commit": commit, "seed": SEED, "scale": scale,
@@ -280,7 +292,7 @@ def run_command(
     if not command.program.endswith(".py"):
         output = RUNS / commit / f"{name}.metrics.json"
         run_program([*shlex.split(line), "--json", str(output)])
-        figures: dict[str, Any] = {"metrics": json.loads(output.read_text())}
+        figures: dict[str, Any] = {"metrics": json.loads(output.read_text(encoding="utf-8"))}
     else:
         script = Path(command.program).stem
         run = latest_run(script, name)
@@ -303,24 +315,49 @@ def run_command(
     } | figures
 
 
-def check_folders(command: Command, run: Path, finished: Path, folders: Folders) -> None:
-    """Raise UserError where a run folder's config names another folder of SOURCES than is given
-    now; finished: the file of its figures."""
-    config = load_config(run / "config.yaml")
+def places_of(command: Command, folders: Folders) -> dict[str, Path]:
+    """The places in folders of SOURCES that a command reads, by the config's key."""
+    places = {}
     for word in shlex.split(command.line(None)):
         key, _, place = word.partition("=")
         for source, folder in folders.items():
-            if not Path(place).is_relative_to(Path("path/to", source)):
-                continue
-            given = folder / Path(place).relative_to(Path("path/to", source))
+            if Path(place).is_relative_to(Path("path/to", source)):
+                places[key] = folder / Path(place).relative_to(Path("path/to", source))
+    return places
+
+
+def check_sources(parts: Sequence[Part], folders: Folders) -> None:
+    """Raise UserError where a folder that one of the parts reads does not exist."""
+    for command in (command for part in parts for command in part.commands):
+        for place in places_of(command, folders).values():
+            if not place.is_dir():
+                options = ", ".join(f"--{name}" for name in folders_of(command, folders))
+                raise UserError(f"{options}: there is no folder {place}; give the right one")
+
+
+def check_folders(command: Command, finished: Path, folders: Folders) -> None:
+    """Raise UserError where a command was begun, or finished in the file `finished`, with another
+    folder of SOURCES than is given now."""
+    run = latest_run(Path(command.program).stem, finished.stem)
+    if run is not None:
+        config = load_config(run / "config.yaml")
+        for key, place in places_of(command, folders).items():
             section, name = key.split(".")
-            before = getattr(getattr(config, section), name)
-            before = Path(before[0] if isinstance(before, tuple) else before)
-            if before.resolve() != given.resolve():
+            begun = getattr(getattr(config, section), name)
+            begun = Path(begun[0] if isinstance(begun, tuple) else begun)
+            if begun.resolve() != place.resolve():
                 raise UserError(
-                    f"results: {run} has {key}={before} and does not go on with {given}; give the "
+                    f"results: {run} has {key}={begun} and does not go on with {place}; give the "
                     f"folder of before, or delete {run} and {finished}"
                 )
+    if finished.exists():
+        used = folders_of(command, folders)
+        before = json.loads(finished.read_text(encoding="utf-8")).get("folders", used)
+        if before != used:
+            raise UserError(
+                f"results: {finished} holds figures with {', '.join(before.values())}, not with "
+                f"{', '.join(used.values())}; give the folder of before, or delete the file"
+            )
 
 
 def latest_run(script: str, name: str) -> Path | None:
@@ -347,7 +384,7 @@ def run_program(arguments: Sequence[str]) -> None:
 
 def figures_of(run: Path) -> dict[str, Any]:
     """What a table needs of a run's results.json, and paired differences of its policies."""
-    results = json.loads((run / "results.json").read_text())
+    results = json.loads((run / "results.json").read_text(encoding="utf-8"))
     if "folds" in results:
         return {key: results[key] for key in ("correct", "images", "accuracy_ci95")}
     figures: dict[str, Any] = {"rows": results["rows"]}
@@ -365,9 +402,10 @@ def without_places(figures: dict[str, Any], folders: Folders) -> dict[str, Any]:
     """Figures whose object sets are path/to/NAME instead of places on this machine."""
 
     def told(objects: str) -> str:
+        place = Path(objects).resolve()
         for name, folder in folders.items():
-            if Path(objects).is_relative_to(folder):
-                return str(Path("path/to") / name / Path(objects).relative_to(folder))
+            if place.is_relative_to(folder.resolve()):
+                return str(Path("path/to") / name / place.relative_to(folder.resolve()))
         return objects
 
     for one in (*figures.get("rows", ()), *figures.get("comparisons", ())):
@@ -394,10 +432,11 @@ def calibration_of(rounds: Sequence[RoundRecord]) -> list[dict[str, Any]]:
     return found
 
 
-def keep_rounds(part: Part, command: Command, run: Path) -> None:
+def keep_rounds(part: Part, command: Command, run: Path, commit: str) -> None:
     """Copy the first rounds of each row of a run's journal to docs/results, where
-    `python evaluate.py --replay FILE` plays them again."""
-    write_sample(run, FIGURES / f"{part.name}-{command.name}.jsonl", command.kept)
+    `python evaluate.py --replay FILE` plays them again. They name the commit that the table
+    names."""
+    write_sample(run, FIGURES / f"{part.name}-{command.name}.jsonl", command.kept, commit)
 
 
 if __name__ == "__main__":

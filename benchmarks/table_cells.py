@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from utils.result_formats import rate_in_percent
+from utils.result_formats import rate_in_percent, signed_points
 from utils.result_records import CLEAN
 from utils.statistics import FEW_ROUNDS, wilson_interval
 
@@ -43,12 +43,13 @@ def points(difference: Figures | None) -> str:
     """'+1.5 [+0.7, +2.2]' percentage points; an interval of few rounds would be too narrow."""
     if difference is None:
         return "-"
-    value, low, high = (100 * difference[key] for key in ("value", "low", "high"))
-    if value == low == high == 0:
+    bounds = [difference[key] for key in ("value", "low", "high")]
+    if not any(bounds):
         return "0 (in every resample)"
+    value, low, high = map(signed_points, bounds)
     if difference["rounds"] < FEW_ROUNDS:
-        return f"{value:+.1f} (under {FEW_ROUNDS} rounds)"
-    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+        return f"{value} (under {FEW_ROUNDS} rounds)"
+    return f"{value} [{low}, {high}]"
 
 
 def decimal(value: float | None) -> str:

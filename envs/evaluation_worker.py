@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from envs.cell import camera_intrinsics, require_arm
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
+from envs.closed_loop import check_watchdog
 from envs.execution import GraspOutcome, check_tray
 from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
 from envs.policy_approach import (
@@ -79,7 +80,10 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")
     check_sees_workspace(config.camera, camera_intrinsics(config.camera).K, config.workspace)
-    make_cell(config).close()
+    with make_cell(config) as cell:
+        if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
+            for scenario in config.evaluate.scenarios:
+                check_watchdog(cell, scenario)
     if config.robot.arm != "none":
         check_tray(config)
     sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
@@ -128,8 +132,8 @@ def work(config: Config, task: Task) -> TaskResult:
     objects.told = True  # by the main process, which prepares the sets
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()
-    several = len(config.evaluate.object_sets) > 1
-    named = f", {set_in_words(task.objects)}" if several else ""
+    sets = config.evaluate.object_sets
+    named = f", {set_in_words(task.objects, sets)}" if len(sets) > 1 else ""
     for name, controller, noise in task.policies:
         noisy = with_depth_noise(config, noise)
         cell = cell_of(noisy)

@@ -8,6 +8,7 @@ no file format.
 from __future__ import annotations
 
 import copy
+import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Sequence
@@ -202,14 +203,14 @@ def load_object_set(
     check_object_set(name_or_path, "objects")
     if name_or_path in OBJECT_SETS:
         return OBJECT_SETS[name_or_path](settings)
-    if Path(name_or_path).expanduser().is_dir():
+    if _is_folder(name_or_path):
         return _folder(Path(name_or_path), settings)
     return _plugin(name_or_path, settings)
 
 
 def check_object_set(name_or_path: str, where: str) -> None:
     """Raise UserError for what `load_object_set` does not know; `where` is the config's key."""
-    if name_or_path in OBJECT_SETS or Path(name_or_path).expanduser().is_dir():
+    if name_or_path in OBJECT_SETS or _is_folder(name_or_path):
         return
     if is_import_path(name_or_path):
         found = load_plugin(name_or_path, where, must_be_callable=False)
@@ -225,7 +226,7 @@ def check_object_set(name_or_path: str, where: str) -> None:
 
 
 def _folder(folder: Path, settings: SetSettings) -> ObjectSet:
-    folder = folder.expanduser()
+    folder = Path(os.path.expanduser(folder))
     files = object_files(folder, settings.skip_broken)
     return FileSet(folder.resolve().name, files, settings.scale or 1.0, settings)
 
@@ -249,7 +250,8 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
 
 
 def _is_folder(found: object) -> bool:
-    return isinstance(found, str | Path) and Path(found).expanduser().is_dir()
+    # Unlike pathlib's, this `expanduser` leaves the home folder of a user that is not known.
+    return isinstance(found, str | Path) and Path(os.path.expanduser(found)).is_dir()
 
 
 def _no_objects(path: str, found: object, where: str) -> ObjectError:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.objects import load_object_set
 from envs.simulators import make_cell
-from utils.atomic_files import check_writable, new_folder, write_atomic
+from utils.atomic_files import check_writable, command_line, new_folder, write_atomic
 from utils.errors import UserError
 from utils.image_overlay import PICTURES, write_picture
 from utils.runs import parse_args, run_script, this_python
@@ -198,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             picture = studio.picture()
         if chosen.rgbd is not None:
             arguments = write_rgbd(cell.frame(), chosen.rgbd, picture if with_image else None)
-            command = f"{this_python()} {shlex.join(['predict.py', *arguments])}"
+            command = f"{this_python()} {command_line(['predict.py', *arguments])}"
     verb = "replaced" if output.exists() and not with_image else "wrote"
     if not with_image:
         write_picture(output, picture)

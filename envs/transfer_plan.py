@@ -102,12 +102,34 @@ class TransferEvaluation:
     config: Config
 
 
-def evaluations_of(config: Config) -> list[TransferEvaluation]:
-    """The evaluations of the transfer report; rows that are not trained are left out.
+# Keys of an evaluation that the report ignores, and what says it instead.
+IGNORED = {
+    "simulator": "transfer.columns says in which simulators rows are scored",
+    "evaluate.policies": "transfer.policies says which planners are scored",
+    "evaluate.randomise": "transfer.columns says where scenes are changed, as in outside",
+    "evaluate.gallery": "the report has no page with pictures",
+}
 
-    Raises UserError where the report would have to compare closed loops, and for a row that cannot
-    be scored on its scenes.
+
+def check_overrides(config: Config, overrides: Sequence[str]) -> None:
+    """Raise UserError for a key that is set although the report ignores it."""
+    asked = [change.split("=")[0].strip() for change in overrides]
+    ignored = dict(IGNORED)
+    if not any(isinstance(column, PhotographColumn) for column in columns_of(config).values()):
+        ignored["transfer.cornell"] = "no column of transfer.columns is of photographs"
+    for key in asked:
+        if key in ignored:
+            raise UserError(f"{key} would be ignored: {ignored[key]}; omit it")
+
+
+def evaluations_of(config: Config, overrides: Sequence[str] = ()) -> list[TransferEvaluation]:
+    """The evaluations of the transfer report; rows that are not trained are left out. overrides: of
+    the command line.
+
+    Raises UserError where the report would have to compare closed loops, for a key that it would
+    ignore, and for a row that cannot be scored on its scenes.
     """
+    check_overrides(config, overrides)
     if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
         raise UserError(
             "transfer.policies: the report compares open loops; leave evaluate.controllers null "

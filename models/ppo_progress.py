@@ -28,6 +28,7 @@ from models.ppo_rollouts import (
 )
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
+from utils.errors import UserError
 from utils.runs import Stopwatch, resume_command, save_results, this_python
 
 ProgressRow = dict[str, Any]
@@ -113,9 +114,15 @@ def best_of(history: list[ProgressRow]) -> ProgressRow:
 
 
 def reached(settings: RLConfig, row: ProgressRow) -> bool:
-    """Whether an evaluation meets one of the targets of the config's section `rl`."""
+    """Whether an evaluation meets one of the targets of the config's section `rl`. Raises UserError
+    for a target that the environment does not report."""
     success, total = settings.target_success, settings.target_return
-    return (success is not None and row.get("success", 0.0) >= success) or (
+    if success is not None and "success" not in row:
+        raise UserError(
+            f"rl.target_success={success:g}: {settings.env_id} reports no is_success in its info; "
+            "set rl.target_success=null, and rl.target_return for a target"
+        )
+    return (success is not None and row["success"] >= success) or (
         total is not None and row["return"] >= total
     )
 
@@ -201,7 +208,7 @@ def save_training(run: Path, history: list[ProgressRow], weights: Path | None) -
     if weights is not None:
         save_policy(weights, load_policy(run / "best.pt"))
     best = best_of(history)
-    save_results(run / "results.json", {"best": best, "history": history})
+    save_results(run / "results.json", {"best": best, "history": history}, run)
     return best
 
 

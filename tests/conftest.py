@@ -22,13 +22,15 @@ hypothesis.settings.load_profile("everywhere")
 
 
 def pytest_configure() -> None:
-    """What the cache holds was made by the code that is tested: other code has another folder, also
-    in the processes that tests start."""
+    """What the cache holds was made by the code that is tested: other code has another folder in
+    $ROBOT_GRASPING_CACHE, also in the processes that tests start."""
     names = ("object_parts", "object_meshes", "object_files", "object_bodies", "panda_model",
              "panda_urdf")  # fmt: skip
     digest = hashlib.sha256(b"".join((ENVS / f"{name}.py").read_bytes() for name in names))
-    own = Path.home() / ".cache" / "robot_grasping" / "tests" / digest.hexdigest()[:12]
-    os.environ["ROBOT_GRASPING_CACHE"] = str(own)
+    own = Path("tests", digest.hexdigest()[:12])
+    cache = load_config().cache_folder
+    if cache.parts[-2:] != own.parts:  # a process of pytest-xdist has the variable already
+        os.environ["ROBOT_GRASPING_CACHE"] = str(cache / own)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

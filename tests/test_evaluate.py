@@ -384,6 +384,11 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["robot.home=[9,0,0,-2,0,1.5,0]"], "is outside the Panda's joint limits, [-2.8973, -1.76"),
         (["workspace.center=[7,7]"], "the workspace must lie within 0.8 m of the robot and at"),
         (["safety.box_lower=[0.15,-0.3,0.02]"], "leaves out [0.42, -0.48, 0.3] m"),
+        (["cache_dir=~nobody_here/x"], "this machine knows no such home folder; set cache_dir or"),
+        (["evaluate.object_sets=~nobody_here/x"], "object_sets: got '~nobody_here/x', expected"),
+        (['evaluate.policies="a\\0b.pt"'], "a name has no character \\0"),
+        (["--csv", 300 * "a"], "aaa'; give a shorter name"),
+        (["--compare", 300 * "a", "b"], "aaa/config.yaml'; give a shorter name"),
         (
             ["cache_dir=/dev/null/x"],
             "cannot make this folder (Not a directory); set cache_dir or $",

@@ -171,6 +171,21 @@ def test_a_resumed_evaluation_shows_the_pictures_and_films_of_both_parts(tmp_pat
     assert len(again.gallery) == len(again.films) == 2
 
 
+def test_what_a_killed_evaluation_shows_is_on_the_disk_before_its_rounds(tmp_path, monkeypatch):
+    """The films; and the pictures, here with every task."""
+    monkeypatch.setattr(evaluation, "GALLERY_SECONDS", -1)
+    there = []
+
+    def append(journal, record):
+        there.append((record.seed, len(list(tmp_path.glob("films/*")))))
+
+    monkeypatch.setattr(evaluation, "append_round", append)
+    monkeypatch.setattr(evaluation, "write_gallery", lambda *what: there.append(len(what[1])))
+    monkeypatch.setattr(evaluation, "open_executor", CallingExecutor)
+    play(one_worker(), tmp_path, filmed)
+    assert there == [(0, 1), (0, 1), 1, (1, 2), (1, 2), 2, 2]
+
+
 def test_a_round_that_was_played_twice_is_refused(tmp_path):
     for record in (*ROUNDS[:2], ROUNDS[0]):
         append_round(tmp_path / "rounds.jsonl", record)

@@ -1,5 +1,7 @@
 """What a worker process hands back of a scene."""
 
+import contextlib
+
 import pytest
 
 from envs.cell import camera_intrinsics
@@ -52,6 +54,25 @@ def test_a_planner_that_cannot_tell_objects_apart_does_not_retrieve(config):
     with pytest.raises(UserError, match="random does not tell objects apart.*play 'retrieve'"):
         check_everything(asked("random"))
     check_everything(asked("heuristic"))
+
+
+@pytest.mark.parametrize(
+    ("words", "oldest"),
+    [
+        ("evaluate.scenarios=latency", "0.129"),  # 0.1 s, and 7 of the 8 steps of 1/240 s at 30 Hz
+        ("evaluate.scenarios=latency safety.watchdog=0.13", None),
+        ("evaluate.scenarios=latency evaluate.controllers=open_loop", None),
+        ("evaluate.scenarios=static servo.rate=9", "0.108"),  # 26 of 27 steps
+        ("evaluate.scenarios=static servo.rate=10", None),
+        ("evaluate.scenarios=static closed_loop.compute_seconds=0.07", "0.129"),  # a third image
+    ],
+)
+def test_closed_loops_that_the_watchdog_always_stops_are_refused(words, oldest):
+    given = "evaluate.policies=random evaluate.controllers=ibvs evaluate.object_sets=box " + words
+    config = load_config(None, ["sim.renderer=tiny", *given.split()])
+    refused = pytest.raises(UserError, match=f"safety.watchdog: 0.1 s .* {oldest} s .* servo.rate")
+    with refused if oldest else contextlib.nullcontext():
+        check_everything(config)
 
 
 @pytest.mark.parametrize(("layout", "what"), [("flat", "0.016 m thick"), ("tall", "0.12 m long")])

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
+
+import pytest
 
 from utils.runs import REPOSITORY
 
@@ -34,6 +37,10 @@ def test_an_environment_is_made_from_another_folder(tmp_path):
     assert done.stdout.splitlines()[-1] == f"{REPOSITORY / 'configs' / 'default.yaml'} ['state']"
 
 
+@pytest.mark.skipif(
+    not (REPOSITORY / ".git").exists() or shutil.which("git") is None,
+    reason="git lists the files, and this is no repository or a machine without git",
+)
 def test_what_pip_installs_is_there():
     """What setuptools would miss: a package that is not listed, or data without a pattern."""
     settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
@@ -53,3 +60,18 @@ def test_what_pip_installs_is_there():
     assert {REPOSITORY / name for name in listed if not name.endswith(".py")} <= data
     for file in settings["dynamic"]["dependencies"]["file"]:
         assert (REPOSITORY / file).is_file()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_installs_again_where_the_python_of_its_environment_is_gone(tmp_path):
+    """As after an upgrade of the system's Python; `make -n` tells what it would do."""
+    for name in ("requirements.txt", "Makefile"):
+        shutil.copy(REPOSITORY / name, tmp_path)
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "python").symlink_to(tmp_path / "gone")
+    (tmp_path / ".venv" / ".installed").touch()
+    environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+    told = subprocess.run(
+        ["make", "-n", "run"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    ).stdout
+    assert "-m venv .venv" in told and "pip install --no-compile -r requirements.txt" in told

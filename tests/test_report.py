@@ -11,7 +11,15 @@ import pytest
 from tests.helpers.records import CONFIG, OLD, RETRIEVED, ROUNDS, STOPS, a_round, attempt
 from utils.config import with_settings
 from utils.errors import UserError
-from utils.report import GalleryItem, balanced, read_gallery, write_gallery, write_report
+from utils.report import (
+    GalleryItem,
+    balanced,
+    read_gallery,
+    set_in_words,
+    thinned,
+    write_gallery,
+    write_report,
+)
 from utils.result_formats import format_comparisons
 from utils.result_records import FAILURES
 from utils.results import compare, summarise
@@ -209,6 +217,36 @@ def test_the_pictures_that_a_report_may_show_are_kept_for_a_resumed_run(tmp_path
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(UserError, match="gallery.npz: cannot be read as pictures"):
         read_gallery(path)
+
+
+def test_pictures_that_are_thinned_as_they_come_leave_the_same_choice():
+    """Of 400, among them 300 alike, 24 failures of a kind and 5 successes are kept."""
+    image = np.zeros((2, 2, 3), np.uint8)
+    every = [
+        GalleryItem(image, f"{n}", n % 4 == 0, "ab"[n % 8 == 1], ("pile", "box", "none"), "missed")
+        for n in range(400)
+    ]
+    kept = []
+    for item in every:
+        kept = thinned([*kept, item], 5)
+    assert Counter((item.success, item.policy) for item in kept) == {
+        (True, "a"): 5, (False, "a"): 24, (False, "b"): 24,
+    }  # fmt: skip
+    chosen, all_of_them = ([item.caption for item in balanced(some, 5)] for some in (kept, every))
+    assert chosen == all_of_them
+
+
+def test_folders_of_one_last_name_are_told_apart():
+    sets = ["scans/mugs", "meshes/mugs", "meshes/jars", "box", "my:set"]
+    told = [set_in_words(one, sets) for one in sets]
+    assert told == ["scans/mugs", "meshes/mugs", "jars", "box", "my:set"]
+    assert set_in_words("meshes/jars + scans/mugs + box", sets) == "jars + scans/mugs + box"
+
+
+def test_a_run_that_went_on_at_another_commit_names_both_on_its_page(tmp_path):
+    assert "finished at" not in report(tmp_path)
+    (tmp_path / "environment.json").write_text('{"commit": "aaaa", "dirty": false}')
+    assert re.search(r"<dt>commit</dt><dd>aaaa.*; finished at ", report(tmp_path))
 
 
 def test_flipped_bytes_of_kept_pictures_are_one_sentence(tmp_path):

@@ -145,7 +145,8 @@ def test_a_sample_holds_the_first_rounds_of_each_row_and_their_origin(tmp_path):
     sample = read_sample(tmp_path / "sample.jsonl")
     assert sample.rounds == [ROUNDS[2], ROUNDS[0]], "the first round of each of two policies"
     append_round(run / "rounds.jsonl", replace(ROUNDS[0], depth_noise="kinect"))
-    write_sample(run, tmp_path / "noisy.jsonl", count=1)
+    write_sample(run, tmp_path / "noisy.jsonl", count=1, commit="c0ffee")
+    assert read_sample(tmp_path / "noisy.jsonl").commit == "c0ffee"
     noises = [record.depth_noise for record in read_sample(tmp_path / "noisy.jsonl").rounds]
     assert sorted(noises) == ["kinect", "none", "none"]
     assert load_config(None, sample.overrides) == CONFIG

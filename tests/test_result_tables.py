@@ -17,7 +17,7 @@ from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import PARTS, SEALED, SEED, SPLIT, Part
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
-from benchmarks.table_cells import cleared, rate, success
+from benchmarks.table_cells import cleared, points, rate, success
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError
@@ -59,6 +59,14 @@ def test_rate_has_wilsons_interval():
     """Newcombe, Stat. Med. 17 (1998), table I, method 3: 81 of 263 is 0.2553 to 0.3662."""
     assert rate(81, 263) == "31 % [26, 37] (81/263)"
     assert rate(0, 0) == "-"
+
+
+def test_a_share_above_0_is_never_0_percent_and_no_difference_is_negative_zero():
+    assert rate(2, 450).startswith("0.4 % [") and rate(1, 100_000).startswith("0.1 % [")
+    assert rate(0, 450).startswith("0 % [") and rate(5, 450).startswith("1 % [")
+    assert points({"value": -0.0004, "low": -0.012, "high": 0.0, "rounds": 50}) == (
+        "+0.0 [-1.2, +0.0]"
+    )
 
 
 def test_a_share_below_1_is_never_100_percent():
@@ -319,6 +327,10 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
     assert "ycb: skipped, because no --ycb names YCB's objects" in said
     assert "cornell: skipped, because no --cornell names Cornell's photographs" in said
     assert not results.FIGURES.exists()
+    with pytest.raises(UserError, match="--ycb: there is no folder some/ycb; give the right"):
+        main(["--parts", "ycb", "--ycb", "some/ycb"])
+    assert not results.FIGURES.exists(), "no look was noted"
+    Path("some/ycb").mkdir(parents=True)
     assert main(["--parts", "ycb", "--ycb", "some/ycb"]) == 0
     (part,) = chosen_parts("clutter")
     line = part.commands[0].line(3, {"clutter": Path("some/vgn")})
@@ -326,7 +338,8 @@ def test_parts_that_need_what_is_not_shipped_say_so_and_take_its_place(two_parts
     assert "path/to/clutter/pile" in part.commands[0].line(3)
     content = json.loads((results.FIGURES / "ycb.json").read_text())
     assert "path/to/ycb" in content["commands"]["ycb"]["command"]
-    rows = [row("oracle", 3, 4, name) for name in ("../some/vgn/pile", "ycb", "a/ycb + b")]
+    names = str(Path("../some/vgn/pile").resolve()), "ycb", "a/ycb + b"
+    rows = [row("oracle", 3, 4, name) for name in names]
     here = {"clutter": Path("../some/vgn/"), "ycb": Path("a/ycb")}
     told = results.without_places({"rows": rows, "run": "runs/ycb"}, here)
     assert [one["objects"] for one in told["rows"]] == [
@@ -424,17 +437,30 @@ def test_a_run_of_another_folder_is_not_gone_on_with(tmp_path, monkeypatch):
     assert len(played) == 1
 
 
-def test_figures_of_code_that_changed_meanwhile_are_dropped(tmp_path, monkeypatch):
+def edited():
+    raise UserError("commit these first")
+
+
+@pytest.mark.parametrize(
+    ("code_commit", "message"),
+    [
+        (lambda: "dead", "from commit c0ffee to dead while retrieve was measured"),
+        (edited, r"code was changed \(commit these first\) while retrieve was measured"),
+    ],
+)
+def test_figures_of_code_that_changed_meanwhile_are_dropped(
+    tmp_path, monkeypatch, code_commit, message
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(results, "run_command", lambda *job: {"rows": []})
-    monkeypatch.setattr(results, "code_commit", lambda: "dead")
+    monkeypatch.setattr(results, "code_commit", code_commit)
     (part,) = chosen_parts("retrieve")
     (command,) = part.commands
     name = results.run_name(part, command, command.scaled(1.0), "c0ffee")
     run = tmp_path / "runs" / "evaluate" / f"20260102-030405-{name}"
     run.mkdir(parents=True)
     (run / "config.yaml").write_text(dump_config(load_config()))
-    with pytest.raises(UserError, match="from commit c0ffee to dead while retrieve was measured"):
+    with pytest.raises(UserError, match=message):
         results.measure(part, "c0ffee", 1.0)
     assert not results.is_finished(part, "c0ffee", 1.0)
     assert results.latest_run("evaluate", name) is None, "nor does the next call go on with it"
@@ -567,7 +593,7 @@ def test_what_was_measured_by_an_older_version_is_written(two_parts, tmp_path, c
     run = tmp_path / "runs" / "evaluate" / "20260102-030405-old"
     run.mkdir(parents=True)
     (run / "config.yaml").write_text(dump_config(CONFIG))
-    facts = {"commit": 40 * "c", "python": "3.11", "packages": {"numpy": "2.0"}}
+    facts = {"commit": 40 * "d", "python": "3.11", "packages": {"numpy": "2.0"}}
     (run / "environment.json").write_text(json.dumps(facts))
     for record in ROUNDS:
         append_round(run / "rounds.jsonl", record)
@@ -580,6 +606,8 @@ def test_what_was_measured_by_an_older_version_is_written(two_parts, tmp_path, c
     assert main(["--parts", "clutter15", "--scale", "0.5", "--commit", "cccccc"]) == 0
     content = json.loads((results.FIGURES / "clutter15.json").read_text())
     assert content["date"] == content["commands"]["clutter15"]["date"] == "2026-01-03"
-    assert len(read_sample(results.FIGURES / "clutter15-clutter15.jsonl").rounds) == len(ROUNDS)
+    sample = read_sample(results.FIGURES / "clutter15-clutter15.jsonl")
+    assert len(sample.rounds) == len(ROUNDS)
+    assert sample.commit == content["commit"], "whatever commit stood on top of it"
     assert main(["--parts", "clutter15", "--scale", "0.25", "--commit", "cccccc"]) == 0
     assert "clutter15: skipped, because" in capsys.readouterr().out

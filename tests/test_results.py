@@ -263,6 +263,9 @@ def test_rounds_of_several_object_sets_with_the_same_seeds_count_apart():
     expected = paired_difference_interval(*counts.values(), seed=7)
     assert together.success == expected and expected.rounds == 24
     assert expected != paired_difference_interval(*counts.values(), seed=0)
+    # In the order in which busy workers may have finished them, too.
+    in_a_row = [*rounds[12:24], *rounds[::-1]]
+    assert compare(in_a_row, seed=7, pairs=[("random", "heuristic")])[-1].success == expected
 
 
 def test_picks_to_a_target_are_a_mean():

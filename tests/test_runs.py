@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from utils.distributed import Team, run_folder
 from utils.errors import UserError
 from utils.runs import (
     REPOSITORY,
+    GitState,
     check_resume,
     environment,
     git_state,
@@ -127,9 +129,14 @@ def test_commands_that_are_printed_name_the_interpreter_from_here(tmp_path, monk
     assert this_python() == str(Path(".venv", "bin", "python"))
     monkeypatch.setattr(sys, "executable", str(Path.cwd().parent / "a b" / "python"))
     assert shlex.split(this_python()) == [sys.executable]
+    monkeypatch.setattr(sys, "executable", r"C:\a b\python.exe")
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert this_python() == r'"C:\a b\python.exe"'
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_git_state_is_that_of_git(tmp_path, monkeypatch):
+    """At the top of a repository; what lies in a folder of one is not the repository's code."""
     for name in ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):  # which may sign or run hooks
         monkeypatch.setenv(name, os.devnull)
 
@@ -147,6 +154,8 @@ def test_git_state_is_that_of_git(tmp_path, monkeypatch):
     assert git_state(tmp_path) == (git("rev-parse", "HEAD"), False)
     file.write_text("2\n")
     assert git_state(tmp_path) == (git("rev-parse", "HEAD"), True)
+    (tmp_path / "unpacked").mkdir()
+    assert git_state(tmp_path / "unpacked") == (None, None)
 
 
 def test_git_state_outside_a_repository(tmp_path):
@@ -183,10 +192,22 @@ def test_cpus_are_those_of_this_job_shared_by_the_processes_of_this_machine(monk
 
 
 def test_results_tell_where_they_come_from(tmp_path):
-    save_results(tmp_path / "results.json", {"best": 0.5})
+    save_results(tmp_path / "results.json", {"best": 0.5}, None)
     content = json.loads((tmp_path / "results.json").read_text())
     assert content["best"] == 0.5 and content["commit"] == git_state().commit
-    assert content["versions"]["numpy"] == np.__version__
+    assert content["versions"]["numpy"] == np.__version__ and "finished_at" not in content
+
+
+def test_results_of_a_run_that_went_on_at_another_commit_name_both(tmp_path, monkeypatch):
+    run = new_run_folder("evaluate", None, CONFIG, tmp_path)
+    facts = json.loads((run / "environment.json").read_text())
+    begun = facts | {"commit": 40 * "a", "dirty": False, "packages": {"numpy": "0.1"}}
+    write_json_atomic(run / "environment.json", begun)
+    monkeypatch.setattr("utils.runs.git_state", lambda: GitState(40 * "b", False))
+    save_results(tmp_path / "copy.json", {}, run)
+    content = json.loads((tmp_path / "copy.json").read_text())
+    assert (content["commit"], content["finished_at"]) == (40 * "a", 40 * "b")
+    assert content["versions"]["numpy"] == "0.1"
 
 
 def test_only_what_may_change_is_changed_when_a_run_is_resumed(tmp_path):

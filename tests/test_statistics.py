@@ -116,6 +116,19 @@ def test_paired_ratio_of_sums_by_hand():
     assert result.high == pytest.approx(0.5)
 
 
+def test_a_bootstrap_draws_the_same_in_blocks(monkeypatch):
+    rng = np.random.default_rng(3)
+    tried = rng.integers(1, 9, 37)
+    a, b = (np.stack([rng.binomial(tried, 0.7), tried], axis=1) for _ in range(2))
+    whole = paired_difference_interval(a, b, seed=5)
+    monkeypatch.setattr("utils.statistics._MOST_DRAWS", 37 * 999)
+    assert paired_difference_interval(a, b, seed=5) == whole
+    # All at once, as numpy has it.
+    draws = np.random.default_rng(5).multinomial(37, np.full(37, 1 / 37), size=10_000)
+    rates = [(draws @ side)[:, 0] / (draws @ side)[:, 1] for side in (a, b)]
+    assert (whole.low, whole.high) == tuple(np.quantile(rates[0] - rates[1], [0.025, 0.975]))
+
+
 def test_pairing_cancels_the_scene():
     # The same outcomes for both: no difference in any resample, however hard the scenes vary.
     a = np.random.default_rng(1).integers(0, 2, 50)

@@ -193,6 +193,17 @@ def judgement(right):
     return JudgedRectangle("", "", GraspRectangle(np.zeros(2), 0.0, 1.0, 1.0), 1.0, right, 1.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    "override",
+    ["simulator=mujoco", "evaluate.randomise=true", "evaluate.gallery=3", "transfer.cornell=c"],
+)
+def test_a_key_that_the_report_would_ignore_is_refused(override):
+    overrides = ["transfer.columns=pybullet", override]
+    with pytest.raises(UserError, match=f"{override.partition('=')[0]} would be ignored: "):
+        evaluations_of(load_config(REPORT, overrides), overrides)
+    evaluations_of(load_config(REPORT), ["transfer.cornell=c"])
+
+
 @pytest.mark.parametrize("ended", [{"interrupted": True}, {"error": UserError("no room")}, {}])
 def test_photographs_are_scored_once_all_rounds_are_played(ended, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

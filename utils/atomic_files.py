@@ -11,8 +11,9 @@ import secrets
 import shlex
 import shutil
 import stat
+import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from pathlib import Path
@@ -186,7 +187,12 @@ def resumption(run: Path, files: Mapping[str, Path | None]) -> str:
     """The arguments that go on with a run and write the files of the same options:
     '--resume RUN --csv FILE'."""
     named = [part for option, path in files.items() if path for part in (option, str(path))]
-    return shlex.join(["--resume", str(run), *named])
+    return command_line(["--resume", str(run), *named])
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Words as a line that this system's shell takes apart again."""
+    return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

@@ -8,6 +8,7 @@ is an argument: this module knows neither cells nor planners.
 from __future__ import annotations
 
 import platform
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from utils.config_types import Arguments
 from utils.distributed import stop_on_interrupt
 from utils.errors import UserError
 from utils.executor import LostWorkerError, completed, open_executor
-from utils.report import VIDEO_TYPES, GalleryItem, read_gallery, write_gallery
+from utils.report import VIDEO_TYPES, GalleryItem, read_gallery, thinned, write_gallery
 from utils.result_records import (
     CLEAN,
     OPEN_LOOP,
@@ -36,6 +37,8 @@ from utils.result_records import (
     writing,
 )
 from utils.runs import resume_command, usable_cpus
+
+GALLERY_SECONDS = 60  # between two times that the pictures are written: it takes some tenths of one
 
 # Keys that may change when an evaluation is resumed: its scenes and scores stay what they are.
 FREE_TO_CHANGE = (
@@ -293,8 +296,8 @@ def _play(
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
     check_played_once(outcome.rounds, str(journal))
-    films, gallery = run / "films", run / "gallery.npz"
-    outcome.gallery = read_gallery(gallery)
+    films, gallery, shown = run / "films", run / "gallery.npz", config.evaluate.gallery
+    outcome.gallery, written = read_gallery(gallery), time.monotonic()
     todo = tasks(config, outcome.rounds)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:
@@ -307,13 +310,17 @@ def _play(
             ) as stop,
         ):
             for result in completed(workers, partial(work, config), todo, stop):
-                for record in result.rounds:
-                    append_round(journal, record)
-                outcome.rounds += result.rounds
-                outcome.gallery += result.gallery
+                # Before the rounds: what stands in the journal is not filmed again.
                 for film in result.films:
                     write_atomic(films / film.name, film.content)
                     outcome.films.append((films / film.name, film.caption))
+                for record in result.rounds:
+                    append_round(journal, record)
+                outcome.rounds += result.rounds
+                outcome.gallery = thinned([*outcome.gallery, *result.gallery], shown)
+                if time.monotonic() > written + GALLERY_SECONDS:
+                    write_gallery(gallery, outcome.gallery, shown)
+                    written = time.monotonic()
                 progress.update(len(result.rounds))
             outcome.interrupted = stop.is_set()
     except LostWorkerError as error:
@@ -325,7 +332,7 @@ def _play(
         outcome.error = error
     outcome.rounds = in_order(outcome.rounds, config)
     outcome.gallery.sort(key=lambda item: item.caption)  # not in the order of the workers' speed
-    write_gallery(gallery, outcome.gallery, config.evaluate.gallery)
+    write_gallery(gallery, outcome.gallery, shown)
     told = dict(outcome.films)  # films of an earlier part have their file's name as caption
     outcome.films = [
         (file, told.get(file, file.stem))

@@ -8,6 +8,7 @@ module knows no network and no simulator.
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from abc import abstractmethod
@@ -295,7 +296,7 @@ def _size(image: np.ndarray) -> str:
 
 def existing_folder(root: str | Path, key: str = "data.root") -> Path:
     """Return the folder that a config key names; raises UserError if it does not exist."""
-    root = Path(root).expanduser()
+    root = Path(os.path.expanduser(root))
     if not root.is_dir():
         raise UserError(f"{key}: no folder {root}")
     return root

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import io
-import shlex
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ import imageio.v3 as iio
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from utils.atomic_files import figure_bytes, write_atomic
+from utils.atomic_files import command_line, figure_bytes, write_atomic
 from utils.calibration import draw_reliability
 from utils.config import Config, changed_keys, dump_config
 from utils.errors import UNREADABLE_NPZ, UserError
@@ -34,8 +33,8 @@ from utils.result_formats import (
     rate_in_percent,
 )
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
-from utils.results import Comparison, Row, stated_chances, stop_reasons
-from utils.runs import git_state, this_python
+from utils.results import SEVERAL, Comparison, Row, stated_chances, stop_reasons
+from utils.runs import origin_of, this_python
 from utils.statistics import FEW_ROUNDS, Difference
 from utils.transforms import Grasp, RGBDFrame
 
@@ -70,7 +69,7 @@ def write_report(
     interruption: str | None = None,
     privileged: Collection[str] = (),
 ) -> None:
-    """Write the page to `path`; videos are (gif, mp4 or webm file, caption).
+    """Write the page to `path` in the run's folder; videos are (gif, mp4 or webm file, caption).
 
     rows, comparisons: the figures of the rounds by `utils.results`. device, interruption: in words.
     privileged: the planners that see the true scene, whose rows are a bound and no headline.
@@ -84,7 +83,6 @@ def write_report(
         lstrip_blocks=True,
     )
     templates.filters |= {"percent": _percent, "number": _number}
-    git = git_state()
     page = templates.get_template("report.html.j2").render(
         groups=_groups(rows, privileged),
         policies=_in_order(row.policy for row in rows),
@@ -106,10 +104,9 @@ def write_report(
         interruption=interruption,
         gallery=[(_png(item.image), item.caption, item.success) for item in gallery],
         videos=[(*_video(Path(file)), caption) for file, caption in videos],
-        command=f"{this_python()} {shlex.join(['evaluate.py', *changed_keys(config)])}",
+        command=f"{this_python()} {command_line(['evaluate.py', *changed_keys(config)])}",
         seed=config.seed,
-        commit=git.commit,
-        dirty=git.dirty,
+        origin=origin_of(path.parent),
         device=device,
         config=dump_config(config),
         date=datetime.now().strftime("%Y-%m-%d %H:%M"),
@@ -127,6 +124,7 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
     cells: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         cells.setdefault((row.scenario, row.objects, row.depth_noise), []).append(row)
+    sets = {row.objects for row in rows}
     groups = []
     for (scenario, objects, noise), cell in cells.items():
         bounds = [row for row in cell if _sees_truth(row, privileged)]
@@ -137,7 +135,7 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
         groups.append(
             {
                 "scenario": scenario,
-                "objects": objects_in_words(objects, noise),
+                "objects": set_in_words(objects, sets) + depth_in_words(noise),
                 "best": (best, _headline(best)),
                 "even": even if rate is not None else [],
                 "bounds": [(row, _headline(row)) for row in bounds if row != best],
@@ -148,14 +146,13 @@ def _groups(rows: Sequence[Row], privileged: Collection[str]) -> list[dict[str, 
     return groups
 
 
-def objects_in_words(objects: str, noise: str) -> str:
-    """An object set and a depth noise."""
-    return set_in_words(objects) + depth_in_words(noise)
-
-
-def set_in_words(objects: str) -> str:
-    """An object set, a folder by its last part."""
-    return Path(objects).name or objects
+def set_in_words(objects: str, among: Iterable[str]) -> str:
+    """One of the object sets `among`, or several of them with ' + ' between: a folder by its last
+    part, unless that is another one's, too."""
+    short = {one: Path(one).name or one for one in {*among, *objects.split(SEVERAL)}}
+    known = Counter(short.values())
+    words = (short[one] if known[short[one]] == 1 else one for one in objects.split(SEVERAL))
+    return SEVERAL.join(words)
 
 
 def _sees_truth(row: Row, privileged: Collection[str]) -> bool:
@@ -229,10 +226,11 @@ def _comparisons(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     cells: dict[tuple[str, str, str], list[Comparison]] = {}
     for pair in comparisons:
         cells.setdefault((pair.scenario, pair.objects, pair.depth_noise), []).append(pair)
+    sets = {one for pair in comparisons for one in pair.objects.split(SEVERAL)}
     return [
         {
             "scenario": scenario,
-            "objects": objects_in_words(objects, noise),
+            "objects": set_in_words(objects, sets) + depth_in_words(noise),
             "measures": [
                 ("success", [(pair, pair.success, _verdict(pair.success)) for pair in pairs]),
                 ("cleared", [(pair, pair.cleared, _verdict(pair.cleared)) for pair in pairs]),
@@ -331,6 +329,19 @@ def balanced(pictures: list[GalleryItem], count: int) -> list[GalleryItem]:
     successes = [p for p in pictures if p.success]
     take = min(len(failures), max(count // 2, count - len(successes)))
     return _in_turns(failures, take) + _in_turns(successes, count - take)
+
+
+def thinned(pictures: Sequence[GalleryItem], count: int) -> list[GalleryItem]:
+    """The pictures of which `write_gallery` chooses the same: of each policy, kind and reason no
+    more than it takes at all."""
+    seen: Counter[Any] = Counter()
+    kept = []
+    for item in pictures:
+        properties = item.policy, item.kind, item.reason, item.success
+        seen[properties] += 1
+        if seen[properties] <= (count if item.success else max(count, MOST_FAILURES)):
+            kept.append(item)
+    return kept
 
 
 def write_gallery(path: Path, pictures: Sequence[GalleryItem], count: int) -> None:

@@ -29,8 +29,9 @@ def write_results(
     config: Config,
     device: str,
     complete: bool,
+    run: Path | None = None,
 ) -> None:
-    """Write results.json of an evaluation, see `utils.runs.save_results`."""
+    """Write results.json of an evaluation in the folder `run`, see `utils.runs.save_results`."""
     content = {
         "complete": complete,
         "config": config.model_dump(mode="json"),
@@ -38,7 +39,7 @@ def write_results(
         "rows": [asdict(row) for row in rows],
         "comparisons": [asdict(pair) for pair in comparisons],
     }
-    save_results(path, content)
+    save_results(path, content, run)
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -143,9 +144,16 @@ def _share(rate: float | None, interval: tuple[float, float], k: int, n: int) ->
 
 
 def rate_in_percent(rate: float) -> str:
-    """'97' of a rate in [0, 1]; '99.6' where one below 1 would be rounded to 100."""
+    """'97' of a rate in [0, 1]; '99.6' or '0.4' where one between would be rounded to 100 or 0."""
     percent = f"{100 * rate:.0f}"
-    return f"{min(100 * rate, 99.9):.1f}" if percent == "100" and rate < 1 else percent
+    if percent in ("0", "100") and 0 < rate < 1:
+        return f"{min(max(100 * rate, 0.1), 99.9):.1f}"
+    return percent
+
+
+def signed_points(difference: float) -> str:
+    """'+1.5' percentage points of a difference of rates; '+0.0', never '-0.0'."""
+    return f"{round(100 * difference, 1) + 0.0:+.1f}"
 
 
 def _decimal(value: float | None, digits: int) -> str:
@@ -292,10 +300,10 @@ def _points(difference: Difference | None) -> str:
     """'+12.5 [+3.1, +21.9]' in percentage points; an interval of few rounds would be too narrow."""
     if difference is None:
         return "-"
-    value, low, high = (100 * x for x in (difference.value, difference.low, difference.high))
+    value, low, high = map(signed_points, (difference.value, difference.low, difference.high))
     if not has_interval(difference):
-        return f"{value:+.1f} (under {FEW_ROUNDS} rounds)"
-    return f"{value:+.1f} [{low:+.1f}, {high:+.1f}]"
+        return f"{value} (under {FEW_ROUNDS} rounds)"
+    return f"{value} [{low}, {high}]"
 
 
 def write_comparisons(

@@ -322,13 +322,14 @@ class Sample:
     rounds: list[RoundRecord]
 
 
-def write_sample(run: Path, path: Path, count: int = 10) -> None:
+def write_sample(run: Path, path: Path, count: int = 10, commit: str | None = None) -> None:
     """Write the first `count` rounds of each policy, scenario, object set and depth noise of a run
-    folder to a file of JSON lines, the first of which holds config, commit and versions."""
+    folder to a file of JSON lines, the first of which holds config, commit and versions. commit:
+    the one to name, None for that of the run."""
     facts = json.loads((run / "environment.json").read_text(encoding="utf-8"))
     config = load_config(run / "config.yaml")
     origin = {
-        "commit": facts["commit"],
+        "commit": commit or facts["commit"],
         "versions": {"python": facts["python"], **facts["packages"]},
         "overrides": changed_keys(config),
     }

@@ -39,6 +39,7 @@ from utils.statistics import (
 )
 
 CLUTTER = ("packed", "pile")  # scenarios that are also compared together
+SEVERAL = " + "  # between the names of these scenarios and their object sets
 
 _Key = tuple[str, str, str, str]  # of a row: policy, scenario, object set, depth noise
 
@@ -266,7 +267,7 @@ def compare(
         kinds = [kind for kind in cells if kind[0] in CLUTTER and kind[2] == noise]
         if len(kinds) > 1:
             scenarios, sets, _ = (list(dict.fromkeys(names)) for names in zip(*kinds))
-            cells[" + ".join(scenarios), " + ".join(sets), noise] = policies
+            cells[SEVERAL.join(scenarios), SEVERAL.join(sets), noise] = policies
     return [
         _compared(first, second, kind, policies, seed)
         for kind, policies in cells.items()
@@ -286,7 +287,8 @@ def _compared(
     rounds: dict[str, dict[tuple, RoundRecord]],
     seed: int,
 ) -> Comparison:
-    shared = [scene for scene in rounds[first] if scene in rounds[second]]
+    # Sorted, because a bootstrap depends on the order, and a journal on the workers' speed.
+    shared = sorted(rounds[first].keys() & rounds[second].keys())
     a, b = ([rounds[name][scene] for scene in shared] for name in (first, second))
     success = _difference(a, b, "successes", "executed", seed)
     # A round with a target ends once it is in hand: what else was cleared is no merit.

@@ -9,13 +9,13 @@ computes.
 from __future__ import annotations
 
 import argparse
+import errno
 import hashlib
 import json
 import math
 import os
 import platform
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -33,7 +33,14 @@ from typing import Any, NamedTuple, NoReturn, TextIO
 
 from tqdm import tqdm
 
-from utils.atomic_files import DISK_ERRORS, locked, resumption, write_atomic, write_json_atomic
+from utils.atomic_files import (
+    DISK_ERRORS,
+    command_line,
+    locked,
+    resumption,
+    write_atomic,
+    write_json_atomic,
+)
 from utils.config import DEFAULTS, Config, ConfigError, dump_config, load_config
 from utils.errors import UserError, one_line
 from utils.plugins import is_import_path
@@ -129,7 +136,7 @@ def this_python() -> str:
     here, interpreter = Path.cwd(), Path(sys.executable)
     if interpreter.is_relative_to(here):
         interpreter = interpreter.relative_to(here)
-    return shlex.quote(str(interpreter))
+    return command_line([str(interpreter)])
 
 
 def resume_command(script: str, run: Path, files: Mapping[str, Path | None] | None = None) -> str:
@@ -183,10 +190,10 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     The current folder becomes importable for plug-ins (`utils.plugins`), here and in the processes
     that the script starts: by itself Python adds the script's own folder only.
     A user error becomes one line on stderr and status 2, and so do a disk that is full, a folder
-    that cannot be written and memory that does not suffice. Ctrl-C ends with status 130; SIGTERM,
-    by which schedulers end a job, does the same as Ctrl-C and ends with status 143. Where whoever
-    reads the output has ended before, as `head` does, nothing is said and the status is 141.
-    Any other exception is a bug and keeps its traceback.
+    that cannot be written, a name that is too long and memory that does not suffice. Ctrl-C ends
+    with status 130; SIGTERM, by which schedulers end a job, does the same as Ctrl-C and ends with
+    status 143. Where whoever reads the output has ended before, as `head` does, nothing is said and
+    the status is 141. Any other exception is a bug and keeps its traceback.
     """
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
@@ -213,9 +220,11 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
             raise
         status = UNREAD
     except OSError as error:
-        if error.errno not in DISK_ERRORS:
+        if error.errno not in (*DISK_ERRORS, errno.ENAMETOOLONG):
             raise
-        print(f"error: {one_line(error)}; make room or choose another folder", file=sys.stderr)
+        too_long = error.errno == errno.ENAMETOOLONG
+        advice = "give a shorter name" if too_long else "make room or choose another folder"
+        print(f"error: {one_line(error)}; {advice}", file=sys.stderr)
         status = 2
     except (MemoryError, RuntimeError) as error:
         if not (isinstance(error, MemoryError) or NO_MEMORY.search(str(error))):
@@ -415,15 +424,23 @@ def _file_of_module(name: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
 
 
-def save_results(path: Path, content: Mapping[str, Any]) -> None:
-    """Write results.json: `content` with the commit, the versions of Python and of the packages.
+def save_results(path: Path, content: Mapping[str, Any], run: Path | None) -> None:
+    """Write results.json: `content` with `origin_of` the run; None for what is no run's.
 
     Raises ValueError on NaN or infinity before touching the file.
     """
-    facts = environment()
-    origin = {"schema": SCHEMA, "commit": facts["commit"], "dirty": facts["dirty"]}
-    origin["versions"] = {"python": facts["python"], **facts["packages"]}
-    write_json_atomic(path, origin | dict(content))
+    write_json_atomic(path, {"schema": SCHEMA} | origin_of(run) | dict(content))
+
+
+def origin_of(run: Path | None) -> dict[str, Any]:
+    """The commit, whether code was changed since then, and the versions of Python and of the
+    packages, with which a run began; `finished_at`, the present commit, where that is another."""
+    now = environment()
+    begun = now if run is None else now | begun_with(run)
+    origin = {"commit": begun["commit"], "dirty": begun["dirty"] or now["dirty"]}
+    if now["commit"] not in (None, begun["commit"]):
+        origin["finished_at"] = now["commit"]
+    return origin | {"versions": {"python": begun["python"], **begun["packages"]}}
 
 
 def _make_new(parent: Path, stem: str) -> Path:
@@ -471,8 +488,10 @@ def usable_cpus() -> int:
 
 
 def git_state(folder: Path = REPOSITORY) -> GitState:
-    """The commit of the repository that holds `folder`; never raises."""
-    commit = _git(folder, "rev-parse", "--verify", "HEAD")
+    """The commit of the repository whose top is `folder`, and none of one around it, which knows
+    nothing of our files; never raises."""
+    at_top = _git(folder, "rev-parse", "--show-prefix") == ""
+    commit = _git(folder, "rev-parse", "--verify", "HEAD") if at_top else None
     changes = _git(folder, "status", "--porcelain", "--untracked-files=no") if commit else None
     return GitState(commit, None if changes is None else bool(changes))
 

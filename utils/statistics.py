@@ -14,6 +14,7 @@ from scipy.special import ndtri
 
 CONFIDENCE = 0.95  # of every interval
 RESAMPLES = 10_000  # of a bootstrap interval
+_MOST_DRAWS = 1_000_000  # of a bootstrap that are in memory at a time
 FEW_ROUNDS = 20  # below it a bootstrap interval is too narrow to be trusted
 
 
@@ -107,9 +108,14 @@ def paired_difference_interval(a: ArrayLike, b: ArrayLike, seed: int = 0) -> Dif
         return None
     value = a[:, 0].sum() / a[:, 1].sum() - b[:, 0].sum() / b[:, 1].sum()
     rng = np.random.default_rng(seed)
-    # How often each round was drawn; a resample's sums are then matrix products.
-    draws = rng.multinomial(len(a), np.full(len(a), 1 / len(a)), size=RESAMPLES)
-    sums_a, sums_b = draws @ a, draws @ b
+    both, share = np.hstack([a, b]), np.full(len(a), 1 / len(a))
+    sums = np.empty((RESAMPLES, 4))
+    block = max(1, _MOST_DRAWS // len(a))
+    for start in range(0, RESAMPLES, block):
+        stop = min(start + block, RESAMPLES)
+        # How often each round was drawn; a resample's sums are then matrix products.
+        sums[start:stop] = rng.multinomial(len(a), share, size=stop - start) @ both
+    sums_a, sums_b = sums[:, :2], sums[:, 2:]
     defined = (sums_a[:, 1] > 0) & (sums_b[:, 1] > 0)  # a resample may hold no attempt at all
     rates_a = sums_a[defined, 0] / sums_a[defined, 1]
     rates_b = sums_b[defined, 0] / sums_b[defined, 1]

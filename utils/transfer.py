@@ -229,10 +229,10 @@ def write_transfer(
     """
     content = {"complete": complete, "device": device, "config": config.model_dump(mode="json")}
     content |= transfer_content(lines, columns)
-    save_results(run / "results.json", content)
+    save_results(run / "results.json", content, run)
     write_atomic(run / "transfer.png", draw_transfer(lines, columns))
     if copy is not None:  # last: where it cannot be written, the run is whole
-        save_results(copy, content)
+        save_results(copy, content, run)
 
 
 def draw_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> bytes:
