@@ -6,8 +6,8 @@
 
 A run leaves best.pt (chosen by evaluations), last.pt, results.json, TensorBoard events and, with
 rl.films=N, films of N episodes in runs/train_rl/<time>/; --weights FILE is the best policy alone.
-RandomizedGrasping-v0 adds episodes/STEP/env*.jsonl: the randomisation of every training episode,
-one folder for the steps from one checkpoint to the next.
+RandomizedGrasping-v0 adds episodes/STEP/env*.jsonl: the randomisation of every finished episode of
+the training, one folder for the steps from one checkpoint to the next.
 Ctrl-C stops a run early; --resume RUN continues from last.pt, bit for bit on the same device and
 number of processes. The first last.pt follows the pretraining (rl.pretraining_images); until then
 Ctrl-C ends the run for good.

@@ -238,8 +238,8 @@ def near_pose(
 ) -> np.ndarray:
     """(4, 4) T_WE a little over an object, turned a little from how the hand is at home.
 
-    T_home: (4, 4) T_WE at home. object_place: (2,) x, y of the object; top: height of its highest
-    point; both m in W.
+    T_home: (4, 4) T_WE at home. object_place: (2,) x, y of the object; top: height of the highest
+    point of it and of what stands beside it; both m in W.
     """
     side = random.uniform(-_NEAR_SIDE, _NEAR_SIDE, 2)
     height = top + random.uniform(*_NEAR_HEIGHT)

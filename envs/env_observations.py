@@ -20,6 +20,7 @@ from utils.config import Config
 from utils.depth import seeded_noise
 from utils.errors import unknown_choice
 from utils.random_streams import Stream
+from utils.transforms import known_depth
 
 # Entries of info that can be observed, and their sizes.
 INFO_OBSERVATIONS = {
@@ -156,8 +157,9 @@ class Observer:
         return {name: found[name] for name in self._names}
 
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 3) colours and (H, W, 1) metres. The depth noise is a function of the scene's seed
-        and the number of images since the scene was built."""
+        """(H, W, 3) colours and (H, W, 1) metres, 0 where a noise leaves none or one beyond
+        camera.far. The depth noise is a function of the scene's seed and the number of images since
+        the scene was built."""
         if self._wrist:
             T_WC = self.T_WE @ self._T_EC
         else:
@@ -166,7 +168,9 @@ class Observer:
         seed, stream = self._cell.scene.seed, Stream.OBSERVATION_NOISE
         measure = seeded_noise(self._depth_noise, stream, seed, self._cell.observations)
         self._cell.observations += 1
-        return image.rgb, measure(image.depth, image.rgb)[..., None]
+        depth = np.asarray(measure(image.depth, image.rgb), np.float32)
+        within = known_depth(depth) & (depth <= self._camera.far)
+        return image.rgb, np.where(within, depth, np.float32(0))[..., None]
 
     def placeholder(self) -> dict[str, np.ndarray]:
         """An observation within its space for the end of an episode whose physics failed."""

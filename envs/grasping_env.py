@@ -7,7 +7,6 @@ is a demonstration: `python -m envs.grasping_env` lifts a cube and leaves a pict
 from __future__ import annotations
 
 import functools
-import math
 import os
 import sys
 from pathlib import Path
@@ -130,10 +129,11 @@ class RobotGraspingEnv(gymnasium.Env):
     in this cell, which its owner loads scenes into and closes; `take_over` replaces `reset`.
 
     **Options of reset**: `scene_seed` asks for one scene. `start` says where the hand begins:
-    "home"; "near" an object, 1 to 10 cm over it and up to 4 cm beside it in x and in y, easier; or
-    "pretraining", in any state that an episode may lead to, to train a state estimator: without a
-    seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share`
-    of the episodes begins near. The attribute `start` is the option that begins there again.
+    "home"; "near" an object, up to 4 cm beside it in x and in y, and 1 to 10 cm over the highest
+    thing in the scene, easier; or "pretraining", in any state that an episode may lead to, to train
+    a state estimator: without a seed up to 16 such states in a row are at the same scene. Without
+    `start` a share `near_share` of the episodes begins near. The attribute `start` is the option
+    that begins there again.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
@@ -191,9 +191,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self.observation_space = self._seen.space
         size = len(entries)
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
-        # So many observations in a row span hold_seconds: n of them, n - 1 actions.
-        held = self.settings.hold_seconds * self.config.sim.frequency / self.settings.substeps
-        self._hold_steps = math.ceil(held - 1e-9) + 1
+        self._hold_steps = self.settings.hold_steps(self.config.sim.frequency)
         self._actions = ActionDecoder(self.config)
 
     def reset(
@@ -265,7 +263,13 @@ class RobotGraspingEnv(gymnasium.Env):
         outlines, goals = self._seen.outlines, self._seen.goals
         index = int(self.np_random.integers(len(outlines)))
         T_WO = self.cell.object_pose(index)
-        top = outlines[index].seen_from(T_WO, T_home).top + T_home[2, 3]
+        # Of all things: over its own object alone, the hand would be put into what is beside it.
+        tops = [
+            outline.seen_from(self.cell.object_pose(number), T_home).top + T_home[2, 3]
+            for number, outline in enumerate(outlines)
+        ]
+        walls = self.cell.scene.walls
+        top = max([*tops, *(wall.position[2] + wall.half_size[2] for wall in walls)])
         if start == "near":
             T = near_pose(T_home, T_WO[:2, 3], top, self.np_random)
             opening = command = self.config.gripper.max_opening
@@ -423,8 +427,13 @@ def _object_set(
 
 
 def _camera_of_env(config: Config) -> Config:
-    """The config with the cell's camera set to what the env observes with."""
+    """The config with the cell's camera set to what the env observes with. Raises UserError."""
     side = config.env.resolution
+    if config.env.camera == "wrist" and config.camera.view == "side":
+        raise UserError(
+            "camera.view=side places the overhead camera, but the environment observes with "
+            "env.camera=wrist; set camera.view=fixed or env.camera=overhead"
+        )
     return with_settings(
         config, "camera", {"mount": config.env.camera, "width": side, "height": side}
     )

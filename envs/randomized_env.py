@@ -24,7 +24,9 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
 
     info at reset has the episode's sample as `randomization`.
     `reset(options={"randomization": sample})` replays it; together with the scene's seed, the
-    `start` and the same actions that gives the same episode bit for bit.
+    `start` and the same actions that gives the same episode bit for bit. That holds for episodes
+    that began with a new scene: the starts "pretraining" share some, and noise depends on how many
+    images of a scene were taken before.
 
     journal: file to which every finished episode appends a line of JSON, None for none. A line
     holds `is_success` and the options that repeat the episode: `scene_seed`, `start` and
@@ -37,8 +39,9 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         try:
             self.randomizer = DomainRandomizer(self.cell, self.config.randomization)
         except UserError:
-            self.close()  # nobody else can
+            super().close()  # nobody else can
             raise
+        self._callbacks = self.cell.on_build, self.cell.on_action  # of a borrowed cell's owner
         self._recorded: Mapping[str, Any] | None = None
         self.journal: Path | None = None
         self.cell.on_build = self._randomize
@@ -67,6 +70,14 @@ class RandomizedGraspingEnv(RobotGraspingEnv):
         if (terminated or truncated) and self.journal is not None:
             self._append_to_journal(info)
         return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """As `RobotGraspingEnv.close`. A borrowed cell, which has to be open still, becomes nominal
+        and gets back the callbacks that it had before."""
+        if self._borrowed and not self._closed:
+            self.randomizer.restore()
+            self.cell.on_build, self.cell.on_action = self._callbacks
+        super().close()
 
     def _append_to_journal(self, info: Mapping[str, Any]) -> None:
         line = {name: info[name] for name in ("is_success", "scene_seed")}

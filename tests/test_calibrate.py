@@ -12,7 +12,14 @@ from fnmatch import fnmatch
 import numpy as np
 import pytest
 
-from benchmarks.calibrate import ExecutedGrasps, commit_of, fitted_chances, grasps_of, main
+from benchmarks.calibrate import (
+    ExecutedGrasps,
+    commit_of,
+    fitted_chances,
+    grasps_of,
+    main,
+    rounds_of,
+)
 from models.planners import CALIBRATIONS
 from utils.calibration import Calibration, load_calibrations
 from utils.config import dump_config, load_config
@@ -123,6 +130,31 @@ def test_runs_are_fitted_and_only_those_of_training_objects_are_written(tmp_path
             main([str(tmp_path / "train"), "--output", str(file)])
     with pytest.raises(UserError, match=r"no rounds.jsonl"):
         main([str(tmp_path / "nothing")])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("robot.arm=none", "robot.arm is not panda"),
+        ("evaluate.randomise=true", "evaluate.randomise is not false"),
+        ("gripper.max_opening=0.1", "the section gripper is not the default"),
+    ],
+)
+def test_fits_of_another_cell_than_the_arms_are_not_written(tmp_path, change, message) -> None:
+    config = load_config(None, ["objects.split=train", "evaluate.abstain=0", change])
+    (tmp_path / "config.yaml").write_text(dump_config(config))
+    append_round(tmp_path / "rounds.jsonl", played("heuristic", [(0.9, True), (0.7, False)]))
+    assert len(rounds_of(tmp_path, None)) == 1
+    with pytest.raises(UserError, match=f"{message}: play it with that, or omit --output"):
+        rounds_of(tmp_path, tmp_path / "fits.json")
+
+
+def test_a_user_fits_planners_to_a_hand_of_their_own(tmp_path) -> None:
+    changes = ["objects.split=train", "evaluate.abstain=0", "gripper.max_opening=0.1",
+               "evaluate.policies=my_module:plan"]  # fmt: skip
+    (tmp_path / "config.yaml").write_text(dump_config(load_config(None, changes)))
+    append_round(tmp_path / "rounds.jsonl", played("my_module:plan", [(0.9, True)]))
+    assert len(rounds_of(tmp_path, tmp_path / "fits.json")) == 1
 
 
 def test_planners_of_a_user_are_fitted_and_random_and_policies_are_not(tmp_path, capsys) -> None:

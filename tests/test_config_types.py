@@ -87,6 +87,26 @@ def test_a_negative_latency_is_refused():
             "1,3,uniform,scale",
             "field of view of 180 degrees out of camera.wris",
         ),
+        (
+            "vision.camera_fov",
+            "1,2.5,uniform,scale",
+            "field of view of 180 degrees out of closed_loop.fov_deg",
+        ),
+        ("physics.gravity", "9,12,uniform,add", r"high \(12\) makes it 2.19 m/s\^2 along z"),
+        ("physics.gravity", "-9,0,uniform,set", "it must stay below 0"),
+        ("physics.latency", "0,100,uniform,set", r"high \(100\) must be at most 1 s"),
+        *(
+            (name, "0.9,1.1,uniform,scale", "its nominal value is 0.*use add or set")
+            for name in (
+                "physics.joint_damping",
+                "physics.action_noise",
+                "physics.action_bias",
+                "physics.latency",
+                "vision.camera_shift",
+                "vision.camera_turn",
+                "vision.colour_noise",
+            )
+        ),
         ("vision.depth_shift", "-0.6,0,uniform,add", "must not be negative"),
         ("vision.depth_jitter", "-1,0,uniform,set", "must not be negative"),
         ("vision.depth_step", "-0.125,0,uniform,add", "must be positive"),

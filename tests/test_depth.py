@@ -135,8 +135,13 @@ def test_the_generator_advances_alike_whatever_is_seen():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"focal": 0}, {"image_focal": np.nan}, {"noise": -1}, {"window": 8}, {"step": 0}]
-)
+    "wrong",
+    [
+        {"focal": 0}, {"image_focal": np.nan}, {"noise": -1}, {"window": 8}, {"step": 0},
+        {"window": 33}, {"support": 1}, {"support": np.nan}, {"support": "high"},
+        {"shift": np.inf}, {"baseline": np.inf},
+    ],
+)  # fmt: skip
 def test_wrong_parameters_are_refused(wrong):
     with pytest.raises(ValueError, match=f"KinectNoise.{next(iter(wrong))}"):
         KinectNoise(**wrong)
@@ -146,6 +151,10 @@ def test_wrong_parameters_are_refused(wrong):
 def test_wrong_shapes_are_refused(shape):
     with pytest.raises(ValueError, match=r"\(H, W\)"):
         KinectNoise()(np.ones(shape), np.random.default_rng(0))
+    with pytest.raises(
+        UserError, match=r"at least 31 pixels .* got \(16, 16\); take larger images"
+    ):
+        KinectNoise(window=31)(np.ones((16, 16)), np.random.default_rng(0))
 
 
 def test_a_share_of_the_training_images_is_measured():
@@ -287,6 +296,12 @@ def test_every_noise_is_seeded_keeps_its_input_and_the_unknown(noise):
         ("gamma", {"shape": 0}, "GammaNoise.shape must be > 0"),
         ("gamma", {"sigma": -1}, "GammaNoise.sigma must be >= 0"),
         ("gaussian", {"sigma": -1}, "GaussianNoise.sigma must be >= 0"),
+        ("realsense", {"subpixel": np.inf}, "RealSenseNoise.subpixel must be a finite number"),
+        ("gamma", {"shape": np.inf}, "GammaNoise.shape must be a finite number, got inf"),
+        ("gaussian", {"sigma": None}, "GaussianNoise.sigma must be a finite number, got None"),
+        # Of images of 480 pixels' focal length: 9 x 480 / 1, and 200 x 480 / 424.
+        ("kinect", {"focal": 1}, "window would span 4320 pixels of the image"),
+        ("realsense", {"correlation": 200}, "correlation is 226.4 pixels of the image, .* 200"),
     ],
 )
 def test_wrong_parameters_of_a_profile_are_refused(name, wrong, message):

@@ -616,8 +616,23 @@ def test_a_line_on_disk_replays_an_episode_bit_for_bit(env, tmp_path, monkeypatc
     assert again == first and repeated["randomization"] == info["randomization"]
 
 
+def test_a_borrowed_cell_is_given_back_as_it_was(make):
+    config = load_config(None, EXTREME)
+    with make(config) as cell:
+        cell.on_action = same = lambda action: action
+        env = RandomizedGraspingEnv(config=config, cell=cell, observations=["state"])
+        env.reset(seed=0)
+        assert gravity(cell) != pytest.approx(-9.81) and cell.on_action != same
+        env.close()
+        assert gravity(cell) == pytest.approx(-9.81) and cell.sample is None and cell.view is None
+        assert cell.on_build is None and cell.on_action is same
+
+
 def test_an_episode_that_began_near_is_replayed_too(tmp_path):
-    config = load_config(None, ["sim.renderer=tiny", "env.near_share=1", "env.max_steps=2"])
+    config = load_config(
+        None,
+        ["sim.renderer=tiny", "env.near_share=1", "env.max_steps=2", "env.hold_seconds=0"],
+    )
     env = gymnasium.make(
         "RandomizedGrasping-v0", config=config, observations=["state"], control="ee_planar"
     )
@@ -634,7 +649,7 @@ def test_an_episode_that_began_near_is_replayed_too(tmp_path):
 
 ONE_STEP = [
     "rl.env_id=RandomizedGrasping-v0", "env.observations=state", "env.max_steps=1",
-    "env.substeps=1", "sim.renderer=tiny",
+    "env.hold_seconds=0", "env.substeps=1", "sim.renderer=tiny",
 ]  # fmt: skip
 
 

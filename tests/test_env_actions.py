@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, JOINT_VELOCITY, forward_kinematics
+from tests.helpers.simulators import needs_pybullet
 from utils.errors import UserError
 
 CONTROLS = {"ee": 7, "ee_planar": 5, "joint": 8}  # and the sizes of their actions
@@ -33,6 +34,14 @@ def test_episodes_can_begin_near_an_object(make_env):
     for wrong in ({"q": [0.0] * 3}, {"q": "x"}, {"q": [math.nan] * 7}, {"opening": -1.0}):
         with pytest.raises(UserError, match="start must have seven joint positions q in .* m; got"):
             env.reset(seed=0, options={"start": mine | wrong})
+
+
+@needs_pybullet
+def test_the_hand_begins_over_all_that_stands_in_a_scene(make_env):
+    """The board of the layout shelf, 2 cm thick and 0.3 m over the table, is over all objects."""
+    env = make_env(scenario="shelf", objects="tall", near_share=1.0)
+    _, info = env.reset(seed=0)
+    assert 0.32 + 0.009 < info["end_effector_position"][2] < 0.32 + 0.101
 
 
 def test_pretraining_states_are_many_at_each_scene(make_env):

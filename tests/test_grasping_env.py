@@ -35,7 +35,7 @@ ALL = "rgb+depth+state"
 @pytest.fixture
 def picked(make_env):
     """An env whose object is in the hand, one step before success, and the last info."""
-    env = make_env(control="ee_planar", hold_seconds=10.0)
+    env = make_env(control="ee_planar", hold_seconds=10.0, max_steps=200)
     _, info = env.reset(seed=0)
     while not (info["grasped"] and info["object_position"][2] > env.settings.lift_height):
         *_, info = env.step(scripted_pick(env, info)[1])
@@ -445,7 +445,7 @@ def test_dense_rewards_telescope_over_random_actions(make_env):
 
 
 def test_success_needs_the_object_held_up_for_a_while(picked):
-    env, info = picked  # must stay up for 10 s = 120 actions, more than an episode has
+    env, info = picked  # must stay up for 10 s = 120 actions
     for _ in range(20):
         _, _, terminated, _, info = env.step(np.array([0, 0, 0, 0, -1.0]))
         assert not terminated and info["grasped"]
@@ -575,11 +575,33 @@ def test_life_cycle_errors(make_env):
         ({"objects": "no_such_set"}, r"env\.objects.*random_urdfs"),
         ({"position_step": float("nan")}, r"env\.position_step"),
         ({"lift_height": "high"}, r"env\.lift_height"),
+        ({"hold_seconds": 20.0}, r"env\.max_steps \(100\) ends .*, which takes 241 actions; set"),
     ],
 )
 def test_wrong_settings_name_their_key(make_env, settings, message):
     with pytest.raises(UserError, match=message):
         make_env(**settings)
+
+
+def test_a_side_view_is_no_view_of_the_wrists_camera(config):
+    side = with_settings(config, "camera", {"view": "side"})
+    with pytest.raises(UserError, match=r"set camera\.view=fixed or env\.camera=overhead"):
+        RobotGraspingEnv(config=side, camera="wrist")
+
+
+def double_noise(image_focal: float):
+    return lambda depth, rng: depth + rng.normal(0, 0.01, depth.shape)
+
+
+def test_depth_stays_within_its_space_whatever_a_noise_returns(config):
+    """The table is 0.8 m away, half a standard deviation before the far plane."""
+    noise = {"depth_noise": "tests.test_grasping_env:double_noise", "far": 0.805}
+    noisy = with_settings(config, "camera", noise)
+    env = RobotGraspingEnv(config=noisy, observations=["depth"], resolution=32)
+    observation, _ = env.reset(seed=0)
+    env.close()
+    assert observation in env.observation_space
+    assert 0.2 < (observation["depth"] == 0).mean() < 0.4  # a normal law has 0.31 beyond half sigma
 
 
 # --- The long run -----------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def test_policies_lift_what_they_have_never_seen(objects):
 
 def test_fresh_episodes_are_at_full_difficulty(box, monkeypatch):
     """Though half of those of its training began near the box."""
-    config = config_of(box, ["env.max_steps=1", *ANYWHERE])
+    config = config_of(box, ["env.max_steps=1", "env.hold_seconds=0", *ANYWHERE])
     assert config.env.near_share == 0.5
     starts, reset = [], RobotGraspingEnv.reset
 
@@ -136,7 +136,7 @@ def test_in_a_cell_a_policy_observes_what_it_did_in_training(tmp_path, config, s
     trained = load_config(
         None,
         [*ANYWHERE, "env.observations=[state]", f"rl.policy_observations=[{','.join(seen)}]",
-         "rl.privileged_observations=[grasped]", "env.max_steps=2"],
+         "rl.privileged_observations=[grasped]", "env.max_steps=2", "env.hold_seconds=0"],
     )  # fmt: skip
     env = make_env(trained)
     make_ppo(env.observation_space, env.action_space, trained).save(tmp_path / "new.pt", trained)

@@ -24,7 +24,7 @@ from envs.vector_env import WorkerError, make_env, training_envs
 from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo import KIND
 from models.ppo_observations import ObservationLayout
-from models.ppo_progress import scoring_command
+from models.ppo_progress import reached, scoring_command
 from models.ppo_rollouts import EVALUATION, derived_seeds, evaluate_policy
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
@@ -194,6 +194,14 @@ def test_evaluation_does_not_depend_on_how_many_environments_there_are():
         np.testing.assert_allclose(
             [e.total for e in other], [e.total for e in episodes[0]], rtol=1e-5
         )
+
+
+def test_a_target_that_the_environment_does_not_report_is_refused():
+    changes = ["rl.env_id=Pendulum-v1", "rl.target_success=0.9", "rl.target_return=-200"]
+    settings = load_config(None, changes).rl
+    with pytest.raises(UserError, match="Pendulum-v1 reports no is_success.* rl.target_return"):
+        reached(settings, {"return": -150.0})
+    assert reached(settings, {"return": -300.0, "success": 0.9})
 
 
 def test_where_the_time_went_is_printed(tmp_path, monkeypatch, capsys):
@@ -579,7 +587,8 @@ def test_shipped_configs_are_valid(name):
 
 def test_episodes_are_filmed(tmp_path):
     """One picture at the start, one after each of three steps, and the last one for a while."""
-    config = load_config(None, ["env.observations=state", "env.max_steps=3", "sim.renderer=tiny"])
+    changes = ["env.observations=state", "env.max_steps=3", "env.hold_seconds=0"]
+    config = load_config(None, [*changes, "sim.renderer=tiny"])
     env = make_env(config, render_mode="rgb_array")
     path = tmp_path / "films" / "0.mp4"
     assert film_episode(env, lambda observation: np.zeros(7), 0, path) == "max_steps"

@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from utils.config_types import (
     Count,
+    File,
     JointVector,
     KeywordArguments,
     Mount,
@@ -64,8 +65,8 @@ class RobotConfig(Section):
     arm: Literal["panda", "none"]
     home: JointVector
     grip_force: Annotated[float, Field(gt=0, le=70)]  # the Franka Hand's own limit
-    velocity_scale: Share
-    acceleration_scale: Share
+    velocity_scale: Annotated[float, Field(ge=0.01, le=1)]  # slower, an attempt takes minutes
+    acceleration_scale: Annotated[float, Field(ge=0.01, le=1)]
 
 
 class GripperConfig(Section):
@@ -190,7 +191,7 @@ class SceneConfig(Section):
 
 class ExecutionConfig(Section):
     pregrasp_height: Annotated[float, Field(gt=0, le=0.3)]
-    approach_speed: Annotated[float, Field(gt=0, le=1.7)]
+    approach_speed: Annotated[float, Field(ge=0.005, le=1.7)]
     lift_height: Annotated[float, Field(gt=0, le=0.3)]
     hold_seconds: Wait
     contact_stop: Positive
@@ -291,12 +292,12 @@ TransferRow = Annotated[
 class TransferConfig(Section):
     policies: Annotated[tuple[TransferRow, ...], Several, AfterValidator(no_repeats)] | None
     columns: Names
-    cornell: Annotated[Path, Field(strict=False)] | None
+    cornell: File | None
 
 
 class DataConfig(Section):
     kind: Name
-    root: Annotated[Path, Field(strict=False)] | None
+    root: File | None
     split: Literal["object", "image"]
     folds: Annotated[int, Field(ge=2)]
     fold: Annotated[int, Field(ge=0)] | None
@@ -322,7 +323,7 @@ class DataConfig(Section):
 class TrainConfig(Section):
     backbone: Name
     max_width: Annotated[float, Field(gt=0, le=0.5)] | None
-    initial: Annotated[Path, Field(strict=False)] | None
+    initial: File | None
     epochs: Count
     batch_size: Count
     lr: Positive
@@ -342,7 +343,7 @@ class TrainConfig(Section):
 
 
 class AdaptationConfig(Section):
-    target: Annotated[Path, Field(strict=False)] | None
+    target: File | None
     weight: Annotated[float, Field(ge=0)]
     held_out: Annotated[float, Field(gt=0, lt=1)]
 
@@ -379,6 +380,11 @@ class EnvConfig(Section):
         if self.goal == "grasp" and self.scenario != "isolated":
             raise ValueError("goal 'grasp' is for one object: it needs scenario 'isolated'")
         return self
+
+    def hold_steps(self, frequency: int) -> int:
+        """How many observations in a row span hold_seconds: n of them, n - 1 actions. frequency:
+        Hz, of the physics steps."""
+        return math.ceil(self.hold_seconds * frequency / self.substeps - 1e-9) + 1
 
 
 EnvArgument = Annotated[
@@ -424,7 +430,7 @@ class RLConfig(Section):
     hidden_dim: Count
     hidden_layers: Count
     activation: Name
-    initial: Annotated[Path, Field(strict=False)] | None
+    initial: File | None
     evaluate_every: Count
     evaluation_episodes: Count
     films: Annotated[int, Field(ge=0)]
@@ -466,7 +472,7 @@ class Config(Section):
     """Everything that a run depends on; units and meanings stand in configs/default.yaml."""
 
     seed: Annotated[int, Field(ge=0, lt=2**32)]
-    cache_dir: Annotated[Path, Field(strict=False)] | None
+    cache_dir: File | None
     simulator: SimulatorName
     compute: ComputeConfig
     sim: SimConfig
@@ -493,20 +499,43 @@ class Config(Section):
     def _possible_fields_of_view(self) -> Config:
         widened = self.randomization.vision.camera_fov
         factor = changed(widened.operation, 1.0, widened.high)
-        for name in ("fov_deg", "wrist_fov_deg"):
-            widest = factor * getattr(self.camera, name)
+        for key, degrees in (
+            ("camera.fov_deg", self.camera.fov_deg),
+            ("camera.wrist_fov_deg", self.camera.wrist_fov_deg),
+            ("closed_loop.fov_deg", self.closed_loop.fov_deg),
+        ):
+            widest = factor * degrees
             if "vision" in self.randomization.parts and widest >= 180:
                 raise ValueError(
                     f"randomization.vision.camera_fov: high ({widened.high}) makes a field of view "
-                    f"of {widest:g} degrees out of camera.{name}; expected less than 180"
+                    f"of {widest:g} degrees out of {key}; expected less than 180"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _time_to_hold_the_object(self) -> Config:
+        held = self.env.hold_steps(self.sim.frequency)
+        if held > self.env.max_steps:
+            raise ValueError(
+                f"env.max_steps ({self.env.max_steps}) ends every episode before an object can be "
+                f"held for env.hold_seconds ({self.env.hold_seconds:g}), which takes {held} "
+                "actions; set a larger env.max_steps or a smaller env.hold_seconds"
+            )
         return self
 
     @property
     def cache_folder(self) -> Path:
-        """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist."""
+        """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist.
+        Raises UserError for the home folder of a user whom this machine does not know."""
         chosen = self.cache_dir or os.environ.get("ROBOT_GRASPING_CACHE")
-        return Path(chosen or "~/.cache/robot_grasping").expanduser()
+        folder = Path(chosen or "~/.cache/robot_grasping")
+        try:
+            return folder.expanduser()
+        except RuntimeError:
+            raise UserError(
+                f"cache_dir {folder}: this machine knows no such home folder; set cache_dir or "
+                "$ROBOT_GRASPING_CACHE to a whole path"
+            ) from None
 
     def make_cache_folder(self) -> None:
         """Make the cache folder, or raise UserError where that cannot be done."""

@@ -22,6 +22,7 @@ from utils.depth import KinectNoise
 
 Change = tuple[str, Any]  # operation, and a value or a list of them
 _DEVIATIONS = 2.0  # a normal range ends so many standard deviations from its mean
+_GRAVITY = -9.81  # m/s^2 along z, of a nominal cell
 
 
 def no_repeats(values: tuple) -> tuple:
@@ -50,7 +51,17 @@ PositiveWait = Annotated[float, Field(gt=0, le=MOST_SECONDS)]
 Share = Annotated[float, Field(gt=0, le=1)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Pixels = Annotated[int, Field(ge=16, le=4096)]
-Name = Annotated[str, Field(min_length=1)]
+
+
+def _without_nul(value: Any) -> Any:
+    """No system has files with this character in their names."""
+    if "\0" in str(value):
+        raise ValueError("a name has no character \\0")
+    return value
+
+
+Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+File = Annotated[Path, Field(strict=False), AfterValidator(_without_nul)]  # or folder
 Mount = Literal["overhead", "wrist"]
 # YAML has lists where frozen objects hold tuples, hence strict=False; the items stay strict.
 Vector2 = Annotated[tuple[float, float], Field(strict=False)]
@@ -147,6 +158,30 @@ def unsigned(nominal: float = 0.0, zero: bool = True) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _of_zero(value: Range) -> Range:
+    """A validator of ranges of what is 0 in a nominal cell."""
+    if value.operation == "scale":
+        raise ValueError("its nominal value is 0, which no factor changes; use add or set")
+    return value
+
+
+def _at_most_a_second(value: Range) -> Range:
+    """A validator of ranges of delays in seconds."""
+    if value.high > 1:
+        raise ValueError(f"high ({value.high:g}) must be at most 1 s")
+    return value
+
+
+def _downwards(value: Range) -> Range:
+    """A validator of the range of gravity, which has to keep objects on the table."""
+    highest = changed(value.operation, _GRAVITY, value.high)
+    if value.operation != "scale" and highest >= 0:
+        raise ValueError(
+            f"high ({value.high:g}) makes it {highest:g} m/s^2 along z, and it must stay below 0"
+        )
+    return value
+
+
 RangeOf = Annotated[
     tuple[
         float,
@@ -166,6 +201,8 @@ UnsignedRange = Annotated[RangeOf, unsigned()]
 PositiveRange = Annotated[RangeOf, unsigned(zero=False)]
 FactorRange = Annotated[RangeOf, unsigned(nominal=1.0)]  # of what is 1 in a nominal cell
 PositiveFactorRange = Annotated[RangeOf, unsigned(nominal=1.0, zero=False)]
+RangeFromZero = Annotated[RangeOf, AfterValidator(_of_zero)]
+UnsignedRangeFromZero = Annotated[UnsignedRange, AfterValidator(_of_zero)]
 
 
 class PhysicsRangesConfig(Section):
@@ -179,14 +216,14 @@ class PhysicsRangesConfig(Section):
     contact_stiffness: UnsignedRange
     contact_damping: UnsignedRange
     robot_mass: PositiveRange
-    joint_damping: UnsignedRange
+    joint_damping: UnsignedRangeFromZero
     arm_position_gain: PositiveFactorRange
     arm_velocity_gain: FactorRange
     gripper_gain: FactorRange
-    gravity: RangeOf
-    action_noise: UnsignedRange
-    action_bias: RangeOf
-    latency: UnsignedRange
+    gravity: Annotated[RangeOf, AfterValidator(_downwards)]
+    action_noise: UnsignedRangeFromZero
+    action_bias: RangeFromZero
+    latency: Annotated[UnsignedRangeFromZero, AfterValidator(_at_most_a_second)]
 
 
 class VisionRangesConfig(Section):
@@ -196,14 +233,14 @@ class VisionRangesConfig(Section):
     light_ambient: UnsignedRange
     light_diffuse: UnsignedRange
     light_specular: UnsignedRange
-    camera_shift: RangeOf
-    camera_turn: RangeOf
+    camera_shift: RangeFromZero
+    camera_turn: RangeFromZero
     camera_fov: PositiveFactorRange
     brightness: RangeOf
     contrast: RangeOf
     saturation: RangeOf
     white_balance: RangeOf
-    colour_noise: UnsignedRange
+    colour_noise: UnsignedRangeFromZero
     depth_shift: Annotated[RangeOf, unsigned(nominal=KinectNoise.shift)]
     depth_jitter: Annotated[RangeOf, unsigned(nominal=KinectNoise.noise)]
     depth_step: Annotated[RangeOf, unsigned(nominal=KinectNoise.step, zero=False)]
@@ -215,7 +252,7 @@ class RandomizationConfig(Section):
     vision: VisionRangesConfig
     colour_share: Fraction
     texture_share: Fraction
-    texture_folder: Annotated[Path, Field(strict=False)] | None
+    texture_folder: File | None
     shadow_share: Fraction
     depth_noise_share: Fraction
 

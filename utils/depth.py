@@ -20,9 +20,11 @@ simulator, no network and no grasps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Any, ClassVar, NamedTuple
 
 import cv2
@@ -42,6 +44,9 @@ DepthNoise = Callable[..., np.ndarray]
 _PATTERN_SEED = 1975  # the projector's pattern never changes; any number would do
 _DOT_CELL = 3  # sensor pixels: the pattern has one dot in each square of this side
 _INLIER_GROWTH = 1.2**2  # Bohg et al.: far from the centre, disparities may differ by this x r^2
+# With more an image would take gigabytes, or minutes.
+_WIDEST_WINDOW = 31  # sensor pixels
+_WIDEST_IN_IMAGE, _LONGEST_CORRELATION = 4096, 200  # pixels of the image
 
 
 @dataclass(frozen=True)
@@ -54,15 +59,15 @@ class KinectNoise:
     resolution.
     shift: standard deviation, pixels, of the offset at which each pixel reads the disparity.
     step: pixels, the unit in which disparities are counted. noise: standard deviation of a
-    disparity in steps. Barron and Malik's formula 35130 / round(35130 / z + N(0, 1/6) + 0.5), z in
-    centimetres, counts 35130 cm = 585.5 px x 7.5 cm x 8, hence eighths of a pixel: their 1/6 is 1/6
-    of a step.
-    (Of a pixel, it would be 3 mm at 0.8 m, three times what Khoshelham and Elberink, Sensors 2012,
-    measured.) Their 0.5 undoes a truncation that this code does not make.
-    window: pixels, odd; side of the square in which dots are matched. tolerance: pixels, by which a
-    dot at the centre may differ from the window's mean, others by up to 1.44 r^2 times as much, r
-    pixels away. support: share of the window's
-    dots that a match has to exceed.
+    disparity in steps, so that wider steps come with more noise. Barron and Malik's formula
+    35130 / round(35130 / z + N(0, 1/6) + 0.5), z in centimetres, counts 35130 cm = 585.5 px x
+    7.5 cm x 8, hence eighths of a pixel: their 1/6 is 1/6 of a step. (Of a pixel, it would be 3 mm
+    at 0.8 m, three times what Khoshelham and Elberink, Sensors 2012, measured.) Their 0.5 undoes a
+    truncation that this code does not make.
+    window: pixels, odd, 3 to 31; side of the square in which dots are matched. tolerance: pixels,
+    by which a dot at the centre may differ from the window's mean, others by up to 1.44 r^2 times
+    as much, r pixels away. support: share of the window's dots, in [0, 1), that a match has to
+    exceed.
     """
 
     image_focal: float = 480.0
@@ -76,26 +81,39 @@ class KinectNoise:
     support: float = 1 / 1.2
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         for name in ("image_focal", "focal", "baseline", "step", "tolerance"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"KinectNoise.{name} must be > 0, got {getattr(self, name)}")
         for name in ("shift", "noise"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"KinectNoise.{name} must be >= 0, got {getattr(self, name)}")
-        if self.window < 3 or self.window % 2 == 0:
-            raise ValueError(f"KinectNoise.window must be odd and >= 3, got {self.window}")
+        if not 3 <= self.window <= _WIDEST_WINDOW or self.window % 2 != 1:
+            raise ValueError(
+                f"KinectNoise.window must be an odd number from 3 to {_WIDEST_WINDOW}, got "
+                f"{self.window}"
+            )
+        if not 0 <= self.support < 1:
+            raise ValueError(f"KinectNoise.support must be in [0, 1), got {self.support}")
+        wide = self.window * self.image_focal / self.focal
+        if wide > _WIDEST_IN_IMAGE:
+            raise ValueError(
+                f"KinectNoise.window would span {wide:.4g} pixels of the image (window x "
+                f"image_focal / focal), expected at most {_WIDEST_IN_IMAGE}; take a longer focal"
+            )
 
     def __call__(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(H, W) float32 metres as measured; 0 where there is no measurement.
 
         depth: (H, W) metres along the optical axis, 0 (or NaN) where unknown. Always draws
-        3 x H x W normal deviates. Raises ValueError for an image smaller than the window.
+        3 x H x W normal deviates. Raises UserError for an image smaller than the window.
         """
         depth = np.asarray(depth, dtype=np.float32)
         if depth.ndim != 2 or min(depth.shape) < self.matching.window:
-            raise ValueError(
+            raise UserError(
                 f"KinectNoise: depth must be (H, W) and at least {self.matching.window} pixels "
-                f"either way, got {depth.shape}"
+                f"either way, got {depth.shape}; take larger images, or a smaller window or a "
+                "longer focal in camera.depth_noise_args"
             )
         draws = rng.standard_normal((3, *depth.shape), dtype=np.float32)
         disparity = self._matched(self._shifted(depth, draws[0], draws[1]))
@@ -251,6 +269,7 @@ class RealSenseNoise:
     grazing: float = 70.0
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         for name in ("image_focal", "focal", "baseline"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"RealSenseNoise.{name} must be > 0, got {getattr(self, name)}")
@@ -262,6 +281,7 @@ class RealSenseNoise:
                 raise ValueError(
                     f"RealSenseNoise.{name} must be in [0, {most}], got {getattr(self, name)}"
                 )
+        _check_correlation(self, self.correlation * self.image_focal / self.focal)
 
     def __call__(
         self, depth: np.ndarray, rng: np.random.Generator, rgb: np.ndarray | None = None
@@ -327,11 +347,13 @@ class GammaNoise:
     correlation: float = 2**0.5
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         if not self.shape > 0:
             raise ValueError(f"GammaNoise.shape must be > 0, got {self.shape}")
         for name in ("sigma", "correlation"):
-            if not 0 <= getattr(self, name) < np.inf:
+            if not getattr(self, name) >= 0:
                 raise ValueError(f"GammaNoise.{name} must be >= 0, got {getattr(self, name)}")
+        _check_correlation(self, self.correlation)
 
     def __call__(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(H, W) float32 metres; unknown pixels (0 or NaN) are 0."""
@@ -353,7 +375,8 @@ class GaussianNoise:
     sigma: float = 0.0008
 
     def __post_init__(self) -> None:
-        if not 0 <= self.sigma < np.inf:
+        _check_numbers(self)
+        if not self.sigma >= 0:
             raise ValueError(f"GaussianNoise.sigma must be >= 0, got {self.sigma}")
 
     def __call__(self, depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -364,6 +387,24 @@ class GaussianNoise:
 
 
 _BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue; ITU-R BT.601
+
+
+def _check_numbers(noise: Any) -> None:
+    """Raise ValueError for a parameter that is no finite number."""
+    for field in fields(noise):
+        value = getattr(noise, field.name)
+        if not isinstance(value, Real) or not math.isfinite(value):
+            name = f"{type(noise).__name__}.{field.name}"
+            raise ValueError(f"{name} must be a finite number, got {value!r}")
+
+
+def _check_correlation(noise: Any, length: float) -> None:
+    """Raise ValueError for errors that correlate over too many pixels of the image."""
+    if length > _LONGEST_CORRELATION:
+        raise ValueError(
+            f"{type(noise).__name__}.correlation is {length:.4g} pixels of the image, expected at "
+            f"most {_LONGEST_CORRELATION}"
+        )
 
 
 def _depth_image(depth: np.ndarray, name: str) -> np.ndarray:

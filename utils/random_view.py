@@ -10,6 +10,7 @@ module needs no renderer and knows neither simulator nor distribution.
 from __future__ import annotations
 
 import colorsys
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -121,7 +122,7 @@ class TextureRandomizer:
 
     def load_textures(self, folder: Path) -> None:
         """Use the pictures of a folder instead of those so far; see the class for errors."""
-        folder = Path(folder).expanduser()
+        folder = Path(os.path.expanduser(folder))
         if not folder.is_dir():
             raise UserError(f"texture folder {folder}: no such folder")
         files = sorted(str(p) for p in folder.rglob("*") if p.suffix.lower() in PICTURES)
@@ -211,6 +212,7 @@ def _read_picture(file: str) -> np.ndarray:
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma weights, ITU-R BT.601
 _NOISE_STREAM = 2  # keeps a frame's noise apart from what else is drawn with the same seed
+# `KinectNoise.noise` is in steps: depth_step changes the jitter in pixels, too.
 KINECT = {"depth_shift": "shift", "depth_jitter": "noise", "depth_step": "step"}
 LIGHTS = {
     "light_colour": "lightColor",
