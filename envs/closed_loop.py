@@ -20,6 +20,7 @@ on the table below its grasp, G goal.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -40,9 +41,15 @@ from envs.robot_kinematics import (
     should_flip,
 )
 from envs.robot_safety import ArmStoppedError, reaching_down
-from envs.scenarios import CameraCalibration
+from envs.scenarios import SCENARIOS, CameraCalibration
 from envs.servo_arm import ServoArm, image_period
-from utils.errors import CollinearPointsError, FeatureCountError, ServoError, TargetLostError
+from utils.errors import (
+    CollinearPointsError,
+    FeatureCountError,
+    ServoError,
+    TargetLostError,
+    UserError,
+)
 from utils.result_records import OPEN_LOOP
 from utils.servo_control import joint_limit_avoidance, joint_velocities
 from utils.servo_features import MIN_POINTS
@@ -81,6 +88,24 @@ _REACHED = 0.0015  # m from the end of the path that count as its end
 _NEAR_ENOUGH = 0.005  # m that suffice when the time is over
 _BRAKE, _SLOWEST = 6.0, 0.02  # 1/s and m/s: the descent slows towards its end, down to this speed
 _SLACK_SECONDS = 0.35  # beyond the path's own time
+
+
+def check_watchdog(cell: Cell, scenario: str) -> None:
+    """Raise UserError where images come so late or so seldom that the watchdog would stop every
+    approach in a scenario, a key of SCENARIOS."""
+    config, period = cell.config, image_period(cell)
+    latency = SCENARIOS[scenario].latency + config.closed_loop.compute_seconds
+    # An image arrives when a later one is taken, and counts until the next one arrives.
+    late = math.ceil((latency - 1e-9) / (period * cell.dt))
+    oldest = ((late + 1) * period - 1) * cell.dt
+    if oldest > config.safety.watchdog + 1e-9:
+        raise UserError(
+            f"safety.watchdog: {config.safety.watchdog:g} s stops every closed loop in the "
+            f"scenario {scenario}, where images become {oldest:.3f} s old before the next one "
+            f"arrives: servo.rate is {config.servo.rate} Hz, and images are {latency:g} s late "
+            "(by the scenario and closed_loop.compute_seconds); set safety.watchdog to "
+            f"{math.ceil(100 * oldest) / 100:g} or more"
+        )
 
 
 @dataclass
@@ -270,7 +295,7 @@ class GuidedApproach:
         """Flip the wrist where it would meet its limit while it follows the object."""
         predicted = self.target.predicted(self.cell.seconds)
         direction = planar_part(predicted)[2]
-        if abs(direction - self.chosen_at) < _RECONSIDER_ANGLE:
+        if abs(math.remainder(direction - self.chosen_at, math.tau)) < _RECONSIDER_ANGLE:
             return
         self.chosen_at = direction
         if must_flip(self._hand_above(predicted), self.cell.home, self.cell.robot.q):

@@ -9,7 +9,7 @@ grasps are planned.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -185,9 +185,7 @@ def open_loop(cell: Cell, grasp: Grasp) -> ApproachResult:
     way = cell.robot.blended_moves(start, reach, down, corner, **scales(cell))
 
     cell.robot.command_gripper(cell.gripper.opening_before(grasp.width))
-    above = len(way) - len(down)
-    follow(cell, way[:above])
-    follow(cell, way[above:], partial(cell.robot.stop_on_contact, settings.contact_stop))
+    follow(cell, way, partial(cell.robot.stop_on_contact, settings.contact_stop))
     return ApproachResult(cell.step, target)
 
 
@@ -234,6 +232,22 @@ def execute_grasp(
     """
     require_arm(cell.config, "execute_grasp")
     cell.check_physics()
+    with physics_errors(cell):
+        return _execute(cell, grasp, approach, firmly)
+
+
+@contextlib.contextmanager
+def physics_errors(cell: Cell) -> Iterator[None]:
+    """Raise PhysicsError in place of the ValueError with which planning ends where the simulation
+    has blown up: it starts from joint positions that are not finite then."""
+    try:
+        yield
+    except ValueError:
+        cell.check_physics()
+        raise
+
+
+def _execute(cell: Cell, grasp: Grasp, approach: Approach, firmly: bool) -> GraspOutcome:
     start, held, motion, reason, detail = cell.seconds, None, None, "success", ""
     try:
         closed, height = _grip(cell, grasp, approach)
@@ -251,6 +265,7 @@ def execute_grasp(
     stopped_at = None
     if reason == "collision" and cell.robot.palm_touches():
         stopped_at = cell.robot.tip_pose()[:3, 3].copy()
+    cell.check_physics()  # before the arm may be put at home by hand, which hides what blew up
     detail = "; ".join(filter(None, [detail, go_home(cell)]))
     if reason == "success":
         cell.retire(held)  # in the tray, into which it has fallen meanwhile

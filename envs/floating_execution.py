@@ -15,7 +15,14 @@ import numpy as np
 from envs.arm_paths import LIFT_MARGIN
 from envs.cell import Cell
 from envs.cell_layout import GRAVITY, REST_SPEED, rest_check_steps, table_box
-from envs.execution import GraspFailure, GraspOutcome, InHandMotion, close_fingers, holding_force
+from envs.execution import (
+    GraspFailure,
+    GraspOutcome,
+    InHandMotion,
+    close_fingers,
+    holding_force,
+    physics_errors,
+)
 from envs.floating_hand import FloatingHand, meets_box, park
 from utils.result_records import loose
 from utils.transforms import Grasp
@@ -67,6 +74,13 @@ def attempt(cell: Cell, grasp: Grasp, carry: bool = False) -> GraspOutcome:
     CARRY away; at the end it has to be off the table and, unless something hangs over it, lifted.
     """
     cell.check_physics()
+    with physics_errors(cell):
+        outcome = _attempt(cell, grasp, carry)
+    cell.check_physics()  # before the hand is put elsewhere, which hides what blew up
+    return outcome
+
+
+def _attempt(cell: Cell, grasp: Grasp, carry: bool) -> GraspOutcome:
     hand = floating_hand(cell)
     start, held, motion = cell.seconds, None, None
     reason, met, detail = "success", "", ""

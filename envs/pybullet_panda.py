@@ -185,6 +185,7 @@ class PybulletPanda(PybulletHand, Robot):
 
     urdf: the model that `envs.panda_urdf.write_panda` has written for this gripper.
     position_gain, velocity_gain: factors on the arm motors' gains, 1 unless changed.
+    joint_damping: (7,) N m s/rad, as it was set in Bullet, which does not report it; 0 at first.
     """
 
     _carriers = ARM
@@ -200,10 +201,13 @@ class PybulletPanda(PybulletHand, Robot):
     ):
         super().__init__(dt, gripper, grip_force, gate)
         self.position_gain = self.velocity_gain = 1.0
+        self.joint_damping = np.zeros(7)
         self._load(client, urdf)
         self._held_back: float | None = None  # rad/s; as yet what Bullet has
         self.limit_speed(JOINT_VELOCITY.max())
-        self._felt: tuple[int, tuple, tuple] | None = None  # the clock, positions and velocities
+        # The clock, positions and velocities when the torques were asked last, and the answer.
+        self._felt: tuple[int, tuple, tuple] | None = None
+        self._torques = np.zeros(7)
 
     # --- State --------------------------------------------------------------------------------
 
@@ -228,6 +232,7 @@ class PybulletPanda(PybulletHand, Robot):
         opening = self.max_opening if opening is None else opening
         for joint, value in zip([*ARM, *FINGERS], [*q, opening / 2, opening / 2]):
             pybullet.resetJointState(self.body, joint, value, 0.0, physicsClientId=self.client)
+        self._felt = None  # the joints have jumped
         self._stay_placed(q, opening)
 
     # --- Motors -------------------------------------------------------------------------------
@@ -278,19 +283,25 @@ class PybulletPanda(PybulletHand, Robot):
     # --- What the robot feels -----------------------------------------------------------------
 
     def external_torques(self) -> np.ndarray:
-        """(7,) N m. Bullet integrates M(q) (v' - v) / dt = motors + external - bias(q, v), where q
-        and v are those before the step."""
+        """(7,) N m. Bullet integrates M(q) (v' - v) / dt = motors - damping v + external -
+        bias(q, v), where q and v are those before the step."""
+        before = self._felt
+        if before is not None and before[0] == self._clock:  # asked twice in one step
+            return self._torques
         states = pybullet.getJointStates(self.body, _STATE_JOINTS, physicsClientId=self.client)
         q, velocities, _, motors = zip(*states)
-        before, self._felt = self._felt, (self._clock, q, velocities)
+        self._felt, self._torques = (self._clock, q, velocities), np.zeros(7)
         if before is None or before[0] != self._clock - 1:
-            return np.zeros(7)
+            return self._torques
         accelerations = (np.array(velocities) - before[2]) / self.dt
         expected = pybullet.calculateInverseDynamics(
             self.body, list(before[1]), list(before[2]), accelerations.tolist(),
             physicsClientId=self.client,
         )  # fmt: skip
-        return np.array(expected[:7]) - motors[:7]
+        self._torques = np.array(expected[:7]) - motors[:7]
+        if self.joint_damping.any():
+            self._torques += self.joint_damping * before[2][:7]
+        return self._torques
 
 
 class PybulletFloatingHand(PybulletHand, FloatingHand):

@@ -87,6 +87,7 @@ class PybulletRandomizable:
         for i, joint in enumerate(ARM):
             damping = changed_in(changes, "joint_damping", self._damping[joint], i)
             pybullet.changeDynamics(robot.body, joint, jointDamping=damping, physicsClientId=client)
+            robot.joint_damping[i] = damping
         x, y, z = self._gravity
         pybullet.setGravity(x, y, changed_in(changes, "gravity", z), physicsClientId=client)
         for name, attribute in _OF_MOTORS.items():

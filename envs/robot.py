@@ -319,7 +319,8 @@ class Robot(Hand):
     @abstractmethod
     def external_torques(self) -> np.ndarray:
         """(7,) N m on the arm's joints in the last physics step that neither the motors nor the
-        motion of the nominal robot explain; zero where there is no step to compare with."""
+        robot's own motion explain, with the masses and the joint damping that it has, randomised
+        ones, too; zero where there is no step to compare with."""
 
     # --- Motions ------------------------------------------------------------------------------
 

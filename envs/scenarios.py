@@ -258,13 +258,17 @@ class Scenario:
 def displacement(
     rng: np.random.Generator, place: np.ndarray, centre: np.ndarray, reach: float
 ) -> Displacement:
-    """A displacement of 3 to 8 cm in a direction that stays in the workspace, and of up to 45
-    degrees, which begins 0.2 to 0.8 s after the arm has set out."""
+    """A displacement of 3 to 8 cm in a direction that stays in the workspace, or towards its centre
+    where none is found, and of up to 45 degrees, which begins 0.2 to 0.8 s after the arm has set
+    out."""
     for _ in range(100):
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.08)
         shift = distance * np.array([np.cos(angle), np.sin(angle)])
         if np.abs(place + shift - centre).max() < reach:
             break
+    else:  # the object has left the workspace, or the workspace is small
+        angle = np.arctan2(*(centre - place)[::-1])
+        shift = distance * np.array([np.cos(angle), np.sin(angle)])
     return Displacement(shift, rng.uniform(-1, 1) * np.pi / 4, rng.uniform(0.2, 0.8))
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import evaluate
-from envs import closed_loop_tracker
+from envs import closed_loop, closed_loop_tracker
 from envs.closed_loop import ClosedLoop, GuidedApproach
 from envs.closed_loop_tracker import WristCamera
 from envs.execution import execute_grasp
@@ -22,6 +23,7 @@ from tests.helpers.box_rounds import grasp_of_box, loop, round_with_a_box
 from tests.helpers.simulators import needs_pybullet
 from utils.config import load_config
 from utils.runs import REPOSITORY
+from utils.transforms import planar
 
 IN_PYBULLET = pytest.mark.parametrize(
     "taught_cell",
@@ -190,6 +192,21 @@ def test_fewer_than_three_points_stop_the_arm(cell, monkeypatch):
     outcome = execute_grasp(cell, grasp_of_box(cell), loop(cell, "ibvs"))
     assert outcome.reason == "lost"
     assert "2 of those on the object are in the image, needed are at least 3" in outcome.detail
+
+
+@pytest.mark.parametrize(("direction", "asked"), [(-3.1, False), (2.85, True)])
+def test_a_turn_is_measured_the_shorter_way_round(monkeypatch, direction, asked):
+    """From 3.1 rad to -3.1 rad are 0.08 rad, less than after which a flip is considered again."""
+    questions = []
+    monkeypatch.setattr(closed_loop, "must_flip", lambda *args: questions.append(args))
+    place = planar(0.5, 0.0, direction)
+    guided = SimpleNamespace(
+        target=SimpleNamespace(predicted=lambda now: place), chosen_at=3.1,
+        cell=SimpleNamespace(seconds=0.0, home=None, robot=SimpleNamespace(q=None)),
+        _hand_above=lambda T_WO: T_WO,
+    )  # fmt: skip
+    GuidedApproach._reconsider_flip(guided)
+    assert bool(questions) == asked
 
 
 @IN_PYBULLET

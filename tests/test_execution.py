@@ -112,6 +112,18 @@ def test_failures_are_named(cell, box_set, grasp, reason):
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
+def test_a_contact_stops_the_arm_on_its_way_to_the_pregrasp(cell, box_set):
+    """A column of 2.5 kg and 36 cm between home and the cube, which the hand would knock over."""
+    shape = NativeShape("box", (0.05, 0.07, 0.36))
+    column = native_object("column", shape, 2000.0, 0.7, (1.0, 0.0, 0.0, 1.0))
+    standing = Placement(column, np.array([0.42, 0.0, 0.18]), np.array([0.0, 0.0, 0.0, 1.0]))
+    cube = cube_scene(box_set, position=(0.5, -0.06, 0.03)).placements
+    cell.load(Scene("isolated", 0, (*cube, standing)))
+    outcome = execute_grasp(cell, cube_grasp(offset=(0.0, -0.06, 0.0)))
+    assert outcome.reason == "collision" and "allowed are 10.0 N" in outcome.detail
+    assert outcome.sim_seconds < 1.5  # 0.5 s to the column, the rest back home
+
+
 def test_a_hand_that_presses_less_for_a_moment_has_missed_nothing(cell, box_set, monkeypatch):
     cell.load(cube_scene(box_set))
     felt, grips = iter([False]), cell.robot.grips

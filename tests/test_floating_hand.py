@@ -220,6 +220,17 @@ def test_what_is_carried_has_to_leave_the_table(cell):
         assert attempt(cell, grasp, carry=True).reason == carried
 
 
+def test_physics_that_blows_up_on_the_way_ends_the_round(cell, box_set, monkeypatch):
+    def blow_up(cell):
+        if cell.steps == 40:  # 3.3 cm of the 5 before the grasp
+            monkeypatch.setattr(type(cell.robot), "q", property(lambda robot: np.full(3, np.nan)))
+
+    monkeypatch.setattr(cell, "on_step", blow_up)
+    plan, settings = (lambda frame: [cube_grasp(np.pi / 2)]), {"policy": "x", "objects": "b"}
+    record = run_round(cell, cube_scene(box_set), plan, max_failures=2, **settings)
+    assert record.ended == "physics"
+
+
 def test_a_round_ends_after_two_failures_in_a_row(cell, box_set):
     """VGN's rule; the third grasp of the list would have succeeded."""
     wrong = [cube_grasp(np.pi / 4), cube_grasp(-np.pi / 4)]

@@ -82,6 +82,14 @@ def test_nothing_is_felt_at_the_highest_speed(cell):
     cell.robot.limit_speed(JOINT_VELOCITY.max())
 
 
+def test_joint_damping_is_not_felt(cell):
+    """0.5 N m s/rad, the most that is randomised, which joints at 2 rad/s would feel as 1 N m."""
+    cell.build(EMPTY)
+    cell.randomizable().apply({"joint_damping": ("add", [0.5] * 7)})
+    goal = choose_posture(top_down_pose([0.55, -0.2, 0.2], 0.7), cell.home)
+    assert max(felt_on(cell, cell.robot.joint_move(cell.robot.q, goal))) < 1.0
+
+
 @pytest.mark.parametrize("mass", [0.2, 0.6])
 def test_a_held_weight_is_felt(cell, box_set, mass):
     grip(cell, solid(box_set[0], NativeShape("box", (0.04, 0.03, 0.04)), mass, 0.8), 60.0)
@@ -102,6 +110,15 @@ def test_a_first_question_and_one_after_a_pause_feel_nothing_in_pybullet(cell):
     np.testing.assert_array_equal(cell.robot.external_torques(), np.zeros(7))
     cell.step()
     assert cell.robot.external_torques().any()
+
+
+def test_who_asks_twice_in_a_step_is_told_the_same(cell):
+    cell.build(EMPTY)
+    for _ in range(2):
+        push(cell, np.array([20.0, 0.0, 0.0]))
+        cell.step()
+        felt = [cell.robot.external_force() for _ in range(2)]
+    assert felt[0] == felt[1] > 10.0
 
 
 @pytest.mark.parametrize("thickness", [0.003, 0.06])

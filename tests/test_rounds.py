@@ -314,6 +314,19 @@ def test_physics_that_blows_up_ends_the_round(cell, box_set, monkeypatch):
     assert [attempt.reason for attempt in record.attempts] == ["physics"]
 
 
+@pytest.mark.parametrize("step", [100, 450])  # on the way to the cube, and with it to the tray
+def test_physics_that_blows_up_on_the_way_ends_the_round(cell, box_set, monkeypatch, step):
+    def blow_up(cell):
+        if cell.steps == step:
+            monkeypatch.setattr(type(cell.robot), "q", property(lambda robot: np.full(7, np.nan)))
+
+    monkeypatch.setattr(cell, "on_step", blow_up)
+    plan, settings = planner_of([cube_grasp()]), {"policy": "x", "objects": "b"}
+    record = run_round(cell, cube_scene(box_set), plan, max_failures=2, **settings)
+    assert record.ended == "physics"
+    assert [attempt.reason for attempt in record.attempts] == ["physics"]
+
+
 class Planner:
     """A planner that keeps the seeds of its resets and raises an exception after one of them."""
 

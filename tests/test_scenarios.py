@@ -17,6 +17,7 @@ from envs.scenarios import (
     Conveyor,
     Displacement,
     displaced,
+    displacement,
     disturbed,
     level,
     teach,
@@ -46,6 +47,19 @@ def test_a_displacement_ends_where_it_says(cell):
     np.testing.assert_allclose(after[:3, 3] - before[:3, 3], [0.04, -0.03, 0], atol=5e-4)
     assert turn_between(before, after) == pytest.approx(0.5, abs=0.01)
     assert cell.before_step is None
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.14), (0.5, 0.3), (0.9, -0.3)])
+def test_a_displacement_ends_in_the_workspace_or_nearer_to_it(place):
+    """From inside, and from 15 and 25 cm beside it, farther than a displacement goes."""
+    centre, place = np.array([0.5, 0.0]), np.array(place)
+    shift = displacement(np.random.default_rng(0), place, centre, 0.15).shift
+    assert 0.03 <= np.linalg.norm(shift) <= 0.08
+    if place[1] == 0.14:
+        assert abs(place + shift - centre).max() < 0.15
+    else:
+        inwards = (centre - place) / np.linalg.norm(centre - place)
+        np.testing.assert_allclose(shift, np.linalg.norm(shift) * inwards, atol=1e-12)
 
 
 @pytest.mark.parametrize("turn_rate", [0.0, 0.4])

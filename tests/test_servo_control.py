@@ -8,6 +8,7 @@ from hypothesis import given
 
 from envs.pybullet_files import data_folder
 from tests.helpers.servo_cases import derivative, twists
+from utils.errors import UserError
 from utils.servo_control import camera_jacobian, joint_velocities, pseudo_inverse
 from utils.servo_features import interaction_matrix
 from utils.servo_reference import CAMERA, SQUARE, object_pose
@@ -31,6 +32,16 @@ def test_adaptive_gain_by_hand():
     assert gain(100) == pytest.approx(0.4)
     slope = (gain(1e-7) - gain(0)) / 1e-7
     assert slope == pytest.approx(-30, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [((np.inf, 0.4, 30), "at_zero: .*got inf"), ((4, 0, 30), "at_infinity: .*got 0"),
+     ((4, 0.4, np.nan), "slope_at_zero: .*got nan"), ((1, 2, 30), "at_zero > at_infinity")],
+)  # fmt: skip
+def test_an_impossible_adaptive_gain_is_refused_by_the_name_of_its_fault(values, words):
+    with pytest.raises(UserError, match=words):
+        AdaptiveGain(*values)
 
 
 @given(twists)

@@ -95,3 +95,17 @@ def test_an_error_that_no_motion_reduces_ends_the_run():
     history = servo.run(lambda: ServoView(seen, 1.0), lambda v: None, goal)
     assert not history.converged
     assert "no motion" in history.reason
+
+
+def test_views_that_differ_in_their_points_leave_a_history_without_them():
+    servo, goal = PositionBasedVisualServo(CAMERA), ServoView(T_CO=GOAL)
+    for points in (CORNERS[:3], None):
+        views = iter([ServoView(CORNERS, 1.0, START), ServoView(points, 1.0, START)])
+        history = servo.run(lambda seen=views: next(seen), lambda v: None, goal, max_iterations=2)
+        assert history.points.shape == (2, 0, 2) and history.error_norms.shape == (2,)
+
+
+def test_a_run_of_no_iterations_has_an_empty_history():
+    history = PositionBasedVisualServo(CAMERA).simulate(SQUARE, START, GOAL, max_iterations=0)
+    assert history.iterations == len(history.error_norms) == len(history.distances) == 0
+    assert history.reason == "stopped after 0 iterations"

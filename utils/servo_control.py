@@ -68,8 +68,11 @@ class AdaptiveGain:
     slope_at_zero: float = 30.0
 
     def __post_init__(self) -> None:
-        if not (self.at_zero > self.at_infinity > 0.0 and self.slope_at_zero > 0.0):
-            raise UserError(f"AdaptiveGain: expected at_zero > at_infinity > 0, got {self}")
+        for name, value in vars(self).items():
+            if not 0.0 < value < np.inf:
+                raise UserError(f"AdaptiveGain: {name}: expected a positive number, got {value}")
+        if not self.at_zero > self.at_infinity:
+            raise UserError(f"AdaptiveGain: expected at_zero > at_infinity, got {self}")
 
     def __call__(self, x: float) -> float:
         span = self.at_zero - self.at_infinity

@@ -23,6 +23,7 @@ from utils.errors import (
     FeatureCountError,
     PointError,
     PoseError,
+    UserError,
     unknown_choice,
 )
 from utils.transforms import skew
@@ -286,8 +287,11 @@ class DepthFromMotion:
 
     def __init__(self, initial: float, noise: float = 1e-3):
         """initial: first guess for all points, metres. noise: standard deviation of a normalised
-        coordinate between two images; parallax below it hardly counts."""
+        coordinate between two images; parallax below it hardly counts. Raises DepthError, or
+        UserError for the noise."""
         self.initial = float(check_depths(initial, 1)[0])
+        if not 0.0 < noise < np.inf:
+            raise UserError(f"noise: expected a positive standard deviation, got {noise}")
         self.noise = noise
         self.reset()
 

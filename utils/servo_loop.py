@@ -197,7 +197,8 @@ class VisualServo(ABC):
         camera = _SimulatedCamera(self, points_O, T_CO, depth_factor, pixel_noise, rng)
         ideal = _SimulatedCamera(self, points_O, T_GO, 1.0, 0.0, None)
         history = self.run(camera.see, camera.move, ideal.see(), max_iterations, tolerance)
-        history.poses[:] = camera.poses[: history.iterations]  # the true poses, not the fitted ones
+        true = camera.poses[: history.iterations]  # and not the fitted ones
+        history.poses[:] = np.reshape(true, history.poses.shape)
         return history
 
     def compute_joint_velocities(
@@ -259,16 +260,21 @@ class VisualServo(ABC):
         converged: bool,
         reason: str,
     ) -> ServoHistory:
-        """The history of a run that answered each of `views` with one of `steps`."""
+        """The history of a run that answered each of `views` with one of `steps`; without points
+        where the views differ in how many they hold."""
         unknown = np.full((4, 4), np.nan)
         no_points = np.empty((0, 2))
+        points = [no_points if v.points is None else np.asarray(v.points) for v in views]
+        if len({seen.shape for seen in points}) > 1:
+            points = [no_points] * len(views)
+        k = len(steps)
         return ServoHistory(
-            poses=np.array([unknown if v.T_CO is None else v.T_CO for v in views]),
+            poses=np.reshape([unknown if v.T_CO is None else v.T_CO for v in views], (k, 4, 4)),
             goal_pose=unknown if goal.T_CO is None else np.asarray(goal.T_CO),
-            points=np.array([no_points if v.points is None else v.points for v in views]),
+            points=np.array(points) if k else np.empty((0, 0, 2)),
             goal_points=no_points if goal.points is None else np.asarray(goal.points),
-            errors=np.array([s.error for s in steps]),
-            velocities=np.array([s.velocity for s in steps]),
+            errors=np.array([s.error for s in steps]) if k else np.empty((0, 0)),
+            velocities=np.reshape([s.velocity for s in steps], (k, 6)),
             condition_numbers=np.array([s.condition_number for s in steps]),
             gains=np.array([s.gain for s in steps]),
             dt=self.dt,
