@@ -57,7 +57,7 @@ from utils.result_formats import (
     write_csv,
     write_results,
 )
-from utils.result_records import differing_rounds, policy_name, read_sample
+from utils.result_records import differing_rounds, ending, policy_name, read_sample, versions_of
 from utils.results import compare, compare_runs, stop_reasons, summarise
 from utils.runs import check_resume, environment, open_run, parse_args, run_script, save_results
 from utils.transfer import format_transfer, score_of, transfer_notes, write_transfer
@@ -187,21 +187,21 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
     config = load_foreign(values_of(sample.overrides), str(file), overrides)
     check_names(config)
     print(f"{len(sample.rounds)} rounds of commit {sample.commit}, played again", flush=True)
-    facts = environment()
-    ours = {"python": facts["python"], **facts["packages"]}
-    for name, version in sample.versions.items():
-        if version != ours.get(name):
-            print(f"{name} is {ours.get(name)} here, the rounds were played with {version}")
-    different = differing_rounds(sample.rounds, replay(sample, config, work, overrides))
-    for record in different:
-        print(f"different: {record.policy}, {record.scenario}, scene {record.seed}")
-    print(f"{len(sample.rounds) - len(different)} of {len(sample.rounds)} rounds are the same")
+    ours = versions_of(environment())
+    for name, there in sample.versions.items():
+        if there != ours.get(name):
+            print(f"{name} is {ours.get(name)} here, the rounds were played with {there}")
+    different = differing_rounds(sample.rounds, played := replay(sample, config, work, overrides))
+    otherwise = differing_rounds(different, played, ending)
+    for record in otherwise:
+        print(f"ends otherwise: {record.policy}, {record.scenario}, scene {record.seed}")
+    same = len(sample.rounds) - len(different)
+    alike = len(different) - len(otherwise)
+    print(f"{same} of {len(sample.rounds)} rounds are the same, {alike} more end alike")
     if different:
-        print(
-            "code that has changed, or a KEY=VALUE given here, plays other rounds: `git checkout "
-            f"{sample.commit}` has their code"
-        )
-    return 1 if different else 0
+        why = "another processor, changed code or a KEY=VALUE given here plays other rounds"
+        print(f"{why}: `git checkout {sample.commit}` has their code")
+    return 1 if otherwise else 0
 
 
 # --- The transfer report: the same rows in every column -------------------------------------

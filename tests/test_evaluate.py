@@ -142,22 +142,27 @@ def test_a_run_is_compared_with_another(finished, tmp_path, monkeypatch, capsys)
 
 @pytest.mark.slow
 def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, capsys, played_here):
-    """A round that is the same, and one whose published outcome was changed."""
+    """A round of another processor's last digits, and one whose published outcome was changed."""
     folder, _ = finished
     write_sample(only_run(folder), tmp_path / "sample.jsonl", count=1)
     origin, heuristic, random = (tmp_path / "sample.jsonl").read_text().splitlines()
     changed = json.loads(heuristic)
     changed["attempts"][0]["sim_seconds"] += 0.1
+    changed["objects_cleared"] = 1 - changed["objects_cleared"]
+    jittered = json.loads(random)
+    jittered["attempts"][0]["sim_seconds"] += 1e-9
     origin = json.loads(origin)
     origin["versions"]["numpy"] = "1.0"
-    lines = map(json.dumps, (origin, changed))
-    (tmp_path / "sample.jsonl").write_text("\n".join([*lines, random]))
+    origin["versions"]["processor"] = "another one"
+    lines = map(json.dumps, (origin, changed, jittered))
+    (tmp_path / "sample.jsonl").write_text("\n".join(lines))
     monkeypatch.chdir(tmp_path)
     assert evaluate.main(["--replay", "sample.jsonl", "evaluate.workers=1"]) == 1
     printed = capsys.readouterr().out
     assert "the rounds were played with 1.0" in printed and "python is" not in printed
-    assert "different: heuristic, isolated, scene 0" in printed
-    assert "1 of 2 rounds are the same" in printed
+    assert "here, the rounds were played with another one" in printed
+    assert "ends otherwise: heuristic, isolated, scene 0" in printed
+    assert "0 of 2 rounds are the same, 1 more end alike" in printed
     assert f"git checkout {origin['commit']}" in printed
 
 

@@ -16,6 +16,7 @@ from utils.result_records import (
     append_round,
     cut_torn_line,
     differing_rounds,
+    ending,
     read_rounds,
     read_sample,
     without_times,
@@ -185,6 +186,10 @@ def test_rounds_differ_in_outcomes_not_in_wall_clock_times():
     assert without_times(played(9.0, 6)) == without_times(ROUNDS[1])
     assert differing_rounds(ROUNDS[1:2], [played(9.0, 6)]) == []
     assert differing_rounds(ROUNDS[1:2], [played(0.06, 6.1)]) == ROUNDS[1:2]
+    assert differing_rounds(ROUNDS[1:2], [played(0.06, 6.1)], ending) == []
+    missed = [attempt("missed", 0.06, 6), attempt("no_plan", 0.2, 0)]
+    other = a_round("heuristic", 1, 5, 1, missed, "no_plan")
+    assert differing_rounds(ROUNDS[1:2], [other], ending) == ROUNDS[1:2]
     assert differing_rounds(ROUNDS, ROUNDS[:3]) == ROUNDS[3:]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -322,6 +322,11 @@ class Sample:
     rounds: list[RoundRecord]
 
 
+def versions_of(facts: Mapping[str, Any]) -> dict[str, str | None]:
+    """What may change a round, of the facts of `utils.runs.environment`."""
+    return {name: facts.get(name) for name in ("processor", "python")} | facts["packages"]
+
+
 def write_sample(run: Path, path: Path, count: int = 10, commit: str | None = None) -> None:
     """Write the first `count` rounds of each policy, scenario, object set and depth noise of a run
     folder to a file of JSON lines, the first of which holds config, commit and versions. commit:
@@ -330,7 +335,7 @@ def write_sample(run: Path, path: Path, count: int = 10, commit: str | None = No
     config = load_config(run / "config.yaml")
     origin = {
         "commit": commit or facts["commit"],
-        "versions": {"python": facts["python"], **facts["packages"]},
+        "versions": versions_of(facts),
         "overrides": changed_keys(config),
     }
     rows: dict[tuple[str, ...], list[RoundRecord]] = {}
@@ -375,13 +380,19 @@ def without_times(record: RoundRecord) -> RoundRecord:
 
 
 def differing_rounds(
-    before: Sequence[RoundRecord], after: Sequence[RoundRecord]
+    before: Sequence[RoundRecord],
+    after: Sequence[RoundRecord],
+    seen_as: Callable[[RoundRecord], Hashable] = lambda record: _line(without_times(record)),
 ) -> list[RoundRecord]:
-    """The rounds of `before` that `after` does not hold, or holds with another outcome; wall-clock
-    times do not count."""
+    """The rounds of `before` that `after` does not hold, or holds otherwise. seen_as: what of a
+    record counts; by default all of it but wall-clock times."""
+    held = {seen_as(record) for record in after}
+    return [record for record in before if seen_as(record) not in held]
 
-    def key(record: RoundRecord) -> str:
-        return _line(without_times(record))
 
-    held = {key(record) for record in after}
-    return [record for record in before if key(record) not in held]
+def ending(record: RoundRecord) -> Hashable:
+    """What a round is scored by: what was cleared, and how each attempt ended. The places, angles
+    and seconds of a record depend in their last digits on the processor, too."""
+    attempts = tuple((attempt.success, attempt.reason) for attempt in record.attempts)
+    score = record.objects_cleared, record.target_in_hand, record.ended, attempts
+    return record.policy, record.kind, record.seed, score
