@@ -46,6 +46,7 @@ from utils.errors import UserError
 from utils.evaluation import Task
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import RoundRecord
+from utils.runs import REPOSITORY
 from utils.transforms import Grasp, RGBDFrame
 
 CHANCES = st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=60)
@@ -55,6 +56,7 @@ def test_the_error_is_the_mean_distance_of_the_bins() -> None:
     """By hand: 0.8 and 0.9 are bins 8 and 9. (2 |0.5 - 0.8| + 1 |1 - 0.95|) / 3."""
     chances, successes = [0.8, 0.8, 0.95], [True, False, True]
     assert calibration_error(chances, successes) == pytest.approx((2 * 0.3 + 0.05) / 3)
+    assert calibration_error([0.81, 0.89], [True, False]) == pytest.approx(0.35)  # one bin, of 0.1
     bins = reliability(chances, successes)
     assert [one.count for one in bins] == [2, 1]
     np.testing.assert_allclose(bins, [(2, 0.8, 0.5), (1, 0.95, 1.0)])
@@ -490,6 +492,27 @@ def test_chances_that_cannot_be_read_are_no_scores(text, message, tmp_path):
         file.write_text(text)
     with pytest.raises(UserError, match=message):
         load_calibrations(file)
+
+
+def rows_of(page: str, heading: str) -> list[list[str]]:
+    """The cells of the page's table with this first line, without its heading."""
+    lines = page[page.index(heading) :].split("\n\n")[0].splitlines()
+    return [[cell.strip(" `") for cell in line.strip("| ").split("|")] for line in lines[2:]]
+
+
+def test_the_page_states_the_chances_of_the_shipped_fits() -> None:
+    fits = calibrations()
+    page = (REPOSITORY / "docs/calibration.md").read_text(encoding="utf-8")
+    heading = "| score | 0.99 | 0.9 | 0.5 | 0.3 |"
+    scores, rows = (0.99, 0.9, 0.5, 0.3), rows_of(page, heading)
+    assert len(rows) == 4
+    for (name, *stated), (_, *after) in zip(rows[::2], rows[1::2]):
+        fit = fits[name.removeprefix("chance of `")]
+        for failed, told in ((False, stated), (True, after)):
+            assert told == [f"{100 * fit(score, failed=failed):.0f} %" for score in scores]
+    for name, *_, least, after in rows_of(page, "| planner | left out |")[:3]:
+        limits = fits[name].scores([LEAST_CHANCE, LEAST_CHANCE], failed=[False, True])
+        assert [least, after] == [f"{limit:.2f}" for limit in limits]
 
 
 def test_all_five_numbers_of_a_calibration_are_read(tmp_path):

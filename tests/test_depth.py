@@ -19,8 +19,10 @@ from utils.depth import (
     KinectNoise,
     RealSenseNoise,
     make_depth_noise,
+    seeded_noise,
 )
 from utils.errors import UserError
+from utils.random_streams import Stream
 
 
 def plane(depth: float, side: int = 224) -> np.ndarray:
@@ -218,7 +220,7 @@ def test_pixels_are_lost_on_dark_shiny_and_grazing_surfaces():
     """The share lost is the probability that the docstring states."""
     noise, depth = RealSenseNoise(), plane(0.8, 300)
 
-    def share_lost(level: int) -> float:
+    def share_lost(level: int | tuple[int, int, int]) -> float:
         rgb = np.full((300, 300, 3), level, np.uint8)
         return float((noise(depth, np.random.default_rng(2), rgb) == 0).mean())
 
@@ -227,6 +229,8 @@ def test_pixels_are_lost_on_dark_shiny_and_grazing_surfaces():
     assert share_lost(20) == pytest.approx(0.5, abs=0.03)
     assert share_lost(10) == pytest.approx(0.75, abs=0.03)
     assert share_lost(252) == pytest.approx(0.4, abs=0.03)
+    assert share_lost((255, 255, 0)) == share_lost((255, 0, 0)) == 0  # no reflection, not dark
+    assert share_lost((0, 0, 255)) == pytest.approx(1 - 0.114 * 255 / 40, abs=0.03)
     assert (noise(depth, np.random.default_rng(2)) > 0).all()  # no colours, nothing dark
 
     def tilted(degrees: float) -> np.ndarray:
@@ -269,6 +273,17 @@ def test_gaussian_noise_is_independent_and_the_same_at_every_distance():
     # By Gauss's own table, 31.7 % lie outside of one standard deviation and 4.55 % outside of two.
     for sigmas, share in ((1, 0.317), (2, 0.0455)):
         assert (abs(error) > sigmas * 0.0008).mean() == pytest.approx(share, abs=0.005)
+
+
+def test_scenes_have_noise_of_their_own():
+    """Drawn from the scene's seed, the image's number and the stream."""
+    stream, clean = Stream.PLANNING_NOISE, plane(0.7, 500)
+    one, other = (
+        seeded_noise(GaussianNoise(), stream, seed, 0)(clean, None) - clean for seed in (1, 2)
+    )
+    drawn = np.random.default_rng([1, 0, stream]).standard_normal((500, 500), np.float32)
+    np.testing.assert_allclose(one, 0.0008 * drawn, atol=2e-7)
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
 
 
 @pytest.mark.parametrize("noise", [RealSenseNoise(), GammaNoise(), GaussianNoise()])

@@ -44,6 +44,12 @@ def test_tasks_cover_the_plan_once(config):
     assert all(task.policies == entries for task in listed)
 
 
+@pytest.mark.parametrize(("seed", "scenes"), [(0, {0, 1}), (3, {300_000, 300_001})])
+def test_evaluations_of_two_seeds_share_no_scene(seed, scenes):
+    config = load_config(None, [f"seed={seed}", "evaluate.rounds=2"])
+    assert {task.seed for task in tasks(config, [])} == scenes
+
+
 def test_only_missing_rounds_are_left_to_do():
     (task,) = tasks(CONFIG, ROUNDS[1:])
     assert (task.seed, task.policies) == (0, (("heuristic", "open_loop", "none"),))
@@ -145,7 +151,7 @@ def no_second_scene(config, task):
     return known_round(config, task)
 
 
-def test_a_resumed_evaluation_plays_the_rest(tmp_path):
+def test_a_resumed_evaluation_plays_the_rest(tmp_path, played_here):
     config = one_worker()
     append_round(tmp_path / "rounds.jsonl", ROUNDS[2])
     outcome = play(config, tmp_path, known_round)
@@ -160,7 +166,7 @@ def filmed(config, task):
     return TaskResult(known_round(config, task).rounds, pictures, [film])
 
 
-def test_a_resumed_evaluation_shows_the_pictures_and_films_of_both_parts(tmp_path):
+def test_a_resumed_evaluation_shows_the_pictures_and_films_of_both_parts(tmp_path, played_here):
     play(one_worker("evaluate.rounds=1"), tmp_path, filmed)
     outcome = play(one_worker(), tmp_path, filmed)
     assert [item.caption for item in outcome.gallery] == ["scene 0", "scene 1"]
@@ -171,7 +177,9 @@ def test_a_resumed_evaluation_shows_the_pictures_and_films_of_both_parts(tmp_pat
     assert len(again.gallery) == len(again.films) == 2
 
 
-def test_what_a_killed_evaluation_shows_is_on_the_disk_before_its_rounds(tmp_path, monkeypatch):
+def test_what_a_killed_evaluation_shows_is_on_the_disk_before_its_rounds(
+    tmp_path, monkeypatch, played_here
+):
     """The films; and the pictures, here with every task."""
     monkeypatch.setattr(evaluation, "GALLERY_SECONDS", -1)
     there = []
@@ -181,7 +189,6 @@ def test_what_a_killed_evaluation_shows_is_on_the_disk_before_its_rounds(tmp_pat
 
     monkeypatch.setattr(evaluation, "append_round", append)
     monkeypatch.setattr(evaluation, "write_gallery", lambda *what: there.append(len(what[1])))
-    monkeypatch.setattr(evaluation, "open_executor", CallingExecutor)
     play(one_worker(), tmp_path, filmed)
     assert there == [(0, 1), (0, 1), 1, (1, 2), (1, 2), 2, 2]
 
@@ -193,7 +200,7 @@ def test_a_round_that_was_played_twice_is_refused(tmp_path):
         play(one_worker(), tmp_path, known_round)
 
 
-def test_two_processes_do_not_play_the_same_run(tmp_path):
+def test_two_processes_do_not_play_the_same_run(tmp_path, played_here):
     journal = tmp_path / "rounds.jsonl"
     with another_process_within(
         "from utils.result_records import writing", "writing(argument)", journal
@@ -210,7 +217,7 @@ def test_a_round_with_a_noise_that_the_config_does_not_play_is_refused(tmp_path)
         play(one_worker(), tmp_path, known_round)
 
 
-def test_a_scene_that_cannot_be_made_ends_the_run_but_not_the_results(tmp_path):
+def test_a_scene_that_cannot_be_made_ends_the_run_but_not_the_results(tmp_path, played_here):
     outcome = play(one_worker(), tmp_path, no_second_scene)
     assert "second scene" in str(outcome.error)
     assert outcome.rounds == [ROUNDS[0], ROUNDS[2]] == read_rounds(tmp_path / "rounds.jsonl")
@@ -237,7 +244,7 @@ def test_a_scene_that_no_process_survives_leaves_the_rounds_so_far(tmp_path, mon
     assert again.error is None and again.rounds == ROUNDS and len(read_rounds(journal)) == 4
 
 
-def test_a_sample_is_played_again():
+def test_a_sample_is_played_again(played_here):
     sample = Sample(None, {}, [], ROUNDS[:3])
     assert replay(sample, one_worker(), known_round) == ROUNDS[:3]
 
@@ -253,7 +260,7 @@ def test_what_leaves_a_round_of_a_sample_out_is_named(override, round_):
         replay(sample, one_worker(override), known_round, [override])
 
 
-def test_a_torn_journal_is_gone_on_with(tmp_path):
+def test_a_torn_journal_is_gone_on_with(tmp_path, played_here):
     append_round(tmp_path / "rounds.jsonl", ROUNDS[0])
     with (tmp_path / "rounds.jsonl").open("a") as journal:
         journal.write('{"policy": "heur')

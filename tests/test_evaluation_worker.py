@@ -7,6 +7,7 @@ import pytest
 from envs.cell import camera_intrinsics
 from envs.evaluation_worker import check_everything, film_name, privileged_policies, work
 from envs.views import check_sees_workspace
+from tests.helpers.records import ROUNDS
 from utils.config import Config, load_config, with_settings
 from utils.errors import UserError
 from utils.evaluation import Task
@@ -115,3 +116,18 @@ def test_a_picture_knows_its_scene_and_names_the_object_set_where_there_are_seve
 
     assert caption(("box",)) == "random, isolated, clean depth"
     assert caption(("box", "primitives")) == "random, isolated, box, clean depth"
+
+
+@pytest.mark.usefixtures("kept_here")
+def test_a_round_is_played_by_the_rules_of_the_config(config, monkeypatch):
+    rules = {"max_failures": 3, "second_look": 20.0, "abstain": 0.4}
+    received = []
+
+    def play(*arguments, **settings):
+        received.append({name: settings[name] for name in rules})
+        return ROUNDS[0]
+
+    monkeypatch.setattr("envs.evaluation_worker.run_round", play)
+    asked = with_settings(config, "evaluate", rules)
+    work(asked, Task("box", "isolated", 0, (("random", "open_loop", "none"),)))
+    assert received == [rules]

@@ -1,5 +1,7 @@
 """Grasps carried out by the whole arm, and how each failure is named."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,8 @@ from envs.arm_paths import line
 from envs.cell_layout import TRAY_CENTRE, TRAY_HALF_SIZE, Placement, Scene
 from envs.execution import (
     ApproachResult,
+    GraspFailure,
+    InHandMotion,
     WeighingGrip,
     close_fingers,
     execute_grasp,
@@ -19,6 +23,7 @@ from envs.object_primitives import NativeShape
 from envs.robot_kinematics import forward_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import needs_pybullet, pybullet
+from utils.config import with_settings
 from utils.transforms import Grasp
 
 
@@ -63,6 +68,49 @@ def test_the_hand_comes_down_straight_and_slowly_at_the_end(cell, box_set, monke
     settings = cell.config.execution
     assert settings.pregrasp_height == 0.12
     assert 0.9 * settings.approach_speed < speeds.max() < 1.01 * settings.approach_speed
+
+
+def test_what_is_lost_on_the_way_to_the_tray_was_dropped(cell, box_set, monkeypatch):
+    """The fingers open 10 cm beside the middle, over the lift height."""
+
+    def open_beside(cell):
+        if cell.object_position(0)[1] < -0.1:
+            cell.robot.command_gripper(0.08)
+
+    cell.load(cube_scene(box_set))
+    monkeypatch.setattr(cell, "on_step", open_beside)
+    outcome = execute_grasp(cell, cube_grasp())
+    assert (outcome.reason, outcome.object_index) == ("dropped", 0)
+
+
+def test_what_is_picked_is_held_as_long_as_is_asked(cell, box_set, monkeypatch):
+    """Up to the tray alone it takes less than a second."""
+    held = []
+
+    def note(cell):
+        if cell.is_lifted(0, 0.3):
+            held.append(cell.seconds)
+
+    asked = with_settings(cell.config, "execution", {"hold_seconds": 3.0})
+    monkeypatch.setattr(cell, "config", asked)
+    cell.load(cube_scene(box_set))
+    monkeypatch.setattr(cell, "on_step", note)
+    assert execute_grasp(cell, cube_grasp()).success
+    assert 3.0 <= held[-1] - held[0] < 3.5
+
+
+def test_what_a_failed_attempt_pushed_off_the_table_does_not_remain(cell, box_set):
+    (first,), (second,) = (cube_scene(box_set, (0.5, y, 0.03)).placements for y in (0.06, -0.06))
+
+    def push_off(cell, grasp):
+        below = cell.object_pose(1)
+        below[2, 3] = -0.5
+        cell.carry(1, below, np.zeros(3), 0.0)
+        raise GraspFailure("missed")
+
+    cell.load(Scene("packed", 0, (first, second)))
+    assert execute_grasp(cell, cube_grasp(), push_off).reason == "missed"
+    assert cell.remaining == {0}
 
 
 @pytest.mark.parametrize("turn", [-90, -30, 90, 150])
@@ -112,15 +160,18 @@ def test_failures_are_named(cell, box_set, grasp, reason):
     np.testing.assert_allclose(cell.robot.q, cell.home, atol=5e-3)
 
 
-def test_a_contact_stops_the_arm_on_its_way_to_the_pregrasp(cell, box_set):
+@pytest.mark.parametrize("limit", [10.0, 25.0])
+def test_a_contact_stops_the_arm_on_its_way_to_the_pregrasp(cell, box_set, monkeypatch, limit):
     """A column of 2.5 kg and 36 cm between home and the cube, which the hand would knock over."""
     shape = NativeShape("box", (0.05, 0.07, 0.36))
     column = native_object("column", shape, 2000.0, 0.7, (1.0, 0.0, 0.0, 1.0))
     standing = Placement(column, np.array([0.42, 0.0, 0.18]), np.array([0.0, 0.0, 0.0, 1.0]))
     cube = cube_scene(box_set, position=(0.5, -0.06, 0.03)).placements
+    stops = with_settings(cell.config, "execution", {"contact_stop": limit})
+    monkeypatch.setattr(cell, "config", stops)
     cell.load(Scene("isolated", 0, (*cube, standing)))
     outcome = execute_grasp(cell, cube_grasp(offset=(0.0, -0.06, 0.0)))
-    assert outcome.reason == "collision" and "allowed are 10.0 N" in outcome.detail
+    assert outcome.reason == "collision" and f"allowed are {limit} N" in outcome.detail
     assert outcome.sim_seconds < 1.5  # 0.5 s to the column, the rest back home
 
 
@@ -197,6 +248,24 @@ def test_a_frictionless_object_slips(cell, box_set):
             physicsClientId=cell.client,
         )  # fmt: skip
     assert execute_grasp(cell, cube_grasp()).reason == "slipped"
+
+
+def test_an_object_slides_along_the_fingertips_and_not_along_the_closing_line():
+    """By (3, 9, 4) mm in the hand's axes, the second of which is the closing line, and back again:
+    sqrt(3^2 + 4^2) = 5 mm."""
+    hand = forward_kinematics(np.array([0.3, 0.2, -0.4, -2.0, 0.5, 1.8, 0.6]))
+    there = np.eye(4)
+    there[:3, 3] = 0.003, 0.009, 0.004
+    moved = iter([np.eye(4), there, np.eye(4)])
+    cell = SimpleNamespace(
+        robot=SimpleNamespace(tip_pose=lambda: hand),
+        object_pose=lambda index: hand @ next(moved),
+    )
+    motion = InHandMotion(cell, 0)
+    for _ in range(2):
+        motion.look()
+    assert motion.slid == pytest.approx(0.005)
+    assert motion.turned == pytest.approx(0.0, abs=1e-7)
 
 
 class _FeltRobot:

@@ -17,6 +17,7 @@ from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell
 from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import INSTALLED, needs_pybullet
+from utils.config import with_settings
 from utils.transforms import Grasp
 
 G = 9.81
@@ -36,6 +37,16 @@ def test_the_fingers_press_as_hard_as_they_are_told(cell, box_set, force, thickn
     grip(cell, solid(box_set[0], plate, 0.1, 0.5), force)
     cell.step(120)
     assert cell.robot.grip_forces(cell.bodies[0]) == pytest.approx((force, force), rel=0.03)
+
+
+@pytest.mark.parametrize("simulator", INSTALLED)
+def test_a_hand_presses_as_hard_as_the_config_says(config, box_set, simulator):
+    asked = with_settings(config, "robot", {"grip_force": 20.0})
+    with make_cell(asked.model_copy(update={"simulator": simulator})) as cell:
+        cell.load(cube_scene(box_set))
+        close_fingers(cell, open_loop(cell, cube_grasp()).wait)
+        cell.step(120)
+        assert cell.robot.grip_forces(cell.bodies[0]) == pytest.approx((20.0, 20.0), rel=0.03)
 
 
 @pytest.mark.parametrize("friction", [0.4, 0.8])

@@ -267,12 +267,6 @@ def test_the_same_frame_gives_the_same_grasps_and_none_are_alike() -> None:
             assert apart >= 0.01 or between(grasp, other) >= np.deg2rad(20) - 1e-9
 
 
-def test_an_empty_table_has_no_grasp() -> None:
-    frame = boxes_frame([])
-    for name in ("heuristic6d", "oracle6d"):
-        assert make_planner(name, GripperGeometry(), Workspace(), 0)(frame) == []
-
-
 @pytest.mark.parametrize("name", ["oracle", "oracle6d"])
 def test_oracles_leave_out_what_lies_too_wide_for_the_hand(name):
     """A box of 9 x 12 cm, 4 cm high: its level faces are too far apart for a hand of 8 cm, and its

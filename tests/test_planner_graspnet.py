@@ -171,6 +171,13 @@ def test_a_network_that_sees_no_grasp_plans_none_without_a_search() -> None:
     assert plan(frame, FixedMaps(elsewhere=0.0, best=0.0), GraspNetDirectPlanner) == []
 
 
+def test_no_peak_farther_than_4_cm_beside_the_workspace_is_a_grasp() -> None:
+    """The shipped network sees both cubes; the second is 10 cm outside."""
+    cubes = [((0.05, 0.05, 0.05), 0.0, (0.5, y)) for y in (0.0, 0.25)]
+    found = GraspNetDirectPlanner(GripperGeometry(), Workspace())(boxes_frame(cubes, focal=200))
+    assert found and max(abs(grasp.position[1]) for grasp in found) < 0.19
+
+
 def test_a_network_that_sees_grasps_where_no_object_is_plans_none() -> None:
     """An empty table, to a network that sees a grasp in its middle."""
     middle = np.array([111.5, 111.5])

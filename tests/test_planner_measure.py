@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from models.fan_views import fan_views
 from models.planner_antipodal import search, search_once
-from models.planner_candidates import SearchSettings
+from models.planner_candidates import SearchSettings, grip_score
 from models.planner_measure import without_bumps
 from models.planners import make_planner
 from tests.helpers.box_frames import boxes_frame
@@ -30,6 +30,40 @@ from utils.height_map import (
 from utils.seen_heights import without_holes
 from utils.target import only_target
 from utils.transforms import RGBDFrame
+
+PERFECT = {
+    "wedge": 0.0, "turn": 0.0, "tilt": 0.0, "arms": (0.0, 0.0, 0.0), "cover": 1.0,
+    "engagement": 0.022, "roomy": 1.0, "covered": 0.0, "together": True, "over_table": 0.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changed", "score"),
+    [
+        ({}, 1.0),
+        ({"wedge": 0.25}, np.exp(-1)),
+        ({"turn": 0.25}, np.exp(-1)),
+        ({"tilt": 0.45}, np.exp(-1)),
+        ({"arms": (0.022, 0.0, 0.0)}, np.exp(-1)),
+        ({"arms": (0.0, 0.06, 0.0)}, np.exp(-1)),
+        ({"arms": (0.0, 0.0, 0.05)}, np.exp(-1)),
+        ({"cover": 0.0}, 0.4),
+        ({"engagement": 0.011}, 0.5),
+        ({"engagement": 0.0}, 0.2),
+        ({"engagement": 0.05}, 1.0),
+        ({"roomy": 0.4}, 0.4),
+        ({"covered": 0.25}, np.exp(-1)),
+        ({"together": False}, 0.5),
+        ({"over_table": 0.1}, 1.2),
+        ({"over_table": 0.3}, 1.3),
+    ],
+)
+def test_each_fact_of_a_grip_has_its_factor(changed: dict, score: float) -> None:
+    facts = {
+        name: tuple(map(np.array, value)) if name == "arms" else np.array(value)
+        for name, value in (PERFECT | changed).items()
+    }
+    assert grip_score(np, SearchSettings(), **facts) == pytest.approx(score)
 
 
 @given(st.floats(0.007, 0.03), st.floats(0.0001, 0.006), st.floats(0.3, 0.9))

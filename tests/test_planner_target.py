@@ -10,15 +10,12 @@ import pytest
 from models.planner_candidates import with_chances
 from models.planner_target import TargetPlanner
 from models.planners import HeuristicPlanner, make_planner
-from tests.helpers.box_frames import boxes_frame
+from tests.helpers.box_frames import FLAT, TALL, boxes_frame
 from utils.calibration import Calibration
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.transforms import Grasp, RGBDFrame
 
-# A flat box between two walls of boxes: no finger fits beside it, whose long side is too wide.
-FLAT = ((0.03, 0.09, 0.03), 0.0, (0.5, 0.0))
-TALL = [((0.03, 0.09, 0.06), 0.0, (0.5 + side * 0.035, 0.0)) for side in (-1, 1)]
 FAR = ((0.04, 0.06, 0.05), 0.0, (0.5, 0.11))
 
 

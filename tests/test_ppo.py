@@ -120,6 +120,17 @@ def test_what_an_update_learns_from():
     assert first.approx_kl.item() == 0 and first.clip_fraction.item() == 0  # the ratio is 1
 
 
+def test_the_first_step_down_a_gradient_as_small_as_adams_epsilon_is_half_the_rate():
+    """lr g / (g + epsilon): both moments, corrected, are g and g^2. Details, number 3."""
+    ppo = ppo_of("rl.lr=1e-3")
+    before = ppo.weights.detach().clone()
+    ppo.weights.grad = torch.full_like(ppo.weights, 1e-5)
+    ppo.optimizer.step()
+    torch.testing.assert_close(
+        before - ppo.weights.detach(), torch.full_like(before, 5e-4), rtol=1e-3, atol=0
+    )
+
+
 @pytest.mark.parametrize(
     ("clip", "value", "entropy_coef", "largest"), [(0.2, 0.5, 0.02, 0.5), (0.1, 0.25, 0.01, 0.2)]
 )

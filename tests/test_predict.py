@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from envs.cell import Intrinsics
 from envs.studio import write_rgbd
 from models.graspnet import GraspNet
 from models.graspnet_io import save_graspnet
-from models.planners import make_planner
+from models.planners import HeuristicPlanner, make_planner
+from tests.helpers.box_frames import FLAT, TALL, boxes_frame
 from tests.helpers.hand_made import (
     CUBES,
     OVERHEAD,
@@ -31,7 +33,7 @@ from tests.helpers.hand_made import (
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.image_overlay import grasp_picture, is_grasp_picture
-from utils.transforms import RGBDFrame, look_at, project, transform_points
+from utils.transforms import Grasp, RGBDFrame, look_at, project, transform_points
 
 PICTURE = predict.grasp_picture
 
@@ -221,6 +223,31 @@ def test_grasp_that_one(how, number, files, capsys):
     assert found["grasps"] and found["clearing"] == []  # the other cube is 17 cm away
     for grasp in found["grasps"]:
         assert np.hypot(*(in_world(grasp)[:2] - xy)) < 0.03
+
+
+def test_what_is_in_the_way_of_a_marked_object_can_be_cleared(tmp_path, checkpoint, capsys):
+    """A flat box between two higher ones, beside which no finger fits."""
+    files = UserFiles(tmp_path, boxes_frame([FLAT, *TALL]), checkpoint)
+    found = files.run(capsys, checkpoint=None, planner="heuristic", point=[111.5, 111.5])
+    assert found["clearing"]
+    for grasp in found["clearing"]:
+        x, y, _ = grasp["world"]["position"]
+        assert abs(abs(x - 0.5) - 0.035) < 0.01 and abs(y) < 0.05
+
+
+def test_grasps_that_rather_fail_are_remarked_on(files, capsys, monkeypatch):
+    cube = Grasp(np.array([*list(CUBES)[0], 0.03]), 0.3, 0.08, 1.0)
+    two = [replace(cube, quality=chance) for chance in (0.9, 0.4)]
+    monkeypatch.setattr(HeuristicPlanner, "__call__", lambda self, frame: two)
+    found = files.run(capsys, checkpoint=None, planner="heuristic")
+    (remark,) = found["remarks"]
+    assert remark.startswith("1 of the 2 grasps has a chance under 0.5")
+
+
+def test_a_planner_returns_as_many_grasps_as_are_asked_for(files):
+    command = files.command(checkpoint=None, planner="heuristic", count=33)
+    planner = predict.new_planner(predict.parse_options(command), None, Workspace())
+    assert planner.settings.returned == 33
 
 
 def test_a_planner_without_a_network_reads_none(files, capsys, monkeypatch):

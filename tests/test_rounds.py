@@ -1,5 +1,6 @@
 """A round: when it ends, which grasps are tried, and planners that fail."""
 
+import contextlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,7 +9,8 @@ import pytest
 
 from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
-from envs.execution import GraspOutcome
+from envs.closed_loop import ClosedLoop
+from envs.execution import GraspFailure, GraspOutcome
 from envs.next_grasp import (
     ROOM_OVER_TOUCH,
     Failures,
@@ -22,7 +24,9 @@ from envs.rounds import run_round
 from models.planners import make_planner
 from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.calibration import Calibration
+from utils.config import with_settings
 from utils.geometry import GripperGeometry, Workspace
+from utils.random_streams import Stream
 from utils.result_formats import format_table
 from utils.results import summarise
 from utils.transforms import Grasp
@@ -325,6 +329,89 @@ def test_physics_that_blows_up_on_the_way_ends_the_round(cell, box_set, monkeypa
     record = run_round(cell, cube_scene(box_set), plan, max_failures=2, **settings)
     assert record.ended == "physics"
     assert [attempt.reason for attempt in record.attempts] == ["physics"]
+
+
+def test_a_miscalibrated_round_plans_with_the_wrong_camera_pose(cell, box_set):
+    """A centimetre off, in a direction of the scene's seed; levelling mends the height alone."""
+    plan = Targeted([])
+    scene = replace(cube_scene(box_set), seed=7)
+    run_round(cell, scene, plan, policy="x", objects="b", max_failures=2, scenario="miscalibrated")
+    (frame,) = plan.frames
+    shift, _ = np.random.default_rng([7, 0, Stream.MOTION]).normal(size=(2, 3))
+    off = 0.01 * shift / np.linalg.norm(shift)
+    np.testing.assert_allclose(frame.T_WC[:2, 3], np.array([0.5, 0.0]) + off[:2], atol=1e-9)
+    assert frame.T_WC[2, 3] == pytest.approx(0.8, abs=0.001)
+
+
+class StoppedAtOnce(ClosedLoop):
+    """A closed loop that keeps its latency and ends every attempt."""
+
+    latencies = []
+
+    def __init__(self, *arguments):
+        self.latencies.append(arguments[-1])
+        super().__init__(*arguments)
+
+    def __call__(self, cell, grasp):
+        raise GraspFailure("lost")
+
+
+def test_a_late_image_is_later_by_the_time_that_it_takes_to_process(cell, box_set, monkeypatch):
+    """0.1 s of the scenario and 0.02 s of the config."""
+    slow = with_settings(cell.config, "closed_loop", {"compute_seconds": 0.02})
+    monkeypatch.setattr(cell, "config", slow)
+    monkeypatch.setattr("envs.rounds.ClosedLoop", StoppedAtOnce)
+    monkeypatch.setattr(StoppedAtOnce, "latencies", [])
+    settings = {"policy": "x", "objects": "b", "max_failures": 1, "controller": "ibvs"}
+    for scenario in ("latency", "static"):
+        run_round(
+            cell, cube_scene(box_set), planner_of([cube_grasp()]), scenario=scenario, **settings
+        )
+    assert StoppedAtOnce.latencies == pytest.approx([0.12, 0.02])
+
+
+def test_every_attempt_has_a_motion_of_its_own(cell, box_set, monkeypatch):
+    """A conveyor's heading is drawn anew: up to 30 degrees from +y towards the middle, which lies
+    towards +x here."""
+    headings = []
+
+    def note(cell, motion):
+        headings.append(motion.heading)
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr("envs.rounds.disturbed", note)
+    scene = replace(cube_scene(box_set, (0.45, 0.0, 0.03)), seed=7)
+    miss = cube_grasp(offset=(0.13, 0, 0))
+    run_round(
+        cell, scene, planner_of([miss]), policy="x", objects="b", max_failures=2,
+        scenario="moving_5cm",
+    )  # fmt: skip
+    expected = [
+        np.pi / 2 - np.random.default_rng([7, attempt, Stream.MOTION]).uniform(0, np.pi / 6)
+        for attempt in (1, 2)
+    ]
+    assert headings == pytest.approx(expected)
+    assert abs(expected[1] - expected[0]) > 0.01
+
+
+def test_a_record_names_what_was_held_and_how_far_the_hand_leaned(cell, box_set):
+    """The second of two cubes, gripped 40 degrees from straight above."""
+    other = replace(box_set[0], name="other")
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    placements = (
+        Placement(box_set[0], np.array([0.5, 0.12, 0.03]), level),
+        Placement(other, np.array([0.5, 0.0, 0.03]), level),
+    )
+    tilt = np.deg2rad(40)
+    approach = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    grasp = Grasp(np.array([0.5, 0.0, 0.038]), np.pi / 2, 0.08, 1.0, approach)
+    record = run_round(
+        cell, Scene("packed", 0, placements), planner_of([grasp]), policy="x", objects="b",
+        max_failures=1,
+    )  # fmt: skip
+    first = record.attempts[0]
+    assert (first.success, first.held) == (True, "other")
+    assert first.tilt == pytest.approx(0.6981, abs=1e-4)  # radians
 
 
 class Planner:

@@ -33,7 +33,7 @@ from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import HeightMap
 from utils.next_view import OpenSpace
-from utils.transforms import top_down_pose
+from utils.transforms import Grasp, RGBDFrame, top_down_pose
 
 AZIMUTH = 60.0  # degrees, of the first camera: clear of the arm
 
@@ -175,6 +175,18 @@ class Watcher:
         return []
 
 
+def assert_shows_table_and_first_cube(frame: RGBDFrame, cell) -> None:
+    """The table at z = 0, and over 1 cm nothing near the first cube but that cube: its half
+    diagonal and 6 mm."""
+    points = frame.points()
+    near = np.abs(points[..., :2] - (0.5, 0.0)).max(axis=-1) < 0.15
+    low = near & (points[..., 2] < 0.01)
+    assert low.sum() > 1000 and abs(np.median(points[low, 2])) < 0.002
+    away = points - cell.object_position(0)
+    on = (points[..., 2] > 0.01) & (np.linalg.norm(away[..., :2], axis=-1) < 0.07)
+    assert on.sum() > 200 and (np.abs(away[on]) < 0.03 * np.sqrt(2) + 0.006).all()
+
+
 @pytest.mark.parametrize("needs_truth", [False, True])
 def test_a_round_takes_second_frames_for_planners_that_see_no_truth(
     cell, box_set, needs_truth
@@ -188,6 +200,7 @@ def test_a_round_takes_second_frames_for_planners_that_see_no_truth(
     assert (frame.second is None) == needs_truth
     if not needs_truth:
         assert frame.second.segmentation is None
+        assert_shows_table_and_first_cube(frame.second, cell)
     assert (record.attempts[0].sim_seconds > 0.5) == (not needs_truth)
 
 
@@ -218,6 +231,24 @@ def test_a_look_counts_whatever_the_planner_makes_of_it(
     assert with_look.reason == without.reason == reason
     assert with_look.sim_seconds > 0.5 and without.sim_seconds == 0.0
     assert (with_look.plan_seconds, without.plan_seconds) == pytest.approx((0.32, 0.02))
+
+
+def test_a_look_adds_its_time_to_that_of_an_executed_attempt(cell, box_set) -> None:
+    """The same grasp with a look before it and without differs by what the look alone takes, but
+    for two of the checks, 0.05 s apart, in which the fingers come to rest."""
+    scene = two_cubes(box_set)
+    grasp = Grasp(np.array([0.45, 0.04, 0.03]), 0.0, 0.08, 1.0)
+    settings = {"policy": "w", "objects": "box", "max_failures": 1}
+    with_look, without = (
+        run_round(cell, scene, lambda frame: [grasp], second_look=cm3, **settings).attempts[0]
+        for cm3 in (20.0, 0.0)
+    )
+    cell.load(scene)
+    look = SecondLook(cell, 20 * CM3, lambda frame: frame)
+    look(cell.frame)
+    assert look.sim_seconds > 0.5
+    more = with_look.sim_seconds - without.sim_seconds
+    assert more == pytest.approx(look.sim_seconds, abs=0.1)
 
 
 # --- What stands in the arm's way -------------------------------------------------------------

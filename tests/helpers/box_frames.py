@@ -13,6 +13,9 @@ CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 K = np.array([[390.6, 0, 111.5], [0, 390.6, 111.5], [0, 0, 1.0]])  # 224 px, 32 degrees
 T_WC = look_at((0.5, 0, 0.8), (0.5, 0, 0), up=(1, 0, 0))
 BOX = ((0.06, 0.08, 0.10), 0.0, (0.5, 0.0))  # size, yaw, place as of `boxes_frame`
+# A flat box between two walls of boxes: no finger fits beside it, whose long side is too wide.
+FLAT = ((0.03, 0.09, 0.03), 0.0, (0.5, 0.0))
+TALL = [((0.03, 0.09, 0.06), 0.0, (0.5 + side * 0.035, 0.0)) for side in (-1, 1)]
 MIDDLE = np.array([0.5, 0.0, 0.0])  # of the workspace, in W
 
 
