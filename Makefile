@@ -94,7 +94,7 @@ soak: $(VENV)/.installed-dev
 	status=$$?; $(BIN)/python -m benchmarks.results --write && exit $$status
 
 $(VENV)/bin/python:
-	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }; }
+	@$(PYTHON) -c "$(CHECK_PYTHON)" && { $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); exit 1; }; }
 
 # The pip of Python 3.10.13 tries versions for more than ten minutes; the newest one does not.
 # Without compiling all of torch to bytecode, pip needs half the time.

@@ -159,14 +159,14 @@ def rounds_of(run: Path, output: Path | None) -> list[RoundRecord]:
             f"{run}: not all grasps may have been tried; play it with evaluate.abstain=0, or omit "
             "--output"
         )
-    # Planners of a user's own may have a hand of their own.
-    ours = any(policy in PLANNERS for policy in config.evaluate.policies)
+    # Planners of a user's own may have an arm and a hand of their own.
+    ours = any(name in PLANNERS and states_chances(name) for name in config.evaluate.policies)
     for other, key, value in (
         (config.robot.arm == "none", "robot.arm", "panda"),
         (config.evaluate.randomise, "evaluate.randomise", "false"),
-        (ours and config.gripper != load_config().gripper, "the section gripper", "the default"),
+        (config.gripper != load_config().gripper, "the section gripper", "the default"),
     ):
-        if output is not None and other:
+        if output is not None and ours and other:
             raise UserError(
                 f"{run}: planners state the chances of the nominal cell's arm and hand, and {key} "
                 f"is not {value}: play it with that, or omit --output"

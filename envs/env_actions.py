@@ -254,8 +254,9 @@ def pretraining_state(
     max_opening: float,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, float, float]:
-    """A state that an episode may lead to, from high above an object to right around a grasp:
-    (4, 4) T_WE, the opening and the commanded opening in metres.
+    """A state that an episode may lead to, from high above an object, and above what
+    stands beside it, to right around a grasp: (4, 4) T_WE, the opening and the commanded opening in
+    metres.
 
     Arguments as of `near_pose`; goal: a grasp of the object, None for no states on the way down.
     max_opening: m, of the hand.

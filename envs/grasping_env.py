@@ -41,6 +41,7 @@ from envs.studio import Studio
 from utils.config import Config, load_config, with_settings
 from utils.config_schema import ObjectsConfig
 from utils.errors import UserError
+from utils.plugins import is_import_path
 from utils.runs import run_script
 
 _STATES_PER_SCENE = 16  # of pretraining: a state is quicker to reach than a scene is to make
@@ -130,9 +131,9 @@ class RobotGraspingEnv(gymnasium.Env):
 
     **Options of reset**: `scene_seed` asks for one scene. `start` says where the hand begins:
     "home"; "near" an object, up to 4 cm beside it in x and in y, and 1 to 10 cm over the highest
-    thing in the scene, easier; or "pretraining", in any state that an episode may lead to, to train
-    a state estimator: without a seed up to 16 such states in a row are at the same scene. Without
-    `start` a share `near_share` of the episodes begins near. The attribute `start` is the option
+    thing in the scene, easier; or "pretraining", to train a state estimator: in any state
+    that an episode of a single object may lead to, and otherwise over the highest thing; without a
+    seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share` of the episodes begins near. The attribute `start` is the option
     that begins there again.
     """
 
@@ -164,6 +165,10 @@ class RobotGraspingEnv(gymnasium.Env):
             "render_fps": round(self.config.sim.frequency / self.settings.substeps)
         }
         names = observed_names(self.config, by_name="observations" in settings)
+        self._hold_steps = self.settings.hold_steps(self.config.sim.frequency)
+        # A borrowed cell is a judge's, and a reward of a user's own may need no success.
+        if cell is None and not is_import_path(str(self.settings.reward)):
+            self._check_time_to_hold()
         # Names and plug-ins are checked before a simulator starts.
         self._reward = make_reward(self.settings.reward)
         check_object_set(self.settings.objects, "env.objects")
@@ -191,7 +196,6 @@ class RobotGraspingEnv(gymnasium.Env):
         self.observation_space = self._seen.space
         size = len(entries)
         self.action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
-        self._hold_steps = self.settings.hold_steps(self.config.sim.frequency)
         self._actions = ActionDecoder(self.config)
 
     def reset(
@@ -351,6 +355,16 @@ class RobotGraspingEnv(gymnasium.Env):
         if self.cell.scene is None:
             raise ResetNeeded("get_gripper_width() needs a robot: call reset() first")
         return self.cell.robot.opening
+
+    def _check_time_to_hold(self) -> None:
+        settings = self.settings
+        if self._hold_steps > settings.max_steps:
+            raise UserError(
+                f"env.max_steps ({settings.max_steps}) ends every episode before an object can be "
+                f"held for env.hold_seconds ({settings.hold_seconds:g}), which takes "
+                f"{self._hold_steps} actions; set a larger env.max_steps or a smaller "
+                "env.hold_seconds"
+            )
 
     # --- Action -----------------------------------------------------------------------------
 

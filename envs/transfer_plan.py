@@ -107,7 +107,6 @@ IGNORED = {
     "simulator": "transfer.columns says in which simulators rows are scored",
     "evaluate.policies": "transfer.policies says which planners are scored",
     "evaluate.randomise": "transfer.columns says where scenes are changed, as in outside",
-    "evaluate.gallery": "the report has no page with pictures",
 }
 
 

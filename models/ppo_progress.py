@@ -7,6 +7,7 @@ history is the list of all rows. This module makes no environment and no network
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from threading import Event
@@ -28,7 +29,6 @@ from models.ppo_rollouts import (
 )
 from utils.checkpoint import reading
 from utils.config_schema import Config, RLConfig
-from utils.errors import UserError
 from utils.runs import Stopwatch, resume_command, save_results, this_python
 
 ProgressRow = dict[str, Any]
@@ -114,15 +114,16 @@ def best_of(history: list[ProgressRow]) -> ProgressRow:
 
 
 def reached(settings: RLConfig, row: ProgressRow) -> bool:
-    """Whether an evaluation meets one of the targets of the config's section `rl`. Raises UserError
-    for a target that the environment does not report."""
+    """Whether an evaluation meets one of the targets of the config's section `rl`. Warns of one
+    that the environment has not reported."""
     success, total = settings.target_success, settings.target_return
     if success is not None and "success" not in row:
-        raise UserError(
-            f"rl.target_success={success:g}: {settings.env_id} reports no is_success in its info; "
-            "set rl.target_success=null, and rl.target_return for a target"
+        warnings.warn(
+            f"rl.target_success={success:g}: no episode of this evaluation of {settings.env_id} "
+            "reported is_success; rl.target_return is a target for any environment",
+            stacklevel=2,
         )
-    return (success is not None and row["success"] >= success) or (
+    return (success is not None and row.get("success", 0.0) >= success) or (
         total is not None and row["return"] >= total
     )
 

@@ -74,4 +74,5 @@ def test_make_installs_again_where_the_python_of_its_environment_is_gone(tmp_pat
     told = subprocess.run(
         ["make", "-n", "run"], cwd=tmp_path, env=environment, capture_output=True, text=True
     ).stdout
-    assert "-m venv .venv" in told and "pip install --no-compile -r requirements.txt" in told
+    assert "-m venv --clear .venv" in told
+    assert "pip install --no-compile -r requirements.txt" in told

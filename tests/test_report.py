@@ -244,9 +244,9 @@ def test_folders_of_one_last_name_are_told_apart():
 
 
 def test_a_run_that_went_on_at_another_commit_names_both_on_its_page(tmp_path):
-    assert "finished at" not in report(tmp_path)
+    assert "written at" not in report(tmp_path)
     (tmp_path / "environment.json").write_text('{"commit": "aaaa", "dirty": false}')
-    assert re.search(r"<dt>commit</dt><dd>aaaa.*; finished at ", report(tmp_path))
+    assert re.search(r"<dt>commit</dt><dd>aaaa.*; written at ", report(tmp_path))
 
 
 def test_flipped_bytes_of_kept_pictures_are_one_sentence(tmp_path):

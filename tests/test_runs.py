@@ -195,7 +195,7 @@ def test_results_tell_where_they_come_from(tmp_path):
     save_results(tmp_path / "results.json", {"best": 0.5}, None)
     content = json.loads((tmp_path / "results.json").read_text())
     assert content["best"] == 0.5 and content["commit"] == git_state().commit
-    assert content["versions"]["numpy"] == np.__version__ and "finished_at" not in content
+    assert content["versions"]["numpy"] == np.__version__ and "written_at" not in content
 
 
 def test_results_of_a_run_that_went_on_at_another_commit_name_both(tmp_path, monkeypatch):
@@ -206,7 +206,7 @@ def test_results_of_a_run_that_went_on_at_another_commit_name_both(tmp_path, mon
     monkeypatch.setattr("utils.runs.git_state", lambda: GitState(40 * "b", False))
     save_results(tmp_path / "copy.json", {}, run)
     content = json.loads((tmp_path / "copy.json").read_text())
-    assert (content["commit"], content["finished_at"]) == (40 * "a", 40 * "b")
+    assert (content["commit"], content["written_at"]) == (40 * "a", 40 * "b")
     assert content["versions"]["numpy"] == "0.1"
 
 

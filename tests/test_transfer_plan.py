@@ -195,7 +195,7 @@ def judgement(right):
 
 @pytest.mark.parametrize(
     "override",
-    ["simulator=mujoco", "evaluate.randomise=true", "evaluate.gallery=3", "transfer.cornell=c"],
+    ["simulator=mujoco", "evaluate.randomise=true", "transfer.cornell=c"],
 )
 def test_a_key_that_the_report_would_ignore_is_refused(override):
     overrides = ["transfer.columns=pybullet", override]

@@ -191,7 +191,7 @@ def resumption(run: Path, files: Mapping[str, Path | None]) -> str:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Words as a line that this system's shell takes apart again."""
+    """Words as a line for this system's shell; on Windows for cmd.exe, without & | < > ^."""
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
 
 

@@ -512,17 +512,6 @@ class Config(Section):
                 )
         return self
 
-    @model_validator(mode="after")
-    def _time_to_hold_the_object(self) -> Config:
-        held = self.env.hold_steps(self.sim.frequency)
-        if held > self.env.max_steps:
-            raise ValueError(
-                f"env.max_steps ({self.env.max_steps}) ends every episode before an object can be "
-                f"held for env.hold_seconds ({self.env.hold_seconds:g}), which takes {held} "
-                "actions; set a larger env.max_steps or a smaller env.hold_seconds"
-            )
-        return self
-
     @property
     def cache_folder(self) -> Path:
         """`cache_dir`, else $ROBOT_GRASPING_CACHE, else ~/.cache/robot_grasping. May not exist.

@@ -324,7 +324,9 @@ class Sample:
 
 def versions_of(facts: Mapping[str, Any]) -> dict[str, str | None]:
     """What may change a round, of the facts of `utils.runs.environment`."""
-    return {name: facts.get(name) for name in ("processor", "python")} | facts["packages"]
+    # Runs of older versions do not tell their processor.
+    known = {name: facts[name] for name in ("processor", "python") if facts.get(name)}
+    return known | facts["packages"]
 
 
 def write_sample(run: Path, path: Path, count: int = 10, commit: str | None = None) -> None:

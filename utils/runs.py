@@ -434,12 +434,12 @@ def save_results(path: Path, content: Mapping[str, Any], run: Path | None) -> No
 
 def origin_of(run: Path | None) -> dict[str, Any]:
     """The commit, whether code was changed since then, and the versions of Python and of the
-    packages, with which a run began; `finished_at`, the present commit, where that is another."""
+    packages, with which a run began; `written_at`, the present commit, where that is another."""
     now = environment()
     begun = now if run is None else now | begun_with(run)
     origin = {"commit": begun["commit"], "dirty": begun["dirty"] or now["dirty"]}
     if now["commit"] not in (None, begun["commit"]):
-        origin["finished_at"] = now["commit"]
+        origin["written_at"] = now["commit"]
     return origin | {"versions": {"python": begun["python"], **begun["packages"]}}
 
 

@@ -29,7 +29,8 @@ class ServoHistory:
 
     poses: (k, 4, 4) T_CO of the object in the camera; NaN where it is unknown.
     goal_pose: (4, 4) desired T_CO; NaN where the goal has none.
-    points: (k, n, 2) pixels, or (k, 0, 2) where the views hold poses only. goal_points: (n, 2).
+    points: (k, n, 2) pixels, or (k, 0, 2) where the views hold poses only, or differ in how many
+        points they hold. goal_points: (n, 2).
     errors: (k, m), in the law's own units. velocities: (k, 6) commanded v_C, m/s and rad/s.
     condition_numbers: (k,). gains: (k,) 1/s. dt: seconds between images.
     converged: whether the error's norm came under the tolerance. reason: why the run ended.
@@ -136,7 +137,7 @@ class ServoHistory:
     def _plot_path(self, axes) -> None:
         axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="camera, object at 0")
         T = self.camera_poses
-        if not np.isfinite(T).all():
+        if not len(T) or not np.isfinite(T).all():
             axes.set_title("camera path unknown: no poses")
             return
         positions = T[:, :3, 3]
