@@ -197,7 +197,7 @@ def report_replay(file: Path, overrides: Sequence[str]) -> int:
         print(f"ends otherwise: {record.policy}, {record.scenario}, scene {record.seed}")
     same = len(sample.rounds) - len(different)
     alike = len(different) - len(otherwise)
-    print(f"{same} of {len(sample.rounds)} rounds are the same, {alike} more end alike")
+    print(f"{same} of {len(sample.rounds)} rounds are the same, {alike} others end alike")
     if different:
         why = "another processor, changed code or a KEY=VALUE given here plays other rounds"
         print(f"{why}: `git checkout {sample.commit}` has their code")

@@ -162,7 +162,7 @@ def test_published_rounds_are_played_again(finished, tmp_path, monkeypatch, caps
     assert "the rounds were played with 1.0" in printed and "python is" not in printed
     assert "here, the rounds were played with another one" in printed
     assert "ends otherwise: heuristic, isolated, scene 0" in printed
-    assert "0 of 2 rounds are the same, 1 more end alike" in printed
+    assert "0 of 2 rounds are the same, 1 others end alike" in printed
     assert f"git checkout {origin['commit']}" in printed
 
 
