@@ -131,10 +131,10 @@ class RobotGraspingEnv(gymnasium.Env):
 
     **Options of reset**: `scene_seed` asks for one scene. `start` says where the hand begins:
     "home"; "near" an object, up to 4 cm beside it in x and in y, and 1 to 10 cm over the highest
-    thing in the scene, easier; or "pretraining", to train a state estimator: in any state
-    that an episode of a single object may lead to, and otherwise over the highest thing; without a
-    seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share` of the episodes begins near. The attribute `start` is the option
-    that begins there again.
+    thing in the scene, easier; or "pretraining", to train a state estimator: in any state that an
+    episode of a single object may lead to, and in other scenes over the highest thing. Without a
+    seed up to 16 such states in a row are at the same scene. Without `start` a share `near_share`
+    of the episodes begins near. The attribute `start` is the option that begins there again.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 12}
