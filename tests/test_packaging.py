@@ -70,9 +70,16 @@ def test_make_installs_again_where_the_python_of_its_environment_is_gone(tmp_pat
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / ".venv" / "bin" / "python").symlink_to(tmp_path / "gone")
     (tmp_path / ".venv" / ".installed").touch()
-    environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
-    told = subprocess.run(
+    # A make above this test, as in `make LOCKED=1 test`, hands its flags and variables down.
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if "MAKE" not in name and name not in ("LOCKED", "PYTHON", "ARGS")
+    }
+    done = subprocess.run(
         ["make", "-n", "run"], cwd=tmp_path, env=environment, capture_output=True, text=True
-    ).stdout
+    )
+    assert done.returncode == 0, done.stderr
+    told = done.stdout
     assert "-m venv --clear .venv" in told
     assert "pip install --no-compile -r requirements.txt" in told
