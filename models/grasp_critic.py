@@ -25,6 +25,7 @@ from torch import nn
 from models.planner_candidates import FACTS, Candidates
 from models.planner_measure import cells_around
 from utils.checkpoint import build_model, load_checkpoint
+from utils.compiled import compiled
 from utils.height_map import HeightMap
 
 SHIPPED = Path(__file__).resolve().parent.parent / "checkpoints" / "critic.pt"
@@ -145,15 +146,28 @@ def critic_inputs(
     facts = [*view, found.facts, *object_size(found, heights), np.full(count, least_held)]
     u, v = (STEP * (np.arange(cells) - (cells - 1) / 2) for cells in (ALONG, ACROSS))
     where = cells_around(found.xy, along, across, u, v, heights)
-    tips = found.tip[:, None, None]
-    layers = [
-        np.rint(np.clip(surface.take(where) - tips, -MOST, MOST) / UNIT)
-        for surface in (heights.height, heights.ceiling)
-    ]
-    layers.append(heights.label.take(where) == found.label[:, None, None])
-    return CriticInputs(
-        np.column_stack(facts).astype(np.float32), np.stack(layers, axis=1).astype(np.int8)
-    )
+    surfaces = (np.ascontiguousarray(part).ravel() for part in (heights.height, heights.ceiling))
+    label = np.ascontiguousarray(heights.label).ravel()
+    patches = _patches(where, found.tip, found.label, *surfaces, label)
+    return CriticInputs(np.column_stack(facts).astype(np.float32), patches)
+
+
+@compiled
+def _patches(where, tip, own, height, ceiling, label):
+    """(N, 3, V, U) int8 as of `CriticInputs`, of the flat cells `where` (N, V, U) of a map. tip,
+    own: (N,) of the candidates."""
+    count, lines, places = where.shape
+    patches = np.empty((count, _LAYERS, lines, places), np.int8)
+    for i in range(count):
+        for line in range(lines):
+            for k in range(places):
+                cell = where[i, line, k]
+                rise = min(max(height[cell] - tip[i], -MOST), MOST)
+                patches[i, 0, line, k] = int(np.rint(rise / UNIT))
+                rise = min(max(ceiling[cell] - tip[i], -MOST), MOST)
+                patches[i, 1, line, k] = int(np.rint(rise / UNIT))
+                patches[i, 2, line, k] = label[cell] == own[i]
+    return patches
 
 
 def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:

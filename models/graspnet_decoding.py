@@ -99,10 +99,7 @@ def find_peaks(
     the highest pixel of its window (max-pool non-maximum suppression); of equal pixels the first.
     """
     shape = quality.shape[-2:]
-    score = quality.detach().reshape(shape).float().cpu().numpy()
-    if settings.blur > 0:
-        score = cv2.GaussianBlur(score, (0, 0), settings.blur)
-    row, column = local_maxima(score, settings.radius, settings.threshold, settings.count)
+    score, row, column = _peak_pixels(quality, settings)
     at = (..., torch.from_numpy(row), torch.from_numpy(column))
     probability = angle.detach().reshape(-1, *shape)[at].float().softmax(dim=0).cpu().numpy()
     return Peaks(
@@ -111,6 +108,22 @@ def find_peaks(
         width.detach().reshape(shape)[at].float().cpu().numpy(),
         score[row, column],
     )
+
+
+def peak_places(quality: torch.Tensor, settings: PeakSettings = PeakSettings()) -> np.ndarray:
+    """(N, 2) the pixels (u, v), not rounded, of the peaks that `find_peaks` finds."""
+    score, row, column = _peak_pixels(quality, settings)
+    return np.stack([column, row], axis=-1) + _subpixel(score, row, column)
+
+
+def _peak_pixels(
+    quality: torch.Tensor, settings: PeakSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The blurred quality (H, W), and rows and columns (N,) of its peaks, the highest first."""
+    score = quality.detach().reshape(quality.shape[-2:]).float().cpu().numpy()
+    if settings.blur > 0:
+        score = cv2.GaussianBlur(score, (0, 0), settings.blur)
+    return score, *local_maxima(score, settings.radius, settings.threshold, settings.count)
 
 
 def _subpixel(score: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:

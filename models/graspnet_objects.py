@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from utils.compiled import compiled
 from utils.depth_holes import nearest_values
 from utils.height_map import HeightMap, base_heights, local_maxima
 from utils.images import PixelScaling
@@ -67,10 +68,8 @@ def labelled_by_centres(
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
     if len(centres) == 0:
         return heights
-    du, dv = (votes[:, k, None] - centres[:, k] for k in (0, 1))
-    miss = np.sqrt(du * du + dv * dv)
-    count, owner = len(centres), miss.argmin(axis=1)
-    owner = np.where(miss.min(axis=1) < settings.reach, owner, count + heights.label[row, column])
+    count, owner = len(centres), _nearest(votes, centres, settings.reach)
+    owner = np.where(owner >= 0, owner, count + heights.label[row, column])
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
     if behind.any():
@@ -88,6 +87,21 @@ def labelled_by_centres(
     share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
     found = eye + share[:, None] * (ahead - eye)
     return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
+
+
+@compiled
+def _nearest(votes, centres, reach):
+    """(N,) which of the centres (M, 2) each vote (N, 2) is nearest to, -1 where none is nearer than
+    `reach`."""
+    owner = np.full(len(votes), -1)
+    for i in range(len(votes)):
+        least = reach
+        for k in range(len(centres)):
+            du, dv = votes[i, 0] - centres[k, 0], votes[i, 1] - centres[k, 1]
+            miss = np.sqrt(du * du + dv * dv)
+            if miss < least:
+                least, owner[i] = miss, k
+    return owner
 
 
 def _as_beside(

@@ -16,7 +16,7 @@ import torch
 
 from models.fan_candidates import FanCandidates
 from models.fan_views import FanViews
-from models.graspnet_decoding import PeakSettings, find_peaks, surface_depth
+from models.graspnet_decoding import PeakSettings, peak_places, surface_depth
 from models.graspnet_inference import run_network, training_scale
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_objects import labelled_by_centres
@@ -84,9 +84,8 @@ class NetworkView:
 
     def peaks(self, settings: PeakSettings) -> np.ndarray:
         """(N, 3) points in W of the surface at the peaks of the quality, the highest peak first."""
-        quality, angle, width = self._first.maps[:3]
-        found = find_peaks(quality, angle, width, settings)
-        pixels = self._first.scaling.original_pixels(found.pixel)
+        peaks = peak_places(self._first.maps[0], settings)
+        pixels = self._first.scaling.original_pixels(peaks)
         depth = surface_depth(self.frame.depth, pixels)
         points = deproject(pixels, depth, self.frame.K, self.frame.T_WC)
         return points[np.isfinite(depth)]

@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
+from models import planner_loops as loops
 from models.planner_candidates import FACTS, Candidates, SearchSettings, grip_score
 from utils.depth_correction import TRUSTED_ROUGHNESS, bump_height
 from utils.geometry import GripperGeometry
@@ -37,8 +38,9 @@ Array = TypeVar("Array")  # np.ndarray, or torch.Tensor in `models.fan_measure`
 @dataclass(frozen=True)
 class Lines(Generic[Array]):
     """Cells of a map on lines beside N candidates. u: (U,) m along the closing line, from the
-    middle that a candidate claims. v: (V,) m, the places of the lines across it. where: (N, V, U)
-    flat indices. height: (N, V, U) m, and highest: (N, U) m of all lines."""
+    middle that a candidate claims. v: (V,) m, the places of the lines across it. where: (M, V, U)
+    flat indices, and height: (M, V, U) m; M is N, or a fraction of it where candidates i, M + i ...
+    are at the same place. highest: (N, U) m of all lines."""
 
     u: Array
     v: Array
@@ -187,11 +189,7 @@ class _Posed:
         )
         where = cells_around(xy, along, across, u, v, heights)
         height = heights.height.take(where)
-        highest = height.max(axis=1)
-        if depths > 1:
-            where, height = (np.tile(part, (depths, 1, 1)) for part in (where, height))
-            highest = np.tile(highest, (depths, 1))
-        return Lines(u, v, where, height, highest)
+        return Lines(u, v, where, height, np.tile(height.max(axis=1), (depths, 1)))
 
     def _contacts(self, claimed: np.ndarray) -> Contacts[np.ndarray]:
         """A pad stops where the first of the lines across it meets matter. The slope of the
@@ -203,8 +201,8 @@ class _Posed:
         window = np.abs(u) <= claimed[:, None] / 2 + self.settings.rooms[0]
         top = np.where(window, lines.highest, -np.inf).max(axis=1)
         lower, upper = contact_levels(tip, top - tip)
-        low = (lines.height > lower[:, None, None]) & window[:, None]
-        low_left, low_right = _first_contacts(low, u, cell)
+        low_left, low_right = loops.first_contacts(lines.height, lower, window, u)
+        low_left, low_right = low_left - cell / 2, low_right + cell / 2
         high = (lines.highest > upper[:, None]) & window
         high_left, high_right = _first_contacts(high, u, cell)
         left, right = low_left.min(axis=1), low_right.max(axis=1)
@@ -251,14 +249,16 @@ class _Posed:
             good &= thickness > self.gripper.least_held + UNSURE
         if heights.fixed is not None:  # a fixture under an object that leans over it
             between = (lines.u > contacts.left[:, None]) & (lines.u < contacts.right[:, None])
-            fixed = heights.fixed.take(lines.where).max(axis=1)
+            fixed = loops.highest_across(heights.fixed.ravel(), lines.where, np.arange(len(tip)))
             under = (tip - settings.clearance)[:, None]
             good &= (np.where(between, fixed, -np.inf) <= under).all(axis=1)
         some = np.nonzero(good)[0]
         other = heights.label == OTHER_LABEL
         if other.any():
             between = np.abs(lines.u - contacts.shift[some, None]) < width[some, None] / 2
-            mixed = other.take(lines.where[some]) & (lines.height[some] > tip[some, None, None])
+            place = some % len(lines.where)
+            mixed = lines.height[place] > tip[some, None, None]
+            mixed &= other.take(lines.where[place])
             mixed = (mixed & between[:, None]).sum(axis=(1, 2)) / (LINES * between.sum(axis=1))
             some = some[mixed <= settings.most_other]
         return some
@@ -285,23 +285,15 @@ class _Posed:
         gripper, settings, contacts = self.gripper, self.settings, self.contacts
         tip, width = self.tip[some], contacts.width[some]
         obstacles = self.heights.highest_around("height", 1, cv2.MORPH_RECT)
-        obstacles = obstacles.take(self.lines.where[some]).max(axis=1)
+        obstacles = loops.highest_across(obstacles.ravel(), self.lines.where, some)
         beside = self.lines.u - contacts.shift[some, None]
-        # Between contact and finger only the closing pads pass, over all that is below the tips.
-        closing = np.abs(beside) > width[:, None] / 2 + settings.rooms[0]
-        sill = np.where(closing, settings.clearance + 0.001, np.inf)
-        near, half_width = np.abs(beside - offset), width / 2 + abs(offset)
-        opening, open_yet = np.zeros(len(tip)), np.arange(len(tip))
-        for room in (np.inf,) if gripper.opens_fully else reversed(settings.rooms):
-            half = np.minimum(half_width[open_yet] + room, gripper.max_opening / 2)
-            outward = near[open_yet] - half[:, None]
-            below_finger = gripper.finger_underside(np.maximum(outward, 0))
-            under = np.where(outward < -settings.inner_margin, sill[open_yet], below_finger)
-            fits = (obstacles[open_yet] - under).max(axis=1) <= tip[open_yet] - settings.clearance
-            fits &= half >= half_width[open_yet] + settings.rooms[0] - 1e-9
-            opening[open_yet[fits]] = 2 * half[fits]
-            open_yet = open_yet[~fits]
-        return opening
+        beside = self.lines.u - contacts.shift[some, None]
+        rooms = np.full(1, np.inf) if gripper.opens_fully else np.array(settings.rooms[::-1])
+        return loops.widest_opening(
+            obstacles, beside, width, tip, rooms, offset, gripper.max_opening,
+            np.array(gripper.finger_outline), settings.rooms[0], settings.clearance,
+            settings.inner_margin,
+        )  # fmt: skip
 
     def _palm_gap(self, some: np.ndarray, offset: float) -> np.ndarray:
         """(M,) smallest gap between the palm's underside, fingertips at 0, and the matter below
@@ -315,8 +307,8 @@ class _Posed:
         ends = gripper.palm_half_length, gripper.palm_outline[-1][0]
         u, v = (np.linspace(-end, end, 2 * int(np.ceil(end / PALM_STEP)) + 1) for end in ends)
         middle = self.held.xy[some] + offset * along
-        nearby = scene.take(cells_around(middle, along, across, u, v, heights)).max(axis=2)
-        return (gripper.palm_underside(v) - nearby).min(axis=1)
+        where = cells_around(middle, along, across, u, v, heights)
+        return loops.least_gap(scene.ravel(), where, gripper.palm_underside(v))
 
     def covered(self, some: np.ndarray, opening: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """(N,) share of the hand under which matter may be hidden; 0 but of the candidates
@@ -327,8 +319,8 @@ class _Posed:
             beside = np.minimum(beside, contacts.width[some] + 2 * self.settings.rooms[-1])
         near = np.abs(lines.u - (contacts.shift + offset)[some, None])
         under = gripper.finger_underside(near - beside[:, None] / 2)
-        over = self.heights.ceiling.take(lines.where[some]) - under[:, None]
-        covered[some] = (over > self.tip[some, None, None]).mean(axis=(1, 2))
+        ceiling = self.heights.ceiling.ravel()
+        covered[some] = loops.share_over(ceiling, lines.where, some, under, self.tip[some])
         return covered
 
 
@@ -362,18 +354,8 @@ def least_engagement(noise: float) -> float:
 
 def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
     """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
-    columns = heights.height.shape[1]
-    col, row = (
-        heights.nearest(
-            (xy[:, k, None] + u * along[:, k, None])[:, None]
-            + v[:, None] * across[:, k, None, None],
-            k,
-        )
-        for k in (0, 1)
-    )
-    row *= columns
-    row += col
-    return row.astype(np.intp)
+    origin, cell = np.asarray(heights.origin, float), float(heights.cell)
+    return loops.cells_around(xy, along, across, u, v, origin, cell, *heights.height.shape)
 
 
 def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:

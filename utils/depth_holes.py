@@ -13,6 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from utils.compiled import compiled
 from utils.depth import farthest_first
 from utils.errors import UserError
 from utils.transforms import RGBDFrame, check_images, known_depth, ray_component
@@ -166,21 +167,35 @@ def surfaces_in_holes(frame: RGBDFrame) -> RGBDFrame:
     if known.all() or not known.any():
         return frame
     reach = reach_in_pixels(frame, SURFACE_REACH)
-    width = known.shape[1] + 2 * reach
-    measured = np.pad(np.where(known, frame.depth, 0), reach).ravel()
-    colours = np.pad(frame.rgb.astype(np.int32), ((reach, reach), (reach, reach), (0, 0)))
-    colours = colours.reshape(-1, 3)
-    filled = measured.copy()
-    left = np.flatnonzero(np.pad(~known & at_edges(frame), reach))
-    for down, right in reversed(farthest_first(reach)):
-        beside = left + down * width + right
-        difference = colours[beside] - colours[left]
-        alike = np.einsum("ij,ij->i", difference, difference) < LIKE_SURFACE**2
-        alike &= measured[beside] > 0
-        filled[left[alike]] = measured[beside[alike]]
-        left = left[~alike]
-    depth = filled.reshape(-1, width)[reach:-reach, reach:-reach]
-    return replace(frame, depth=np.where(known, frame.depth, depth).astype(frame.depth.dtype))
+    nearest_first = np.array(farthest_first(reach)[::-1])
+    depth = _from_alike(frame.depth, frame.rgb, known, ~known & at_edges(frame), nearest_first)
+    return replace(frame, depth=depth)
+
+
+@compiled
+def _from_alike(
+    depth: np.ndarray, rgb: np.ndarray, known: np.ndarray, holes: np.ndarray, steps: np.ndarray
+) -> np.ndarray:
+    """The depth (H, W) with that of the first known pixel, steps (K, 2) down and right away, whose
+    colour is like their own in the holes (H, W); 0 in other pixels that are not known."""
+    filled = np.where(known, depth, depth.dtype.type(0))
+    rows, columns = depth.shape
+    for v in range(rows):
+        for u in range(columns):
+            if not holes[v, u]:
+                continue
+            for k in range(len(steps)):
+                y, x = v + steps[k, 0], u + steps[k, 1]
+                if not (0 <= y < rows and 0 <= x < columns and known[y, x]):
+                    continue
+                difference = 0
+                for channel in range(3):
+                    apart = int(rgb[y, x, channel]) - int(rgb[v, u, channel])
+                    difference += apart * apart
+                if difference < LIKE_SURFACE**2:
+                    filled[v, u] = depth[y, x]
+                    break
+    return filled
 
 
 def _eroded(mask: np.ndarray, radius: int) -> np.ndarray:

@@ -10,8 +10,8 @@ import sys
 # among them: where it is missing, MuJoCo does its work.
 PACKAGES = (
     "PIL", "collada", "cv2", "gymnasium", "h5py", "imageio", "imageio_ffmpeg", "jinja2",
-    "manifold3d", "matplotlib", "mujoco", "numpy", "onnx", "onnxscript", "pydantic", "scipy",
-    "tensorboard", "torch", "torchvision", "tqdm", "trimesh", "typing_extensions", "yaml",
+    "manifold3d", "matplotlib", "mujoco", "numba", "numpy", "onnx", "onnxscript", "pydantic",
+    "scipy", "tensorboard", "torch", "torchvision", "tqdm", "trimesh", "typing_extensions", "yaml",
     "yourdfpy",
 )  # fmt: skip
 

@@ -8,14 +8,13 @@ This module knows neither objects nor networks.
 
 from __future__ import annotations
 
-import itertools
 import warnings
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from utils.compiled import compiled
 from utils.depth_holes import (
     HOLE_REACH,
     at_edges,
@@ -104,22 +103,21 @@ def seen_heights(
     to_table = np.where(unknown, depth_of_plane(frame, table), 0) if unknown.any() else None
     frame = replace(frame, T_WC=inverse_pose(T_WV) @ frame.T_WC)
     split = subpixels(frame, cell)
-    seen = _highest(_surface_points(frame, origin, cell, split), shape)
+    seen = _surface(frame, origin, cell, split, shape)
     hidden = ~np.isfinite(seen)
     height = _filled(seen, slope, cell)
     # The rays that graze an edge bound the matter in its shadow.
-    ceiling = _highest(_grazing_points(frame, origin, cell), shape)
+    ceiling = _grazed(frame, origin, cell, shape)
     ceiling = np.maximum(ceiling, height)
     if T_WV[2, 2] == 1.0:  # a camera above has seen what is over a surface that it sees
         ceiling = np.where(hidden, ceiling, height)
     if hiding.any():
         nearer = replace(frame, depth=np.where(hiding, frame.depth - HOLE_RISE, 0))
-        risen = _highest(_surface_points(nearer, origin, cell, split), shape)
+        risen = _surface(nearer, origin, cell, split, shape)
         ceiling = np.maximum(ceiling, risen)
     unknown = np.zeros(shape, bool)
     if to_table is not None:
-        under = _surface_points(replace(frame, depth=to_table), origin, cell, split)
-        below = _highest(under, shape)
+        below = _surface(replace(frame, depth=to_table), origin, cell, split, shape)
         unknown = hidden & np.isfinite(below)
     first = SeenHeights(height, ceiling, hidden, unknown, slope, origin, cell, T_WV)
     if frame.second is None or not known_depth(frame.second.depth).any():
@@ -139,7 +137,7 @@ def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
     shape, cell = first.height.shape, first.cell
     second = replace(second, T_WC=inverse_pose(first.T_WV) @ second.T_WC)
     split = subpixels(second, cell)
-    also = _highest(_surface_points(second, first.origin, cell, split), shape)
+    also = _surface(second, first.origin, cell, split, shape)
     seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
     height, hidden = _filled(seen, first.slope, cell), ~np.isfinite(seen)
     ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
@@ -316,71 +314,48 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     return rows, columns
 
 
-def _highest(parts: Iterable[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
-    """(R, C) float32 highest z of the points in each cell; -inf where there is none.
+def _surface(frame: RGBDFrame, origin: np.ndarray, cell: float, split: int, shape) -> np.ndarray:
+    """(R, C) float32 highest z of the frame's points in each cell; -inf where there is none.
 
-    Each part holds columns and rows, in cells, and z (metres) of points, (3, ...); it is
-    overwritten.
+    Each pixel with a depth stands for split x split points of its square (`subpixels`).
     """
-    rows, cols = shape
-    height = np.full((rows + 2, cols + 2), -np.inf, np.float32)  # a rim for points outside
-    for col, row, z in parts:
-        for place, count in ((col, cols), (row, rows)):
-            np.clip(place, -1, count, out=place)
-            np.rint(place, out=place)
-        row += 1
-        row *= cols + 2
-        row += col
-        row += 1
-        index, z = row.astype(np.intp), z.astype(np.float32)
-        np.maximum.at(height.reshape(-1), index.ravel(), z.ravel())
-    return height[1:-1, 1:-1]
-
-
-def _surface_points(
-    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int
-) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns, rows and z (...) of points, split x split times: each pixel stands for that many
-    points of its square (`subpixels`). Without a depth, a pixel stands for none, or z is -inf.
-    """
-    depth = frame.depth.astype(float)
-    unknown = ~known_depth(depth)
-    v, u = np.indices(depth.shape, dtype=float, sparse=True)
-    if 2 * np.count_nonzero(unknown) > unknown.size:  # the few others are quicker by themselves
-        known = ~unknown
-        v, u = (place.astype(float) for place in np.nonzero(known))
-        depth, unknown = depth[known], unknown[known]
-    depth[unknown] = 0
     to_cells = np.diag([1 / cell, 1 / cell, 1.0])
     start = to_cells @ (frame.T_WC[:3, 3] - (*origin, 0.0))
     # A ray is the sum of three parts: for the pixel's column, for its row, and the optical axis.
-    by_u, by_v, axis = (to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)).T
+    rays = to_cells @ frame.T_WC[:3, :3] @ np.linalg.inv(frame.K)
     sub = (np.arange(split) + 0.5) / split - 0.5
-    for dv, du in itertools.product(sub, sub):
-        points = []
-        for a, b, c, d in zip(by_u, by_v, axis, start):
-            along = (a * (u + du) + c) + b * (v + dv)
-            along *= depth
-            along += d
-            points.append(along)
-        points[2][unknown] = -np.inf
-        yield tuple(points)
+    height = np.full(shape, -np.inf, np.float32)
+    _raise_to_surface(height, frame.depth, known_depth(frame.depth), rays, start, sub)
+    return height
 
 
-def subpixels(frame: RGBDFrame, cell: float) -> int:
-    """Points along each side of the square that a pixel stands for, so that on a surface at the
-    middle depth, which faces the camera, the next one is no farther than a cell: none stays empty.
-    """
-    known = frame.depth[known_depth(frame.depth)]
-    if len(known) == 0:
-        return SUBPIXELS
-    pixel = float(np.median(known)) / min(frame.K[0, 0], frame.K[1, 1])  # m
-    return max(SUBPIXELS, int(np.ceil(pixel / cell)))
+@compiled
+def _raise_to_surface(height, depth, known, rays, start, sub):
+    """Raise heights (R, C), cells of a grid, to the points of an image's pixels, each spread over
+    the places `sub` along both sides. rays: (3, 3) from pixels to cells, cells and metres at a
+    depth of 1 m. start: (3,) the camera, likewise."""
+    rows, columns = height.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if not known[v, u]:
+                continue
+            far = float(depth[v, u])
+            for dv in sub:
+                for du in sub:
+                    at_u, at_v = u + du, v + dv
+                    x = ((rays[0, 0] * at_u + rays[0, 2]) + rays[0, 1] * at_v) * far + start[0]
+                    y = ((rays[1, 0] * at_u + rays[1, 2]) + rays[1, 1] * at_v) * far + start[1]
+                    column, row = np.rint(x), np.rint(y)
+                    if 0 <= column < columns and 0 <= row < rows:
+                        z = ((rays[2, 0] * at_u + rays[2, 2]) + rays[2, 1] * at_v) * far + start[2]
+                        place = int(row), int(column)
+                        height[place] = max(height[place], np.float32(z))
 
 
-def _grazing_points(frame: RGBDFrame, origin: np.ndarray, cell: float) -> Iterator[np.ndarray]:
-    """Columns, rows and z (3, S, N) of points on the rays between neighbouring pixels whose depths
-    differ by GRAZING_JUMP: beside each other, and one below the other."""
+def _grazed(frame: RGBDFrame, origin: np.ndarray, cell: float, shape) -> np.ndarray:
+    """(R, C) float32 highest z, in each cell, of the rays between neighbouring pixels whose depths
+    differ by GRAZING_JUMP, beside each other and one below the other; -inf where there is none."""
+    height = np.full(shape, -np.inf, np.float32)
     for step in ((1, 0), (0, 1)):
         here = frame.depth[: frame.depth.shape[0] - step[1], : frame.depth.shape[1] - step[0]]
         there = frame.depth[step[1] :, step[0] :]
@@ -396,9 +371,35 @@ def _grazing_points(frame: RGBDFrame, origin: np.ndarray, cell: float) -> Iterat
         for end in (near, far):
             end[:2] = (end[:2] - origin[:, None]) / cell
         cells = np.linalg.norm((far - near)[:2], axis=0)
-        share = np.linspace(0, 1, int(np.clip(2 * cells.max(), 2, GRAZING_SHARES)))[:, None]
-        yield near[:, None] + share * (far - near)[:, None]
+        share = np.linspace(0, 1, int(np.clip(2 * cells.max(), 2, GRAZING_SHARES)))
+        _raise_to_rays(height, near, far - near, share)
         if (2 * cells > GRAZING_SHARES).any():
             near, far = (end[:, 2 * cells > GRAZING_SHARES] for end in (near, far))
-            share = np.linspace(0, 1, int(min(2 * cells.max(), MOST_SHARES)))[:, None]
-            yield near[:, None] + share * (far - near)[:, None]
+            share = np.linspace(0, 1, int(min(2 * cells.max(), MOST_SHARES)))
+            _raise_to_rays(height, near, far - near, share)
+    return height
+
+
+@compiled
+def _raise_to_rays(height, near, along, share):
+    """Raise heights (R, C) to points at shares (S,) of the way from near (3, N) `along` (3, N):
+    columns and rows, in cells, and metres."""
+    rows, columns = height.shape
+    for k in range(near.shape[1]):
+        for part in share:
+            column = np.rint(near[0, k] + part * along[0, k])
+            row = np.rint(near[1, k] + part * along[1, k])
+            if 0 <= column < columns and 0 <= row < rows:
+                place = int(row), int(column)
+                height[place] = max(height[place], np.float32(near[2, k] + part * along[2, k]))
+
+
+def subpixels(frame: RGBDFrame, cell: float) -> int:
+    """Points along each side of the square that a pixel stands for, so that on a surface at the
+    middle depth, which faces the camera, the next one is no farther than a cell: none stays empty.
+    """
+    known = frame.depth[known_depth(frame.depth)]
+    if len(known) == 0:
+        return SUBPIXELS
+    pixel = float(np.median(known)) / min(frame.K[0, 0], frame.K[1, 1])  # m
+    return max(SUBPIXELS, int(np.ceil(pixel / cell)))
