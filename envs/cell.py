@@ -276,6 +276,10 @@ class Cell(ABC):
             raise PhysicsError("the robot's joint positions are not finite")
         for index in self.remaining:
             self.object_position(index)
+        self.check_solver()
+
+    def check_solver(self) -> None:  # noqa: B027 - most have nothing to say
+        """Raise PhysicsError where the solver warns of numbers that are still finite."""
 
     # --- Objects ------------------------------------------------------------------------------
 

@@ -23,8 +23,10 @@ from envs.robot_kinematics import (
     JOINT_VELOCITY,
     ServoStep,
     moved,
+    moved_within,
     pose_error,
     rotation_matrix,
+    stepped_towards,
     wrist_room,
 )
 from utils.config import Config
@@ -72,8 +74,8 @@ class ActionDecoder:
         self._settings, self._max_opening = config.env, config.gripper.max_opening
         reach = config.workspace.size / 2 + _MARGIN
         x, y = config.workspace.center
-        self.lowest = (x - reach, y - reach, LOWEST_TIP)
-        self.highest = (x + reach, y + reach, _HIGHEST_TIP)
+        self.lowest = np.array([x - reach, y - reach, LOWEST_TIP])
+        self.highest = np.array([x + reach, y + reach, _HIGHEST_TIP])
         self._speed = _FASTEST * _SPEED_HEADROOM * config.robot.velocity_scale
         self._max_joint_change = self._speed * config.env.substeps / config.sim.frequency
 
@@ -116,20 +118,12 @@ class ActionDecoder:
     def _moved_pose(self, action: np.ndarray) -> np.ndarray:
         """(4, 4) the commanded pose of E moved by an action, within the workspace and what the
         wrist can turn: a hand at its limit can still move."""
-        settings, T = self._settings, self._T_command.copy()
-        move = settings.position_step * action[:3]
+        settings = self._settings
         turn = action[3:6] if settings.control == "ee" else np.array([0.0, 0.0, action[3]])
-        if settings.frame == "hand":
-            move, turn = T[:3, :3] @ move, T[:3, :3] @ turn
-        position = zip((T[:3, 3] + move).tolist(), self.lowest, self.highest)
-        T[:3, 3] = [min(max(value, low), high) for value, low, high in position]
-        if any(turn.tolist()):
-            turn = settings.rotation_step * turn
-            about, (low, high) = float(turn @ T[:3, 2]), wrist_room(self._servo.q)
-            if not low <= about <= high:
-                turn = turn + (min(max(about, low), high) - about) * T[:3, 2]
-            T[:3, :3] = rotation_matrix(turn) @ T[:3, :3]
-        return T
+        return moved_within(
+            self._T_command, settings.position_step * action[:3], settings.rotation_step * turn,
+            settings.frame == "hand", self.lowest, self.highest, wrist_room(self._servo.q),
+        )  # fmt: skip
 
     def _follow(self, target: np.ndarray) -> None:
         """Move the command towards a pose (4, 4) as far as the joint speeds allow, or not at all
@@ -165,9 +159,7 @@ class ActionDecoder:
     def _within_speed(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
         """Joint positions (7,) towards a goal that one action can reach, and the share of the way
         that they are."""
-        change = goal - self._servo.q
-        share = 1.0 / max(float(abs(change).max()) / self._max_joint_change, 1.0)
-        return self._servo.q + share * change, share
+        return stepped_towards(self._servo.q, goal, self._max_joint_change)
 
 
 # --- Initial states -----------------------------------------------------------------------------

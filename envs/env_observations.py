@@ -103,6 +103,8 @@ class Observer:
         poses = [cell.object_pose(i) for i in range(len(cell.bodies))]
         positions = [T_WO[:3, 3] for T_WO in poses]
         distances = [math.dist(position, self.tip) for position in positions]
+        if not math.isfinite(sum(distances)):
+            raise PhysicsError("an object's position is not finite")
         self.nearest = nearest = distances.index(min(distances))
         self.positions, self.object_position = positions, positions[nearest]
         T_WO = poses[nearest]

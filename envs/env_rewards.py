@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from utils.compiled import compiled
 from utils.errors import unknown_choice
 from utils.geometry import GripperGeometry, SceneGeometry, Workspace
 from utils.grasp_quality import LabelSettings, grasp_depth, grasp_quality, undersides
@@ -53,9 +54,8 @@ _FINGERS = 0.035  # m, the hand would hit what reaches farther up between the fi
 _SIDE_SLACK, _LENGTH_SLACK = 0.008, 0.015  # m off the middle from where the hand may come down
 _OPENING_SLACK = 0.01  # m by which the fingers should be wider apart than the object
 
-# (3, 2 DIRECTIONS + 1): the directions over a whole turn in the closing line's frame, and up.
-_TURNS = math.pi / DIRECTIONS * np.arange(2 * DIRECTIONS)
-_AXES = np.column_stack([[np.cos(_TURNS), np.sin(_TURNS), 0 * _TURNS], [0.0, 0.0, 1.0]])
+_TURNS = math.pi / DIRECTIONS * np.arange(DIRECTIONS)
+_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 
 
 class Outline:
@@ -70,19 +70,32 @@ class Outline:
 
     def seen_from(self, T_WO: np.ndarray, T_WE: np.ndarray) -> OutlineView:
         """The object at T_WO (4, 4) relative to a hand at T_WE (4, 4)."""
-        x, y = T_WE[0, 1], T_WE[1, 1]  # of the closing line
-        length = math.hypot(x, y)
-        x, y = x / length, y / length
-        turn = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
-        reach = np.maximum.reduce(self._points @ (T_WO[:3, :3].T @ turn @ _AXES))
+        widths, top = _shadow(self._points, T_WO, T_WE)
         between = T_WO[:3, 3] - T_WE[:3, 3]
         height = float(between[2])
-        return OutlineView(
-            between @ T_WE[:3, :3],
-            reach[:DIRECTIONS] + reach[DIRECTIONS:-1],
-            float(reach[-1]) + height,
-            height,
-        )
+        return OutlineView(between @ T_WE[:3, :3], widths, top + height, height)
+
+
+@compiled
+def _shadow(points: np.ndarray, T_WO: np.ndarray, T_WE: np.ndarray) -> tuple[np.ndarray, float]:
+    """Widths as of `OutlineView`, and metres from the object's centre up to its highest point.
+    points: (V, 3) of the object at T_WO (4, 4). T_WE: (4, 4) of the hand."""
+    x, y = T_WE[0, 1], T_WE[1, 1]  # of the closing line
+    length = math.hypot(x, y)
+    x, y = x / length, y / length
+    along, across = x * _COSINES - y * _SINES, y * _COSINES + x * _SINES  # directions in W
+    least, most = np.full(DIRECTIONS, np.inf), np.full(DIRECTIONS, -np.inf)
+    top = -np.inf
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        px = T_WO[0, 0] * a + T_WO[0, 1] * b + T_WO[0, 2] * c
+        py = T_WO[1, 0] * a + T_WO[1, 1] * b + T_WO[1, 2] * c
+        pz = T_WO[2, 0] * a + T_WO[2, 1] * b + T_WO[2, 2] * c
+        top = max(top, pz)
+        for k in range(DIRECTIONS):
+            place = along[k] * px + across[k] * py
+            least[k], most[k] = min(least[k], place), max(most[k], place)
+    return most - least, top
 
 
 class OutlineView:

@@ -306,7 +306,7 @@ class RobotGraspingEnv(gymnasium.Env):
         self.cell.step(self.settings.substeps)
         self._steps += 1
         try:
-            self.cell.check_physics()  # MuJoCo warns while all numbers are still finite
+            self.cell.check_solver()
             self._read_cell()
         except PhysicsError:
             self._running = False

@@ -158,8 +158,7 @@ class MujocoCell(Cell):
             self._camera = MujocoCamera(self.robot.model, self.robot.data)
         return self._camera
 
-    def check_physics(self) -> None:
-        super().check_physics()
+    def check_solver(self) -> None:
         kinds = self._mujoco.mjtWarning
         for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC):
             if self.robot.data.warning[kind].number:

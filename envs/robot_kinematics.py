@@ -14,9 +14,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dposv
-from scipy.spatial.transform import Rotation
 
+from utils.compiled import compiled
 from utils.errors import UserError
 
 # Limits of the arm, from Franka's documentation of its control interface (FCI), Panda.
@@ -46,12 +45,11 @@ _LINKS = [
     (a, float(np.round(np.sin(alpha))), d)
     for a, alpha, d in zip((*_A, 0.0), (*_ALPHA, 0.0), (*_D, TOOL_LENGTH))
 ]
+_LINK_TABLE = np.array(_LINKS)
 _ARM_FROM_ITS_END = _LINKS[-2::-1]
 
 _POINT_SPACING = 0.05  # m along the links
 _ELBOW = 5  # of the ends of the links' parts, two for each joint, that of the elbow
-
-_IDENTITY = np.eye(6)
 
 # Of inverse kinematics: how near a pose counts as reached along and about each axis, in m and rad.
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
@@ -89,36 +87,33 @@ def tip_position(q: Sequence[float]) -> tuple[float, float, float]:
     return x, y, z
 
 
+@compiled
 def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first.
-
-    In plain numbers, which for matrices this small is twice as fast as numpy.
-    """
-    angles = [*q.tolist(), HAND_TURN]
-    links = [(*link, math.cos(angle), math.sin(angle)) for link, angle in zip(_LINKS, angles)]
-    rows, axes, origins = [], [], []
-    for x, y, z in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
-        p, axis, origin = 0.0, [], []  # (x, y, z, p) is a row of the pose so far
-        for a, turn, d, cosine, sine in links:
+    """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
+    T, jacobian = np.eye(4), np.empty((6, 7))
+    arm = np.empty((3, 7))  # from each joint to E
+    for i in range(3):
+        x, y, z, p = T[i, 0], T[i, 1], T[i, 2], T[i, 3]  # a row of the pose so far
+        for k in range(8):
+            angle = q[k] if k < 7 else HAND_TURN
+            cosine, sine = math.cos(angle), math.sin(angle)
+            a, turn, d = _LINK_TABLE[k, 0], _LINK_TABLE[k, 1], _LINK_TABLE[k, 2]
             p += a * x
-            if turn:  # by a right angle about x
+            if turn != 0:  # by a right angle about x
                 y, z = turn * z, -turn * y
             p += d * z
             x, y = cosine * x + sine * y, cosine * y - sine * x
-            axis.append(z)
-            origin.append(p)
-        rows.append((x, y, z, p))
-        axes.append(axis[:-1])
-        origins.append([p - start for start in origin[:-1]])
-    T = np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
-    axis_x, axis_y, axis_z = axes
-    arm_x, arm_y, arm_z = origins
-    linear = [
-        [b * w - c * v for b, c, v, w in zip(axis_y, axis_z, arm_y, arm_z)],
-        [c * u - a * w for c, a, u, w in zip(axis_z, axis_x, arm_x, arm_z)],
-        [a * v - b * u for a, b, u, v in zip(axis_x, axis_y, arm_x, arm_y)],
-    ]
-    return T, np.array([*linear, *axes])
+            if k < 7:
+                jacobian[3 + i, k] = z
+                arm[i, k] = p
+        T[i, 0], T[i, 1], T[i, 2], T[i, 3] = x, y, z, p
+        for k in range(7):
+            arm[i, k] = p - arm[i, k]
+    for k in range(7):
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            jacobian[i, k] = jacobian[3 + j, k] * arm[m, k] - jacobian[3 + m, k] * arm[j, k]
+    return T, jacobian
 
 
 def geometric_jacobian(q: np.ndarray) -> np.ndarray:
@@ -180,26 +175,39 @@ def arm_points(q: np.ndarray) -> np.ndarray:
     return np.stack(points, axis=1)
 
 
+@compiled
 def rotation_vector(R: np.ndarray) -> np.ndarray:
-    """(3,) axis-angle logarithm of a (3, 3) rotation, fast where the angle is not near pi."""
-    return np.array(_rotation_log(R))
+    """(3,) axis-angle logarithm of a (3, 3) rotation."""
+    cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    vector = np.array(
+        [0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])]
+    )
+    sine = _length(vector)
+    if cosine > -0.99:
+        return vector * (math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0)
+    # Near half a turn the sine says little of the axis; the symmetric part is
+    # cosine + (1 - cosine) axis axis^T.
+    k = 0
+    for i in range(1, 3):
+        if R[i, i] > R[k, k]:
+            k = i
+    axis = np.array([0.5 * (R[i, k] + R[k, i]) for i in range(3)])
+    axis[k] -= cosine
+    angle = math.atan2(sine, cosine) / _length(axis)
+    along = axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2]
+    return axis * (-angle if along < 0 else angle)
 
 
-def _rotation_log(R: np.ndarray) -> tuple[float, float, float]:
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    cosine = 0.5 * (a + e + i - 1.0)
-    if cosine < -0.99:
-        return tuple(Rotation.from_matrix(R).as_rotvec().tolist())
-    x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
-    sine = math.sqrt(x * x + y * y + z * z)
-    scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
-    return scale * x, scale * y, scale * z
+@compiled
+def _length(vector: np.ndarray) -> float:
+    return math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
 
 
+@compiled
 def rotation_matrix(vector: np.ndarray) -> np.ndarray:
     """(3, 3) rotation of an axis-angle vector (3,), by Rodrigues' formula."""
-    x, y, z = vector.tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
+    x, y, z = vector[0], vector[1], vector[2]
+    angle = _length(vector)
     if angle < 1e-9:
         return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])
     x, y, z = x / angle, y / angle, z / angle
@@ -214,17 +222,58 @@ def rotation_matrix(vector: np.ndarray) -> np.ndarray:
     )
 
 
+@compiled
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Of matrices too small for a library."""
+    product = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(left.shape[0]):
+        for k in range(right.shape[1]):
+            for j in range(left.shape[1]):
+                product[i, k] += left[i, j] * right[j, k]
+    return product
+
+
+@compiled
 def pose_error(T: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(6,) small motion in W that takes pose T to the target: metres, then radians."""
-    move = (target[:3, 3] - T[:3, 3]).tolist()
-    return np.array([*move, *_rotation_log(target[:3, :3] @ T[:3, :3].T)])
+    error = np.empty(6)
+    error[:3] = target[:3, 3] - T[:3, 3]
+    error[3:] = rotation_vector(_product(target[:3, :3], T[:3, :3].T))
+    return error
 
 
+@compiled
 def moved(T: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Pose T (4, 4) after a motion (6,) in W, metres then radians: `pose_error` the other way."""
     result = T.copy()
-    result[:3, :3] = rotation_matrix(motion[3:]) @ T[:3, :3]
+    result[:3, :3] = _product(rotation_matrix(motion[3:]), T[:3, :3])
     result[:3, 3] = T[:3, 3] + motion[:3]
+    return result
+
+
+@compiled
+def moved_within(
+    T: np.ndarray,
+    move: np.ndarray,
+    turn: np.ndarray,
+    in_hand: bool,
+    lowest: np.ndarray,
+    highest: np.ndarray,
+    room: tuple[float, float],
+) -> np.ndarray:
+    """Pose T (4, 4) after a move (3,) m and a turn (3,) rad, its position within the box from
+    lowest (3,) to highest (3,) m, its turn about its own z within `room` rad. in_hand: whether
+    move and turn are along the axes of T instead of W's."""
+    result = T.copy()
+    if in_hand:
+        move = _product(T[:3, :3], move.reshape(3, 1))[:, 0]
+        turn = _product(T[:3, :3], turn.reshape(3, 1))[:, 0]
+    result[:3, 3] = np.minimum(np.maximum(T[:3, 3] + move, lowest), highest)
+    if turn.any():
+        approach = T[:3, 2]
+        about = turn[0] * approach[0] + turn[1] * approach[1] + turn[2] * approach[2]
+        turn = turn + (min(max(about, room[0]), room[1]) - about) * approach
+        result[:3, :3] = _product(rotation_matrix(turn), T[:3, :3])
     return result
 
 
@@ -239,13 +288,10 @@ def inverse_kinematics(
     within ROTATION_TOLERANCE radians, otherwise UnreachableError.
     """
     q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
-    for _ in range(_MOST_STEPS):
-        T, jacobian = _chain(q)
-        error = pose_error(T, target)
-        if abs(error[:3]).max() < POSITION_TOLERANCE and abs(error[3:]).max() < ROTATION_TOLERANCE:
-            return q
-        q = q + _damped_step(jacobian, error, q, rest)
-        q = np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
+    target = np.asarray(target, dtype=float)
+    q, error = _approached(target, q, np.zeros(7) if rest is None else rest, rest is not None)
+    if _is_near(error):
+        return q
     position = np.round(target[:3, 3], 3).tolist()
     raise UnreachableError(
         f"the arm cannot reach the pose at {position} m within its joint limits: inverse "
@@ -255,18 +301,77 @@ def inverse_kinematics(
     )
 
 
-def _damped_step(jacobian, error, q, rest):
-    """One damped-least-squares step (7,) with a pull towards `rest` in the null space."""
-    # Positive definite, so that Cholesky's method serves.
-    square = jacobian @ jacobian.T + _DAMPING**2 * _IDENTITY
-    if rest is None:
-        step = jacobian.T @ dposv(square, error)[1]
-    else:
+@compiled
+def _approached(
+    target: np.ndarray, q: np.ndarray, rest: np.ndarray, pulled: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions (7,) after damped steps from q (7,) towards a pose, and what is left, (6,)
+    metres and radians, before the last of them. pulled: whether `rest` counts."""
+    for _ in range(_MOST_STEPS):
+        T, jacobian = _chain(q)
+        error = pose_error(T, target)
+        if _is_near(error):
+            break
+        q = _within_limits(q + _damped_step(jacobian, error, q, rest, pulled))
+    return q, error
+
+
+@compiled
+def _is_near(error: np.ndarray) -> bool:
+    return (
+        np.abs(error[:3]).max() < POSITION_TOLERANCE
+        and np.abs(error[3:]).max() < ROTATION_TOLERANCE
+    )
+
+
+@compiled
+def _within_limits(q: np.ndarray) -> np.ndarray:
+    return np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
+
+
+@compiled
+def _damped_step(
+    jacobian: np.ndarray, error: np.ndarray, q: np.ndarray, rest: np.ndarray, pulled: bool
+) -> np.ndarray:
+    """One damped-least-squares step (7,), with a pull towards `rest` in the null space."""
+    pull, wanted = np.zeros(7), error.copy()
+    if pulled:
         # The pull fades near the goal, where the damping would let it leak into the task.
-        pull = 0.1 * min(1.0, abs(error).max() / 0.05) * (rest - q)
-        step = pull + jacobian.T @ dposv(square, error - jacobian @ pull)[1]
-    largest = abs(step).max()
+        pull = 0.1 * min(1.0, np.abs(error).max() / 0.05) * (rest - q)
+        for i in range(6):
+            for k in range(7):
+                wanted[i] -= jacobian[i, k] * pull[k]
+    square = _product(jacobian, jacobian.T)
+    for i in range(6):
+        square[i, i] += _DAMPING**2
+    force = _solved(square, wanted)
+    step = pull
+    for k in range(7):
+        for i in range(6):
+            step[k] += jacobian[i, k] * force[i]
+    largest = np.abs(step).max()
     return step * (_LONGEST_STEP / largest) if largest > _LONGEST_STEP else step
+
+
+@compiled
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution (N,) for a positive definite matrix (N, N), which is overwritten, by Cholesky's
+    decomposition."""
+    count, x = len(right), right.copy()
+    for i in range(count):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(rest) if i == j else rest / matrix[j, j]
+        for k in range(i):
+            x[i] -= matrix[i, k] * x[k]
+        x[i] /= matrix[i, i]
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
+            x[i] -= matrix[k, i] * x[k]
+        x[i] /= matrix[i, i]
+    return x
 
 
 class ServoStep:
@@ -281,8 +386,21 @@ class ServoStep:
         self.reached, self._jacobian = _chain(q)
 
     def towards(self, target: np.ndarray) -> np.ndarray:
-        step = _damped_step(self._jacobian, pose_error(self.reached, target), self.q, None)
-        return np.minimum(np.maximum(self.q + step, JOINT_LOWER), JOINT_UPPER)
+        return _stepped(self.q, self.reached, self._jacobian, target)
+
+
+@compiled
+def _stepped(q: np.ndarray, T: np.ndarray, jacobian: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return _within_limits(q + _damped_step(jacobian, pose_error(T, target), q, q, False))
+
+
+@compiled
+def stepped_towards(q: np.ndarray, goal: np.ndarray, most: float) -> tuple[np.ndarray, float]:
+    """Joint positions (7,) from q towards a goal (7,), along which no joint turns by more than
+    `most` rad, and the share of the way that they are."""
+    change = goal - q
+    share = 1.0 / max(np.abs(change).max() / most, 1.0)
+    return q + share * change, share
 
 
 def wrist_room(q: np.ndarray) -> tuple[float, float]:
