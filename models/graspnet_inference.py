@@ -38,7 +38,7 @@ def training_scale(frame: RGBDFrame, metres_per_pixel: float) -> PixelScaling:
     return scaling
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def run_network(
     model: GraspNet,
     frame: RGBDFrame,
