@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import nn
@@ -172,21 +171,30 @@ def _patches(where, tip, own, height, ceiling, label):
 
 def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:
     """(3, N) OBJECT_INPUTS of candidates; 0 for those of no object."""
-    size = np.zeros((len(OBJECT_INPUTS), len(found)))
-    axes = np.stack(found.axes())
-    cells = np.flatnonzero(heights.label >= 0)
-    owner = heights.label.take(cells)
-    over_table = np.maximum(heights.height.take(cells) - heights.table().take(cells), 0.0)
-    for label in np.unique(found.label[found.label >= 0]):
-        here = owner == label
-        if not here.any():
-            continue
-        own = found.label == label
-        row, column = np.divmod(cells[here], heights.label.shape[1])
-        outline = cv2.convexHull(np.column_stack([column, row]).astype(np.int32))[:, 0]
-        places = axes[:, own] @ (heights.cell * outline.T)  # (2, n, K)
-        size[:2, own] = np.ptp(places, axis=2) + heights.cell
-        size[2, own] = np.cbrt(over_table[here].sum() * heights.cell**2)
+    over_table = np.maximum(heights.height - heights.table(), 0.0)
+    row, column = np.nonzero(heights.label >= 0)
+    cells = heights.label[row, column], over_table[row, column]
+    return _sizes(found.label, *found.axes(), row, column, *cells, heights.cell)
+
+
+@compiled
+def _sizes(own, along, across, row, column, label, over_table, cell):
+    """(3, N) as of `object_size`. own: (N,) the labels of candidates with the axes along and across
+    (N, 2). row, column, label, over_table: (K,) of the map's cells of objects, m; `cell` m wide."""
+    size = np.zeros((3, len(own)))
+    for i in range(len(own)):
+        least, most, volume = np.full(2, np.inf), np.full(2, -np.inf), 0.0
+        for k in range(len(row)):
+            if label[k] == own[i]:
+                x, y = cell * column[k], cell * row[k]
+                places = along[i, 0] * x + along[i, 1] * y, across[i, 0] * x + across[i, 1] * y
+                for axis in range(2):
+                    least[axis] = min(least[axis], places[axis])
+                    most[axis] = max(most[axis], places[axis])
+                volume += over_table[k]
+        if most[0] >= least[0]:
+            size[0, i], size[1, i] = most[0] - least[0] + cell, most[1] - least[1] + cell
+            size[2, i] = np.cbrt(volume * cell**2)
     return size
 
 

@@ -144,13 +144,14 @@ class _Prediction:
         rows, columns = quality.shape
         column, row = ((start + end) / 2).round().long().T
         column, row = column.clamp(0, columns - 1), row.clamp(0, rows - 1)
-        share = angle[:, row, column].softmax(dim=0) ** (1 / 3)
+        logit = angle[:, row, column]
+        share = ((logit - logit.amax(dim=0)) / 3).exp()  # as in `quality_between`
         bins, each = len(share), torch.arange(len(row), device=ends.device)
         du, dv = (end - start).T
         place = torch.atan2(dv, du).remainder(np.pi) * bins / np.pi
         below, part = place.floor().long(), place - place.floor()
         at = (1 - part) * share[below % bins, each] + part * share[(below + 1) % bins, each]
-        return torch.where(ahead, quality[row, column] * at / share.amax(dim=0), 0.0)
+        return torch.where(ahead, quality[row, column] * at, 0.0)
 
     @functools.cached_property
     def _maps_there(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -194,18 +195,19 @@ def quality_between(
     quality (H, W) and angle (1, K, H, W), logits.
 
     It is the quality at a line's middle, times the quality of the line's angle relative to the best
-    angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`).
-    It is 0 for lines that the camera cannot see, whose pixels are NaN.
+    angle there. The cube root turns the bins' probabilities into qualities (`targets_from_labels`),
+    so that a bin's is exp(logit / 3), up to a factor. It is 0 for lines that the camera cannot see,
+    whose pixels are NaN.
     """
     ahead = np.isfinite(start + end).all(axis=1)
     start, end = (np.where(ahead[:, None], pixels, 0.0) for pixels in (start, end))
     u, v = np.rint((start + end) / 2).astype(int).T
     u, v = np.clip(u, 0, quality.shape[1] - 1), np.clip(v, 0, quality.shape[0] - 1)
-    share = angle[0, :, v, u].softmax(dim=0).numpy()
-    bins, each = len(share), np.arange(len(u))
+    logit = angle[0].numpy()[:, v, u]
+    bins, each = len(logit), np.arange(len(u))
     du, dv = (end - start).T
     place = np.mod(np.arctan2(dv, du), np.pi) * bins / np.pi  # between two bins
     below, part = np.floor(place).astype(int), place - np.floor(place)
-    at = (1 - part) * np.cbrt(share[below % bins, each])
-    at += part * np.cbrt(share[(below + 1) % bins, each])
-    return np.where(ahead, quality[v, u] * at / np.cbrt(share.max(axis=0)), 0.0)
+    best = logit.max(axis=0)
+    lower, upper = (np.exp((logit[bin % bins, each] - best) / 3) for bin in (below, below + 1))
+    return np.where(ahead, quality[v, u] * ((1 - part) * lower + part * upper), 0.0)

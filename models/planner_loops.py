@@ -30,10 +30,10 @@ def cells_around(xy, along, across, u, v, origin, cell, rows, columns):
 
 
 @compiled
-def first_contacts(height, level, window, u):
-    """(2, N, V) the places u (U,) at which each line of heights (M, V, U) first rises over a level
-    (N,), from the left and from the right; +inf and -inf where it does not. window: (N, U) bool,
-    where it counts."""
+def first_contacts(height, level, window, u, cell):
+    """(2, N, V) m, where each line of heights (M, V, U) first rises over a level (N,), from the
+    left and from the right; +inf and -inf where it does not. window: (N, U) bool, where it counts.
+    u: (U,) m, the middles of the cells along the lines, which are `cell` m wide."""
     found = np.empty((2, len(level), height.shape[1]))
     found[0], found[1] = np.inf, -np.inf
     for i in range(len(level)):
@@ -41,11 +41,11 @@ def first_contacts(height, level, window, u):
         for line in range(len(lines)):
             for k in range(len(u)):
                 if window[i, k] and lines[line, k] > level[i]:
-                    found[0, i, line] = u[k]
+                    found[0, i, line] = u[k] - cell / 2
                     break
             for k in range(len(u) - 1, -1, -1):
                 if window[i, k] and lines[line, k] > level[i]:
-                    found[1, i, line] = u[k]
+                    found[1, i, line] = u[k] + cell / 2
                     break
     return found
 

@@ -201,10 +201,9 @@ class _Posed:
         window = np.abs(u) <= claimed[:, None] / 2 + self.settings.rooms[0]
         top = np.where(window, lines.highest, -np.inf).max(axis=1)
         lower, upper = contact_levels(tip, top - tip)
-        low_left, low_right = loops.first_contacts(lines.height, lower, window, u)
-        low_left, low_right = low_left - cell / 2, low_right + cell / 2
-        high = (lines.highest > upper[:, None]) & window
-        high_left, high_right = _first_contacts(high, u, cell)
+        low_left, low_right = loops.first_contacts(lines.height, lower, window, u, cell)
+        high = loops.first_contacts(lines.highest[:, None], upper, window, u, cell)
+        high_left, high_right = high[..., 0]
         left, right = low_left.min(axis=1), low_right.max(axis=1)
         touched = np.isfinite(left) & np.isfinite(high_left)
         left, right = np.where(touched, left, 0.0), np.where(touched, right, 0.0)
@@ -356,15 +355,6 @@ def cells_around(xy, along, across, u, v, heights: HeightMap) -> np.ndarray:
     """(N, V, U) flat indices of the map's cells u along and v across from each centre."""
     origin, cell = np.asarray(heights.origin, float), float(heights.cell)
     return loops.cells_around(xy, along, across, u, v, origin, cell, *heights.height.shape)
-
-
-def _first_contacts(matter: np.ndarray, u: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
-    """(...) places at which lines (..., U) first meet matter, from the left and from the right;
-    +inf (left) and -inf (right) for lines that meet none."""
-    hit = matter.any(axis=-1)
-    left = u[matter.argmax(axis=-1)] - cell / 2
-    right = u[len(u) - 1 - matter[..., ::-1].argmax(axis=-1)] + cell / 2
-    return np.where(hit, left, np.inf), np.where(hit, right, -np.inf)
 
 
 def _thickness(chords: np.ndarray, along: np.ndarray, cell: float) -> np.ndarray:

@@ -52,12 +52,12 @@ def test_first_contacts_are_the_first_cells_over_the_level(seed):
     random, height, xy, along, across = scene(seed)
     lines = height.take(around(height, xy, along, across, U, V))
     level, window = random.uniform(0.05, 0.11, 10), random.random((10, 31)) < 0.5
-    found = loops.first_contacts(lines, level, window, U)
+    found = loops.first_contacts(lines, level, window, U, CELL)
     for i in range(10):  # two heights of the fingertips at five places
         met = (lines[i % 5] > level[i]) & window[i]
         for line in range(9):
             places = U[met[line]]
-            ends = (places[0], places[-1]) if len(places) else (np.inf, -np.inf)
+            ends = (places[0] - 0.001, places[-1] + 0.001) if len(places) else (np.inf, -np.inf)
             assert tuple(found[:, i, line]) == ends
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from utils.compiled import compiled
 from utils.geometry import GripperGeometry, SceneGeometry, intersect_lines
 from utils.height_map import HeightMap
 
@@ -391,22 +392,33 @@ def fit_faces(
     faces. wedge: half the angle between the faces in plan view. cover: smaller share of a pad's
     lines in touch.
     """
-    slope, cover = _fit_face(np.stack([left_gap, right_gap]), v)
-    left, right = np.arctan(slope)
-    return -(left - right) / 2, np.abs(left + right) / 2, cover.min(axis=0)
+    (left, left_cover), (right, right_cover) = (_fit_face(gap, v) for gap in (left_gap, right_gap))
+    left, right = np.arctan(left), np.arctan(right)
+    return -(left - right) / 2, np.abs(left + right) / 2, np.minimum(left_cover, right_cover)
 
 
+@compiled
 def _fit_face(gap: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slope (...) of the gaps (..., L) over the places v (L,), by least squares over those under
-    `NEAR_FACE`; and the share (...) of lines in touch."""
-    weight = (gap < NEAR_FACE).astype(float)
-    gap = np.where(gap < NEAR_FACE, gap, 0.0)
-    total = np.maximum(weight.sum(axis=-1), 1)
-    mean_v = (weight * v).sum(axis=-1) / total
-    spread = weight * (v - mean_v[..., None])
-    variance = (spread * v).sum(axis=-1)
-    slope = (spread * gap).sum(axis=-1) / np.where(variance > 1e-9, variance, np.inf)
-    return slope, (weight * (gap < TOUCH)).mean(axis=-1)
+    """Slope (N,) of the gaps (N, L) over the places v (L,), by least squares over those under
+    `NEAR_FACE`; and the share (N,) of lines in touch."""
+    slope, cover = np.zeros(len(gap)), np.zeros(len(gap))
+    near, touch = gap.dtype.type(NEAR_FACE), gap.dtype.type(TOUCH)
+    for i in range(len(gap)):
+        count, total = 0, 0.0
+        for k in range(len(v)):
+            if gap[i, k] < near:
+                count += 1
+                total += v[k]
+                cover[i] += gap[i, k] < touch
+        cover[i] /= len(v)
+        mean, variance, together = total / max(count, 1), 0.0, 0.0
+        for k in range(len(v)):
+            if gap[i, k] < near:
+                variance += (v[k] - mean) * v[k]
+                together += (v[k] - mean) * gap[i, k]
+        if variance > 1e-9:
+            slope[i] = together / variance
+    return slope, cover
 
 
 def _quality(
