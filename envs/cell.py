@@ -271,7 +271,8 @@ class Cell(ABC):
         """Undo `enable_sleeping`."""
 
     def check_physics(self) -> None:
-        """Raise PhysicsError if a position of the robot or of an object is not finite."""
+        """Raise PhysicsError if a position of the robot or of an object is not finite, and as
+        `check_solver` does."""
         if not np.isfinite(self.robot.q).all():
             raise PhysicsError("the robot's joint positions are not finite")
         for index in self.remaining:

@@ -3,7 +3,8 @@
 At the end: `postures`, which of two joint configurations reaches a grasp. The fingers are alike, so
 a gripper pose and the same pose turned by half a turn about the approach (the wrist flip) are one
 grasp; the last joint turns by less than a whole turn, so the choice decides how far it can follow
-an object that turns. Pure numpy: planning touches no simulator and knows no cell and no object.
+an object that turns. No simulator, no cell and no object is known here. The loops over joints are
+compiled (`utils.compiled`).
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def forward_kinematics(q: np.ndarray) -> np.ndarray:
 
 def tip_position(q: Sequence[float]) -> tuple[float, float, float]:
     """x, y, z of E in W, metres, for seven joint positions in rad: what `forward_kinematics` has in
-    its last column, in a tenth of the time: each command to the arm needs it."""
+    its last column, from a list and without the Jacobian: each command to the arm needs it."""
     x, y, z = 0.0, 0.0, TOOL_LENGTH
     for (a, turn, d), angle in zip(_ARM_FROM_ITS_END, reversed(q)):
         cosine, sine = math.cos(angle), math.sin(angle)
@@ -90,6 +91,8 @@ def tip_position(q: Sequence[float]) -> tuple[float, float, float]:
 @compiled
 def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_WE (4, 4) and the geometric Jacobian (6, 7) of E in W, linear rows first."""
+    if len(q) != 7:
+        raise ValueError("expected the positions of seven joints")
     T, jacobian = np.eye(4), np.empty((6, 7))
     arm = np.empty((3, 7))  # from each joint to E
     for i in range(3):
@@ -200,6 +203,7 @@ def rotation_vector(R: np.ndarray) -> np.ndarray:
 
 @compiled
 def _length(vector: np.ndarray) -> float:
+    """Of a vector (3,)."""
     return math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
 
 
@@ -224,7 +228,7 @@ def rotation_matrix(vector: np.ndarray) -> np.ndarray:
 
 @compiled
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Of matrices too small for a library."""
+    """(N, M) of matrices (N, K) and (K, M) that are too small for a library."""
     product = np.zeros((left.shape[0], right.shape[1]))
     for i in range(left.shape[0]):
         for k in range(right.shape[1]):
@@ -265,15 +269,18 @@ def moved_within(
     lowest (3,) to highest (3,) m, its turn about its own z within `room` rad. in_hand: whether
     move and turn are along the axes of T instead of W's."""
     result = T.copy()
-    if in_hand:
-        move = _product(T[:3, :3], move.reshape(3, 1))[:, 0]
-        turn = _product(T[:3, :3], turn.reshape(3, 1))[:, 0]
-    result[:3, 3] = np.minimum(np.maximum(T[:3, 3] + move, lowest), highest)
-    if turn.any():
+    axes = T[:3, :3] if in_hand else np.eye(3)
+    shift, spin = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            shift[i] += axes[i, k] * move[k]
+            spin[i] += axes[i, k] * turn[k]
+    result[:3, 3] = np.minimum(np.maximum(T[:3, 3] + shift, lowest), highest)
+    if spin.any():
         approach = T[:3, 2]
-        about = turn[0] * approach[0] + turn[1] * approach[1] + turn[2] * approach[2]
-        turn = turn + (min(max(about, room[0]), room[1]) - about) * approach
-        result[:3, :3] = _product(rotation_matrix(turn), T[:3, :3])
+        about = spin[0] * approach[0] + spin[1] * approach[1] + spin[2] * approach[2]
+        spin += (min(max(about, room[0]), room[1]) - about) * approach
+        result[:3, :3] = _product(rotation_matrix(spin), T[:3, :3])
     return result
 
 
@@ -288,8 +295,9 @@ def inverse_kinematics(
     within ROTATION_TOLERANCE radians, otherwise UnreachableError.
     """
     q = np.clip(np.asarray(seed, dtype=float), JOINT_LOWER, JOINT_UPPER)
-    target = np.asarray(target, dtype=float)
-    q, error = _approached(target, q, np.zeros(7) if rest is None else rest, rest is not None)
+    target = np.ascontiguousarray(target, dtype=float)
+    pull = np.zeros(7) if rest is None else np.ascontiguousarray(rest, dtype=float)
+    q, error = _approached(target, q, pull, rest is not None)
     if _is_near(error):
         return q
     position = np.round(target[:3, 3], 3).tolist()
@@ -305,8 +313,9 @@ def inverse_kinematics(
 def _approached(
     target: np.ndarray, q: np.ndarray, rest: np.ndarray, pulled: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint positions (7,) after damped steps from q (7,) towards a pose, and what is left, (6,)
-    metres and radians, before the last of them. pulled: whether `rest` counts."""
+    """Joint positions (7,) after damped steps from q (7,) towards a pose, and `pose_error` (6,) as
+    it was last looked at: where the steps did not get there, before the last one. pulled: whether
+    `rest` counts."""
     for _ in range(_MOST_STEPS):
         T, jacobian = _chain(q)
         error = pose_error(T, target)
@@ -318,6 +327,7 @@ def _approached(
 
 @compiled
 def _is_near(error: np.ndarray) -> bool:
+    """Whether a pose with such a `pose_error` (6,) counts as reached."""
     return (
         np.abs(error[:3]).max() < POSITION_TOLERANCE
         and np.abs(error[3:]).max() < ROTATION_TOLERANCE
@@ -326,6 +336,7 @@ def _is_near(error: np.ndarray) -> bool:
 
 @compiled
 def _within_limits(q: np.ndarray) -> np.ndarray:
+    """Joint positions (7,), those beyond a limit at it."""
     return np.minimum(np.maximum(q, JOINT_LOWER), JOINT_UPPER)
 
 
@@ -344,8 +355,7 @@ def _damped_step(
     square = _product(jacobian, jacobian.T)
     for i in range(6):
         square[i, i] += _DAMPING**2
-    force = _solved(square, wanted)
-    step = pull
+    force, step = _solved(square, wanted), pull.copy()
     for k in range(7):
         for i in range(6):
             step[k] += jacobian[i, k] * force[i]
@@ -386,11 +396,14 @@ class ServoStep:
         self.reached, self._jacobian = _chain(q)
 
     def towards(self, target: np.ndarray) -> np.ndarray:
-        return _stepped(self.q, self.reached, self._jacobian, target)
+        return _servo_step(self.q, self.reached, self._jacobian, target)
 
 
 @compiled
-def _stepped(q: np.ndarray, T: np.ndarray, jacobian: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _servo_step(
+    q: np.ndarray, T: np.ndarray, jacobian: np.ndarray, target: np.ndarray
+) -> np.ndarray:
+    """Joint positions (7,) one damped step from q (7,), where T is reached, towards a pose."""
     return _within_limits(q + _damped_step(jacobian, pose_error(T, target), q, q, False))
 
 

@@ -23,8 +23,10 @@ def cells_around(xy, along, across, u, v, origin, cell, rows, columns):
             for k in range(len(u)):
                 x = ((xy[i, 0] + u[k] * along[i, 0]) + over_x) - origin[0]
                 y = ((xy[i, 1] + u[k] * along[i, 1]) + over_y) - origin[1]
-                column = min(max(np.rint(x / cell), 0.0), columns - 1.0)
-                row = min(max(np.rint(y / cell), 0.0), rows - 1.0)
+                column, row = np.rint(x / cell), np.rint(y / cell)
+                # NaN, which is no index, fails the comparison.
+                column = min(column, columns - 1.0) if column > 0 else 0.0
+                row = min(row, rows - 1.0) if row > 0 else 0.0
                 where[i, line, k] = int(row) * columns + int(column)
     return where
 
@@ -52,7 +54,7 @@ def first_contacts(height, level, window, u, cell):
 
 @compiled
 def highest_across(surface, where, some):
-    """(K, U) the highest surface of all lines of the candidates `some` (K,)."""
+    """(K, U) m, the highest surface, m, of all lines of the candidates `some` (K,)."""
     highest = np.empty((len(some), where.shape[2]), surface.dtype)
     for i in range(len(some)):
         place = some[i] % len(where)
@@ -94,7 +96,7 @@ def widest_opening(
                     under = clearance + 0.001
                 else:
                     continue
-                if obstacles[i, k] - under > tip[i] - clearance:
+                if not obstacles[i, k] - under <= tip[i] - clearance:
                     free = False
                     break
             if free:
@@ -118,7 +120,8 @@ def _interpolated(place, outline):
 
 @compiled
 def least_gap(surface, where, underside):
-    """(M,) the smallest gap between an underside (V,), m, and the surface on the lines below it."""
+    """(M,) m, the smallest gap between an underside (V,), m, and the surface, m, on the lines below
+    it."""
     gap = np.empty(len(where))
     for i in range(len(where)):
         least = np.inf
@@ -133,7 +136,7 @@ def least_gap(surface, where, underside):
 
 @compiled
 def share_over(surface, where, some, under, tip):
-    """(K,) share of the cells beside the candidates `some` (K,) whose surface rises over the
+    """(K,) share of the cells beside the candidates `some` (K,) whose surface, m, rises over the
     fingertips `tip` (K,) and what is `under` (K, U) them, m over the tips."""
     share = np.empty(len(some))
     for i in range(len(some)):

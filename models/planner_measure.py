@@ -286,7 +286,6 @@ class _Posed:
         obstacles = self.heights.highest_around("height", 1, cv2.MORPH_RECT)
         obstacles = loops.highest_across(obstacles.ravel(), self.lines.where, some)
         beside = self.lines.u - contacts.shift[some, None]
-        beside = self.lines.u - contacts.shift[some, None]
         rooms = np.full(1, np.inf) if gripper.opens_fully else np.array(settings.rooms[::-1])
         return loops.widest_opening(
             obstacles, beside, width, tip, rooms, offset, gripper.max_opening,

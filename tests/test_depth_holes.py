@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.box_frames import boxes_frame
+from utils import depth_holes
 from utils.depth_holes import depth_of_plane, near_side, surfaces_in_holes, table_in_holes
 from utils.transforms import RGBDFrame
 
@@ -156,3 +157,25 @@ def test_rays_meet_a_plane_where_they_should(height: float) -> None:
     frame = boxes_frame([])
     points = replace(frame, depth=depth_of_plane(frame, height)).points()
     np.testing.assert_allclose(points[..., 2], height, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_holes_take_the_first_pixel_of_their_colour(seed: int) -> None:
+    """In an image with many alike and many lost pixels, up to its border."""
+    random = np.random.default_rng(seed)
+    depth = random.uniform(0.5, 0.6, (9, 11)).astype(np.float32)
+    rgb = random.choice(np.array([10, 20, 60], np.uint8), (9, 11, 3))
+    known = random.random(depth.shape) < 0.4
+    holes = ~known & (random.random(depth.shape) < 0.7)
+    steps = [(0, 1), (0, -1), (1, 0), (-1, 0), (2, 1), (-2, -1)]
+    expected = np.where(known, depth, 0)
+    for v, u in zip(*np.nonzero(holes)):
+        for down, right in steps:
+            y, x = v + down, u + right
+            inside = 0 <= y < 9 and 0 <= x < 11
+            if inside and known[y, x] and np.linalg.norm(1.0 * rgb[y, x] - rgb[v, u]) < 20:
+                expected[v, u] = depth[y, x]
+                break
+    found = depth_holes._from_alike(depth, rgb, known, holes, np.array(steps))
+    np.testing.assert_array_equal(found, expected)
+    assert (found[holes] > 0).sum() > 5

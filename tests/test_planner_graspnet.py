@@ -6,7 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
+from models import graspnet_objects
 from models.graspnet_io import SavedGraspNet
 from models.graspnet_objects import VoteSettings, labelled_by_centres, vote_centres
 from models.graspnet_view import CROP_MARGIN, around_matter, quality_between
@@ -377,3 +381,13 @@ def test_scattered_votes_leave_the_map_as_it_is(boxes) -> None:
     heights = height_map_from_frame(frame, Workspace())
     scattered = np.random.default_rng(0).uniform(-100, 100, (2, 224, 224))
     assert labelled_by_centres(heights, frame, SAME, scattered) is heights
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+@settings(max_examples=30, deadline=None)
+def test_votes_go_to_the_nearest_centre_in_reach(seed: int, count: int) -> None:
+    random = np.random.default_rng(seed)
+    votes, centres = random.uniform(0, 100, (200, 2)), random.uniform(0, 100, (count, 2))
+    miss, nearest = cKDTree(centres).query(votes)
+    found = graspnet_objects._nearest(votes, centres, 12.0)
+    np.testing.assert_array_equal(found, np.where(miss < 12, nearest, -1))

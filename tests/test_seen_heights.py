@@ -9,6 +9,7 @@ import pytest
 
 from models.planners import make_planner
 from tests.helpers.box_frames import BOX, boxes_frame, from_side, seen_from
+from utils import seen_heights
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import (
     HeightMap,
@@ -18,7 +19,7 @@ from utils.height_map import (
     tilted_view,
 )
 from utils.seen_heights import hides, sees_through, with_surroundings, without_holes
-from utils.transforms import RGBDFrame, look_at, project
+from utils.transforms import RGBDFrame, deproject, look_at, project
 
 
 def map_along(frame: RGBDFrame, approach: np.ndarray) -> HeightMap:
@@ -235,3 +236,53 @@ def test_a_workspace_out_of_sight_is_told() -> None:
     plan = make_planner("heuristic", GripperGeometry(), far, 0)
     with pytest.warns(UserWarning, match=r"no point .* 0.3 m at \(-2, 0\).*workspace_of"):
         assert plan(frame) == []
+
+
+def highest(points: np.ndarray, shape: tuple[int, int], origin: np.ndarray, cell: float):
+    """(R, C) float32 highest z of points (..., 3) in each cell, as NumPy finds it."""
+    column, row = np.rint((points[..., :2] - origin) / cell).reshape(-1, 2).T
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    height = np.full(shape, -np.inf, np.float32)
+    at = row[inside].astype(int), column[inside].astype(int)
+    np.maximum.at(height, at, points[..., 2].ravel()[inside].astype(np.float32))
+    return height
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_cell_has_the_highest_of_the_pixels_that_fall_on_it(seed: int) -> None:
+    """A map smaller than the view, pixels without a depth, four points for each other one."""
+    random = np.random.default_rng(seed)
+    depth = random.uniform(0.5, 0.6, (40, 60)).astype(np.float32)
+    depth[random.random(depth.shape) < 0.2] = 0
+    K = np.array([[120.0, 0, 29.5], [0, 120.0, 19.5], [0, 0, 1]])
+    T_WC = look_at([0.5, 0.02, 0.6], [0.5, 0, 0], up=(1, 0, 0))
+    frame = RGBDFrame(np.zeros((40, 60, 3), np.uint8), depth, K, T_WC)
+    origin, cell, shape = np.array([0.45, -0.06]), 0.004, (30, 20)
+    found = seen_heights._surface(frame, origin, cell, 2, shape)
+    v, u = np.mgrid[:40, :60]
+    parts = [
+        deproject(np.stack([u + du, v + dv], axis=-1), depth, K, T_WC)[depth > 0]
+        for du in (-0.25, 0.25)
+        for dv in (-0.25, 0.25)
+    ]
+    expected = highest(np.concatenate(parts), shape, origin, cell)
+    # A point just between two cells may be rounded to either.
+    alike = np.isclose(found, expected, atol=1e-6) | (found == expected)
+    assert np.isfinite(expected).mean() > 0.5 and alike.mean() > 0.995
+
+
+def test_rays_raise_all_cells_that_they_pass() -> None:
+    near, far = np.array([[0.0], [2.0], [0.1]]), np.array([[4.0], [2.0], [0.3]])
+    height = np.full((5, 5), -np.inf, np.float32)
+    seen_heights._raise_to_rays(height, near, far - near, np.linspace(0, 1, 5))
+    np.testing.assert_allclose(height[2], [0.1, 0.15, 0.2, 0.25, 0.3], atol=1e-7)
+    assert np.isinf(np.delete(height, 2, axis=0)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float16, ">f4", np.longdouble, np.float64])
+def test_depth_of_any_float_type_is_mapped(dtype) -> None:
+    frame = boxes_frame([BOX])
+    other = replace(frame, depth=frame.depth.astype(dtype))
+    expected, found = (height_map_from_frame(f, Workspace()).height for f in (frame, other))
+    # Half floats have 0.5 mm at this distance, and edges move with them.
+    assert (np.abs(found - expected) < 1e-3).mean() > (0.97 if dtype is np.float16 else 0.9999)

@@ -49,7 +49,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = (  # whose versions may change a result
     "numpy", "scipy", "torch", "torchvision", "pybullet", "mujoco", "gymnasium", "pydantic",
     "opencv-python-headless", "pillow", "trimesh", "manifold3d", "pycollada", "yourdfpy",
-    "h5py",
+    "h5py", "numba", "llvmlite",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of the container, where it has one

@@ -144,8 +144,8 @@ class ImageGrasp:
 class RGBDFrame:
     """An RGB-D image and all that is needed to turn its pixels into points.
 
-    rgb: (H, W, 3) uint8. depth: (H, W) float32 metres along the optical axis; 0, negative or not
-        finite where it is unknown (`known_depth`).
+    rgb: (H, W, 3) uint8. depth: (H, W) float32 (or float64; others become float32) metres along
+        the optical axis; 0, negative or not finite where it is unknown (`known_depth`).
     K: (3, 3) pinhole matrix in pixels. T_WC: (4, 4) camera pose in the world.
     segmentation: (H, W) int32, the index of the object seen at each pixel in scene order, -1 for
         table and background, -2 for the robot; or None. Labels and pictures use it; planners that
@@ -178,6 +178,8 @@ class RGBDFrame:
         """Raises UserError where an image, K, T_WC or a target is none, and where the images
         differ in size. A target of numbers is True where it is not 0."""
         check_images(self.rgb, self.depth)
+        if self.depth.dtype not in (np.float32, np.float64):  # other sizes, or another byte order
+            object.__setattr__(self, "depth", self.depth.astype(np.float32))
         K, T = np.asarray(self.K, dtype=float), np.asarray(self.T_WC, dtype=float)
         if K.shape != (3, 3):
             raise UserError(f"K: got an array of shape {K.shape}, expected (3, 3) pixels")
