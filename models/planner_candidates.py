@@ -67,17 +67,14 @@ class Candidates:
     @staticmethod
     def joined(parts: Sequence[Candidates]) -> Candidates:
         """All candidates of several lists."""
-        columns = (
-            np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(Candidates)
-        )
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS)
         return Candidates(*columns)
 
     def __len__(self) -> int:
         return len(self.angle)
 
     def take(self, index) -> Candidates:
-        return Candidates(*(getattr(self, field.name)[index] for field in fields(self)))
+        return Candidates(*(getattr(self, name)[index] for name in COLUMNS))
 
     def best(self, count: int) -> Candidates:
         """The `count` best feasible candidates, best first."""
@@ -87,8 +84,8 @@ class Candidates:
     def replaced(self, index: np.ndarray, others: Candidates) -> Candidates:
         """All candidates, with `others` in the places `index`."""
         result = self.take(np.arange(len(self)))
-        for field in fields(self):
-            getattr(result, field.name)[index] = getattr(others, field.name)
+        for name in COLUMNS:
+            getattr(result, name)[index] = getattr(others, name)
         return result
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +109,9 @@ class Candidates:
                 middle, height, self.angle, self.opening.tolist(), self.score.tolist()
             )
         ]
+
+
+COLUMNS = tuple(field.name for field in fields(Candidates))
 
 
 def closing_axes(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ peaks of such a map, or of any image. This module knows no simulator and no netw
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -129,12 +130,18 @@ class HeightMap:
 
 def grid_points(workspace: Workspace, margin: float, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Centres (R, C, 2) of the cells over the workspace widened by `margin`, and the first one."""
-    half = workspace.size / 2 + margin
+    points = _grid(*map(float, workspace.centre), workspace.size / 2 + margin, cell)
+    return points, points[0, 0].copy()
+
+
+@functools.lru_cache(maxsize=8)  # the same for each frame of a cell
+def _grid(x: float, y: float, half: float, cell: float) -> np.ndarray:
+    """(R, C, 2) read-only centres of the cells of a square around (x, y); all in metres."""
     count = int(np.floor(2 * half / cell)) + 1
     steps = (np.arange(count) - (count - 1) / 2) * cell
-    x, y = np.meshgrid(workspace.centre[0] + steps, workspace.centre[1] + steps)
-    points = np.stack([x, y], axis=-1)
-    return points, points[0, 0]
+    points = np.stack(np.meshgrid(x + steps, y + steps), axis=-1)
+    points.setflags(write=False)
+    return points
 
 
 def tilted_view(approach: np.ndarray, workspace: Workspace) -> np.ndarray:
