@@ -152,7 +152,14 @@ def critic_inputs(
 
 
 @compiled
-def _patches(where, tip, own, height, ceiling, label):
+def _patches(
+    where: np.ndarray,
+    tip: np.ndarray,
+    own: np.ndarray,
+    height: np.ndarray,
+    ceiling: np.ndarray,
+    label: np.ndarray,
+) -> np.ndarray:
     """(N, 3, V, U) int8 as of `CriticInputs`, of the flat cells `where` (N, V, U) of a map. tip,
     own: (N,) of the candidates."""
     count, lines, places = where.shape
@@ -178,7 +185,16 @@ def object_size(found: Candidates, heights: HeightMap) -> np.ndarray:
 
 
 @compiled
-def _sizes(own, along, across, row, column, label, over_table, cell):
+def _sizes(
+    own: np.ndarray,
+    along: np.ndarray,
+    across: np.ndarray,
+    row: np.ndarray,
+    column: np.ndarray,
+    label: np.ndarray,
+    over_table: np.ndarray,
+    cell: float,
+) -> np.ndarray:
     """(3, N) as of `object_size`. own: (N,) the labels of candidates with the axes along and across
     (N, 2). row, column, label, over_table: (K,) of the map's cells of objects, m; `cell` m wide."""
     size = np.zeros((3, len(own)))

@@ -90,7 +90,7 @@ def labelled_by_centres(
 
 
 @compiled
-def _nearest(votes, centres, reach):
+def _nearest(votes: np.ndarray, centres: np.ndarray, reach: float) -> np.ndarray:
     """(N,) which of the centres (M, 2) each vote (N, 2) is nearest to, -1 where none is nearer than
     `reach`."""
     owner = np.full(len(votes), -1)

@@ -13,7 +13,17 @@ from utils.compiled import compiled
 
 
 @compiled
-def cells_around(xy, along, across, u, v, origin, cell, rows, columns):
+def cells_around(
+    xy: np.ndarray,
+    along: np.ndarray,
+    across: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    origin: np.ndarray,
+    cell: float,
+    rows: int,
+    columns: int,
+) -> np.ndarray:
     """(M, V, U) indices of the cells of a map (rows, columns) that are u (U,) along and v (V,)
     across from each place xy (M, 2); the nearest cell if outside. origin: (2,), cell: m."""
     where = np.empty((len(xy), len(v), len(u)), np.intp)
@@ -32,7 +42,9 @@ def cells_around(xy, along, across, u, v, origin, cell, rows, columns):
 
 
 @compiled
-def first_contacts(height, level, window, u, cell):
+def first_contacts(
+    height: np.ndarray, level: np.ndarray, window: np.ndarray, u: np.ndarray, cell: float
+) -> np.ndarray:
     """(2, N, V) m, where each line of heights (M, V, U) first rises over a level (N,), from the
     left and from the right; +inf and -inf where it does not. window: (N, U) bool, where it counts.
     u: (U,) m, the middles of the cells along the lines, which are `cell` m wide."""
@@ -53,7 +65,7 @@ def first_contacts(height, level, window, u, cell):
 
 
 @compiled
-def highest_across(surface, where, some):
+def highest_across(surface: np.ndarray, where: np.ndarray, some: np.ndarray) -> np.ndarray:
     """(K, U) m, the highest surface, m, of all lines of the candidates `some` (K,)."""
     highest = np.empty((len(some), where.shape[2]), surface.dtype)
     for i in range(len(some)):
@@ -68,8 +80,18 @@ def highest_across(surface, where, some):
 
 @compiled
 def widest_opening(
-    obstacles, beside, width, tip, rooms, offset, most, outline, least_room, clearance, inner
-):
+    obstacles: np.ndarray,
+    beside: np.ndarray,
+    width: np.ndarray,
+    tip: np.ndarray,
+    rooms: np.ndarray,
+    offset: float,
+    most: float,
+    outline: np.ndarray,
+    least_room: float,
+    clearance: float,
+    inner: float,
+) -> np.ndarray:
     """(K,) widest opening, m, of fingers that come straight down over candidates whose lines meet
     obstacles (K, U) m at the places `beside` (K, U) from the middle of their contacts; 0 where none
     is free.
@@ -106,7 +128,7 @@ def widest_opening(
 
 
 @compiled
-def _interpolated(place, outline):
+def _interpolated(place: float, outline: np.ndarray) -> float:
     """The height of an outline (P, 2) at a place, infinite beyond its end; as `np.interp`."""
     last = len(outline) - 1
     if place >= outline[last, 0]:
@@ -119,7 +141,7 @@ def _interpolated(place, outline):
 
 
 @compiled
-def least_gap(surface, where, underside):
+def least_gap(surface: np.ndarray, where: np.ndarray, underside: np.ndarray) -> np.ndarray:
     """(M,) m, the smallest gap between an underside (V,), m, and the surface, m, on the lines below
     it."""
     gap = np.empty(len(where))
@@ -135,7 +157,9 @@ def least_gap(surface, where, underside):
 
 
 @compiled
-def share_over(surface, where, some, under, tip):
+def share_over(
+    surface: np.ndarray, where: np.ndarray, some: np.ndarray, under: np.ndarray, tip: np.ndarray
+) -> np.ndarray:
     """(K,) share of the cells beside the candidates `some` (K,) whose surface, m, rises over the
     fingertips `tip` (K,) and what is `under` (K, U) them, m over the tips."""
     share = np.empty(len(some))

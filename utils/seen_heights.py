@@ -314,7 +314,9 @@ def _around(frame: RGBDFrame, workspace: Workspace) -> tuple[slice, slice]:
     return rows, columns
 
 
-def _surface(frame: RGBDFrame, origin: np.ndarray, cell: float, split: int, shape) -> np.ndarray:
+def _surface(
+    frame: RGBDFrame, origin: np.ndarray, cell: float, split: int, shape: tuple[int, int]
+) -> np.ndarray:
     """(R, C) float32 highest z of the frame's points in each cell; -inf where there is none.
 
     Each pixel with a depth stands for split x split points of its square (`subpixels`).
@@ -330,7 +332,14 @@ def _surface(frame: RGBDFrame, origin: np.ndarray, cell: float, split: int, shap
 
 
 @compiled
-def _raise_to_surface(height, depth, known, rays, start, sub):
+def _raise_to_surface(
+    height: np.ndarray,
+    depth: np.ndarray,
+    known: np.ndarray,
+    rays: np.ndarray,
+    start: np.ndarray,
+    sub: np.ndarray,
+) -> None:
     """Raise heights (R, C), cells of a grid, to the points of an image's pixels, each spread over
     the places `sub` along both sides. rays: (3, 3) from pixels to cells, cells and metres at a
     depth of 1 m. start: (3,) the camera, likewise."""
@@ -352,7 +361,9 @@ def _raise_to_surface(height, depth, known, rays, start, sub):
                         height[place] = max(height[place], np.float32(z))
 
 
-def _grazed(frame: RGBDFrame, origin: np.ndarray, cell: float, shape) -> np.ndarray:
+def _grazed(
+    frame: RGBDFrame, origin: np.ndarray, cell: float, shape: tuple[int, int]
+) -> np.ndarray:
     """(R, C) float32 highest z, in each cell, of the rays between neighbouring pixels whose depths
     differ by GRAZING_JUMP, beside each other and one below the other; -inf where there is none."""
     height = np.full(shape, -np.inf, np.float32)
@@ -381,7 +392,9 @@ def _grazed(frame: RGBDFrame, origin: np.ndarray, cell: float, shape) -> np.ndar
 
 
 @compiled
-def _raise_to_rays(height, near, along, share):
+def _raise_to_rays(
+    height: np.ndarray, near: np.ndarray, along: np.ndarray, share: np.ndarray
+) -> None:
     """Raise heights (R, C) to points at shares (S,) of the way from near (3, N) `along` (3, N):
     columns and rows, in cells, and metres."""
     rows, columns = height.shape
