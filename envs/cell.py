@@ -25,7 +25,14 @@ from utils.config import CameraConfig, Config
 from utils.depth import seeded_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
-from utils.geometry import HANGS_FROM, SceneGeometry, SolidObject
+from utils.geometry import (
+    HANGS_FROM,
+    TRAY_CENTRE,
+    TRAY_HALF_SIZE,
+    TRAY_WALL,
+    SceneGeometry,
+    SolidObject,
+)
 from utils.random_streams import Stream
 from utils.random_view import RandomView
 from utils.transforms import RGBDFrame, look_at
@@ -112,6 +119,7 @@ def wrist_mount(camera: CameraConfig) -> np.ndarray:
 TABLE_OR_BACKGROUND, ROBOT = -1, -2  # in RGBDFrame.segmentation
 # An object farther than this share of the workspace's side from its centre is out of the round.
 _REACH = 0.63
+_HIDDEN_DEPTH = 0.5  # m under the table, where no camera sees an object
 
 
 class PhysicsError(RuntimeError):
@@ -318,9 +326,22 @@ class Cell(ABC):
         )
 
     def retire(self, index: int) -> None:
-        """Take an object out of the round: it stays visible where it is but collides no more."""
+        """Take an object out of the round: it collides no more. It stays visible where all of it
+        lies over the tray; else it is put out of sight, as a camera would show a planner what no
+        hand can touch."""
         self.remaining.discard(index)
+        T = self.object_pose(index)
+        if not self._over_tray(index, T):
+            T[2, 3] = -_HIDDEN_DEPTH
+            self.carry(index, T, np.zeros(3), 0.0)
         self._immobilise(index)
+
+    def _over_tray(self, index: int, T_WO: np.ndarray) -> bool:
+        """Whether all of an object at T_WO (4, 4) lies above the square that the tray covers."""
+        solids = self.scene.placements[index].model.geometry()
+        corners = np.concatenate([solid.transformed(T_WO).vertices for solid in solids])
+        away = np.abs(corners[:, :2] - TRAY_CENTRE).max()
+        return bool(away <= TRAY_HALF_SIZE + TRAY_WALL and corners[:, 2].max() > 0)
 
     @abstractmethod
     def _immobilise(self, index: int) -> None:

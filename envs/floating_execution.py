@@ -31,7 +31,6 @@ PREGRASP = 0.05  # m back along the approach, where the hand is put: VGN's
 RETREAT = 0.10  # m, VGN's
 SIDEWAYS = np.pi / 3  # rad of tilt beyond which VGN's hand retreats straight up
 CARRY, CARRY_SPEED = np.array([0.0, -0.25, 0.0]), 1.0  # m, m/s: towards an arm's tray
-_HIDDEN_DEPTH = 0.5  # m under the table, where a removed object is out of sight
 
 
 def clears_table(cell: Cell, grasp: Grasp) -> bool:
@@ -56,7 +55,7 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     start = cell.seconds
     outcome = _not_empty(cell, attempt(cell, grasp))
     if outcome.success and outcome.object_index is not None:
-        _remove(cell, outcome.object_index)
+        cell.retire(outcome.object_index)
     park(floating_hand(cell), cell.config.workspace)
     _let_rest(cell)
     cell.check_physics()
@@ -194,14 +193,6 @@ def _not_empty(cell: Cell, outcome: GraspOutcome) -> GraspOutcome:
     )
     detail = ", and ".join(filter(None, [outcome.detail, thin]))
     return replace(outcome, reason="missed", detail=detail)
-
-
-def _remove(cell: Cell, index: int) -> None:
-    """Take an object out of the round and out of sight."""
-    T = cell.object_pose(index)
-    T[2, 3] = -_HIDDEN_DEPTH
-    cell.carry(index, T, np.zeros(3), 0.0)
-    cell.retire(index)
 
 
 def _let_rest(cell: Cell) -> None:

@@ -15,9 +15,10 @@ from envs.mujoco_cell import MujocoCell
 from envs.object_primitives import NativeShape
 from envs.objects import load_object_set
 from models.planners import make_planner
+from tests.helpers.cubes import cube_scene
 from tests.helpers.simulators import pybullet
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import TRAY_CENTRE, GripperGeometry, Workspace
 from utils.transforms import position_quaternion
 
 
@@ -75,6 +76,28 @@ def test_what_leans_on_a_retired_object_wakes_and_falls(config, box_set):
         cell.retire(0)
         cell.step(24)  # 0.1 s: by 4.9 cm of its 6
         assert cell.object_position(1)[2] == pytest.approx(0.09 - 9.81 * 0.1**2 / 2, abs=3e-3)
+
+
+@pytest.mark.parametrize("off_centre, stays", [(0.0, True), (0.10, True), (0.12, False)], ids=str)
+def test_a_retired_object_stays_in_the_tray_and_nowhere_else(cells, box_set, off_centre, stays):
+    """A cube of 6 cm; the tray is 26 cm wide, and its walls 5 mm thick."""
+    one = make_scene("isolated", box_set, 0, cells[0].config).placements[0]
+    place = np.array([*(TRAY_CENTRE + [0.0, off_centre]), 0.03])
+    level = replace(one, position=place, quaternion=np.array([0, 0, 0, 1.0]))
+    for cell in cells:
+        cell.build(Scene("isolated", 0, (level,)))
+        cell.retire(0)
+        cell.step(24)
+        depth = -0.5 if not stays else 0.03
+        assert cell.object_position(0) == pytest.approx([*place[:2], depth], abs=1e-4)
+
+
+def test_no_camera_sees_what_was_taken_from_the_table(cells, box_set):
+    for cell in cells:
+        cell.load(cube_scene(box_set))
+        assert (cell.frame().depth < 0.75).sum() > 500
+        cell.retire(0)
+        assert cell.frame().depth.min() > 0.79
 
 
 @pytest.mark.slow
