@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from models.graspnet_parts import joined_parts
 from utils.compiled import compiled
 from utils.depth_holes import nearest_values
 from utils.height_map import HeightMap, base_heights, local_maxima
@@ -43,50 +44,72 @@ def labelled_by_centres(
 
     offset: (2, h, w) pixels to the centre of mass, at the network's scale; `scaling` takes the
     frame's pixels to it. Every labelled cell keeps a label. The votes give a centre's place in the
-    image; its height is the centroid of the columns under the object's visible surface, an estimate
-    that is too low where the object rests on others.
+    image, unless the votes of several parts of one object met (`models.graspnet_parts`); else its
+    place and always its height are those of the centroid of the columns under the object's visible
+    surface, an estimate that is too low where the object rests on others.
     """
     row, column = np.nonzero(heights.label >= 0)
     height = heights.height[row, column]
     surface = np.column_stack(
         [heights.origin + heights.cell * np.column_stack([column, row]), height]
     )
+    pixels, _ = project(surface, frame.K, frame.T_WC)
     # NaN, behind the camera, is outside the image, too.
-    place = np.nan_to_num(scaling.pixels(project(surface, frame.K, frame.T_WC)[0]), nan=-2.0)
+    place = np.nan_to_num(scaling.pixels(pixels), nan=-2.0)
     limits = offset.shape[2] - 1, offset.shape[1] - 1
     within = np.clip(place, 0, limits)
     u, v = np.rint(within).astype(int).T
     votes = within + offset[:, v, u].T
     # Hidden cells do not vote: their height is borrowed, and their pixel shows something else. Nor
     # do those outside the image, which belong to what the border shows.
-    seen = heights.ceiling[row, column] <= height
-    seen &= (np.abs(place - within) <= 1).all(axis=1)
+    shown = heights.ceiling[row, column] <= height
     behind = np.zeros(len(row), bool)
     if frame.second is not None:
         behind = hides(frame, surface)
-    seen &= ~behind
+    shown &= ~behind
+    seen = shown & (np.abs(place - within) <= 1).all(axis=1)
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
     if len(centres) == 0:
         return heights
-    count, owner = len(centres), _nearest(votes, centres, settings.reach)
-    owner = np.where(owner >= 0, owner, count + heights.label[row, column])
+    count, piece = len(centres), heights.label[row, column]
+    owner = _nearest(votes, centres, settings.reach)
+    owner = np.where(owner >= 0, owner, count + piece)
+    part = np.full(heights.label.shape, -1)
+    part[row[shown], column[shown]] = owner[shown]
+    colour, most = _colours(frame.rgb, pixels[shown]), count + len(heights.centres)
+    whole = joined_parts(part, votes[shown], height[shown], colour, most, heights.cell)
+    owner = whole[owner]
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = owner
     if behind.any():
-        label = _as_beside(label, heights.label, row[behind], column[behind], count)
+        rest = whole[count + piece[behind]]
+        label = _as_beside(label, heights.label, row[behind], column[behind], rest)
 
-    rise, base = height - heights.table_height, np.zeros(count)
+    parts = np.bincount(whole)
+    base = np.full(len(parts), heights.table_height)
     if heights.fixed is not None:
-        base = base_heights(label, heights.fixed, heights.table_height)[:count]
-        base = base - heights.table_height
-        rise = np.maximum(rise - np.append(base, 0.0)[np.minimum(owner, count)], 0.0)
-    total = np.bincount(owner, rise, count)[:count]
-    mean = base + np.bincount(owner, rise**2, count)[:count] / (2 * np.maximum(total, 1e-9))
+        on = base_heights(label, heights.fixed, heights.table_height)
+        base[: len(on)] = on
+    rise = np.maximum(height - base[owner], 0.0)
+    total = np.maximum(np.bincount(owner, rise, len(parts)), 1e-9)
+    middle = base + np.bincount(owner, rise**2, len(parts)) / (2 * total)
     ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
     eye = frame.T_WC[:3, 3]
-    share = (heights.table_height + mean - eye[2]) / (ahead[:, 2] - eye[2])
-    found = eye + share[:, None] * (ahead - eye)
-    return replace(heights, label=label, centres=np.concatenate([found, heights.centres]))
+    share = (middle[whole[:count]] - eye[2]) / (ahead[:, 2] - eye[2])
+    found = np.empty((len(parts), 3))
+    found[whole] = np.concatenate([eye + share[:, None] * (ahead - eye), heights.centres])
+    several = parts > 1
+    if several.any():  # the votes of parts say nothing of the whole's centre
+        place = [np.bincount(owner, rise * along, len(parts)) / total for along in surface.T[:2]]
+        found[several] = np.column_stack([*place, middle])[several]
+    return replace(heights, label=label, centres=found)
+
+
+def _colours(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(N, 3) of an image (H, W, 3) at pixels (N, 2), at the nearest one if outside."""
+    rows, columns = rgb.shape[:2]
+    u, v = np.rint(np.clip(np.nan_to_num(pixels), 0, (columns - 1, rows - 1))).astype(int).T
+    return rgb[v, u]
 
 
 @compiled
@@ -105,15 +128,14 @@ def _nearest(votes: np.ndarray, centres: np.ndarray, reach: float) -> np.ndarray
 
 
 def _as_beside(
-    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, count: int
+    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
     """Labels (R, C) whose cells (N,) that only a second frame shows are those of the nearest other
-    cell of the same `piece` (R, C), or the piece itself, after `count` objects, where there is
-    none."""
+    cell of the same `piece` (R, C), or their `rest` (N,) where there is none."""
     others = label >= 0
     others[row, column] = False
     label = label.copy()
-    label[row, column] = count + piece[row, column]
+    label[row, column] = rest
     if others.any():
         nearest, its_piece = (nearest_values(values, others) for values in (label, piece))
         same = its_piece[row, column] == piece[row, column]

@@ -303,6 +303,34 @@ def test_what_the_image_cuts_off_is_one_object_with_what_it_shows() -> None:
     np.testing.assert_allclose(found.centres[0], [0.5, 0.15, 0.025], atol=0.002)
 
 
+def three_votes(frame: RGBDFrame) -> np.ndarray:
+    """(2, H, W) of a head that takes a beam along y for three objects, as it does where they are
+    larger than what it learned from: votes for three places, and some between them."""
+    v, u = np.mgrid[:224, :224]
+    along = frame.points()[..., 1]
+    voted = np.interp(along, (-0.06, -0.02, 0.02, 0.06), (-0.045, 0.0, 0.0, 0.045))
+    places, _ = project(
+        np.stack([np.full(along.shape, 0.5), voted, np.full(along.shape, 0.02)], axis=-1),
+        frame.K,
+        frame.T_WC,
+    )
+    return np.moveaxis(places, -1, 0) - np.stack([u, v])
+
+
+def test_a_long_beam_is_one_object_unless_it_has_several_colours() -> None:
+    """2 x 24 x 4 cm; the middle third may be red."""
+    frame = boxes_frame([((0.02, 0.24, 0.04), 0.0, (0.5, 0.0))])
+    heights = height_map_from_frame(frame, Workspace())
+    found = labelled_by_centres(heights, frame, SAME, three_votes(frame))
+    labels = found.label[found.label >= 0]
+    assert len(set(labels)) == 1
+    np.testing.assert_allclose(found.centres[labels[0]], [0.5, 0.0, 0.02], atol=0.002)
+    rgb = frame.rgb.copy()
+    rgb[np.abs(frame.points()[..., 1]) < 0.04] = (200, 30, 30)
+    found = labelled_by_centres(heights, replace(frame, rgb=rgb), SAME, three_votes(frame))
+    assert len(set(found.label[found.label >= 0])) == 3
+
+
 def test_what_lies_behind_the_first_camera_casts_no_votes() -> None:
     """A low camera looks along the table from its middle; the second one sees a box behind it."""
     boxes = [TOUCHING[0], ((0.04, 0.04, 0.05), 0.0, (0.40, 0.0))]
