@@ -76,7 +76,7 @@ def labelled_by_centres(
     owner = np.where(owner >= 0, owner, count + piece)
     part = np.full(heights.label.shape, -1)
     part[row[shown], column[shown]] = owner[shown]
-    colour, most = _colours(frame.rgb, pixels[shown]), count + len(heights.centres)
+    colour, most = colours_at(frame.rgb, pixels[shown]), count + len(heights.centres)
     whole = joined_parts(part, votes[shown], height[shown], colour, most, heights.cell)
     owner = whole[owner]
     label = np.minimum(heights.label, -1)  # table and walls stay
@@ -105,7 +105,7 @@ def labelled_by_centres(
     return replace(heights, label=label, centres=found)
 
 
-def _colours(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def colours_at(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """(N, 3) of an image (H, W, 3) at pixels (N, 2), at the nearest one if outside."""
     rows, columns = rgb.shape[:2]
     u, v = np.rint(np.clip(np.nan_to_num(pixels), 0, (columns - 1, rows - 1))).astype(int).T

@@ -7,6 +7,7 @@ from models.graspnet_parts import PartSettings, joined_parts
 
 CELL = 0.002
 BROWN, GREEN = (150, 100, 60), (60, 150, 100)
+USUAL = PartSettings()
 
 
 def halves(columns=20, rows=20, gap=0):
@@ -16,7 +17,7 @@ def halves(columns=20, rows=20, gap=0):
     return label
 
 
-def joined(label, votes=1.0, step=0.0, colours=(BROWN, BROWN), settings=PartSettings()):
+def joined(label, votes=1.0, step=0.0, colours=(BROWN, BROWN), settings=USUAL):
     """What becomes of two parts whose votes (pixels) and heights (m) differ by so much; both may be
     given for each row."""
     rows = np.ones(len(label))

@@ -1,0 +1,100 @@
+"""How well GraspNet's votes tell objects apart: python -m benchmarks.bench_objects [--json FILE]
+
+Frames of training objects with `realsense` noise; the objects of the height map that the planners
+get, beside the true ones. `cut`: share of the objects of which no part of the map has 70 % of what
+is seen of them. `joined`: of which the part that has most is less than 70 % theirs. With
+`--one-colour`, objects are told apart as if all had the same colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.metrics import Metric, benchmark_parser, natural_number, positive_int, report
+from envs.cell_scenes import make_scene
+from envs.objects import load_object_set
+from envs.simulators import make_cell
+from models import graspnet_objects
+from models.graspnet_io import SHIPPED
+from models.graspnet_view import NetworkView
+from models.planner_graspnet import loaded
+from utils.config import Config, load_config
+from utils.depth_correction import corrected
+from utils.height_map import CELL, height_map_from_scene
+from utils.runs import run_script
+
+# Scenarios, their object sets and how many objects stand in a scene; None: as many as usual.
+SCENES = (
+    ("household", "household", None), ("pile", "primitives", None), ("pile", "random_urdfs", None),
+    ("packed", "primitives", None), ("packed", "random_urdfs", None),
+    ("pile", "random_urdfs", 15), ("bin", "primitives", None), ("flat", "flat", None),
+)  # fmt: skip
+FIRST_SEED = 97_900_000
+LEAST_CELLS = 100  # 4 cm2, of what is seen of an object that counts
+SHARE = 0.7
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = benchmark_parser(__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=positive_int, default=12, help="of each kind")
+    parser.add_argument("--seed", type=natural_number, default=FIRST_SEED, help="of the first one")
+    parser.add_argument("--one-colour", action="store_true", help="colours tell nothing apart")
+    options = parser.parse_args(argv)
+    if options.one_colour:
+        graspnet_objects.colours_at = _grey
+    count = 1 if options.quick else options.scenes
+    metrics = []
+    for scenario, objects, clutter in tqdm(SCENES, unit="set"):
+        settings = ["sim.renderer=tiny", "objects.split=train", "camera.depth_noise=realsense"]
+        more = [] if clutter is None else [f"scene.count={clutter}"]
+        config = load_config(None, settings + more)
+        found = np.concatenate(list(told_apart(config, scenario, objects, options.seed, count)))
+        name = f"{scenario}{clutter or ''}_{objects}"
+        metrics += [
+            Metric(f"{name}_objects", len(found), ""),
+            *(Metric(f"{name}_{fault}", share, "") for fault, share in zip(
+                ("cut", "joined"), found.mean(axis=0)
+            )),
+        ]  # fmt: skip
+    report(metrics, options.json)
+
+
+def told_apart(config: Config, scenario: str, name: str, first_seed: int, count: int):
+    """Yields (M, 2) bool of each scene: which of its objects are cut, and which are joined."""
+    objects = load_object_set(
+        name, cache_dir=config.cache_folder, max_opening=config.gripper.max_opening,
+        **config.objects.model_dump(),
+    )  # fmt: skip
+    workspace, network = config.workspace.geometry, loaded(SHIPPED)
+    with make_cell(config) as cell:
+        for seed in range(first_seed, first_seed + count):
+            cell.load(make_scene(scenario, objects, seed, config))
+            frame = corrected(cell.frame(), workspace.table_height)
+            label = NetworkView(network, frame, workspace, crop=True).heights.label
+            truth = height_map_from_scene(cell.truth(), workspace, cell=CELL).label
+            yield faults(label, truth)
+
+
+def faults(label: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(M, 2) bool, cut and joined, of the M objects of which enough is seen. label, truth: (R, C)
+    int, negative where there is no object."""
+    found = []
+    for own in np.unique(truth[truth >= 0]):
+        there = truth == own
+        parts, cells = np.unique(label[there & (label >= 0)], return_counts=True)
+        if cells.sum() < LEAST_CELLS:
+            continue
+        matter = (label == parts[cells.argmax()]) & (truth >= 0)
+        found.append((cells.max() < SHARE * cells.sum(), cells.max() < SHARE * matter.sum()))
+    return np.array(found, bool).reshape(-1, 2)
+
+
+def _grey(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    return np.full((len(pixels), 3), 128, np.uint8)
+
+
+if __name__ == "__main__":
+    run_script(main)
