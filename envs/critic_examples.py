@@ -1,11 +1,11 @@
 """Examples for the critic: what the planners see of their candidates, and what becomes of them.
 
-Scenes of training objects, household things and some larger than usual among them, are seen by a
-camera from above or from a side, with one of the depth noises. A floating hand, half the time by
-VGN's rule of when it is empty, executes some of the candidates and carries away what it grips
-(`envs.floating_execution`): half of them drawn at random, the others those of the rest that the
-shipped critic likes best, so that the next one learns what this one overrates. The examples of a
-scene are a pure function of the config, its number and the shipped critic.
+Scenes of training objects, household and rounded things and some larger than usual among them, are
+seen by a camera from above or from a side, with one of the depth noises. A floating hand, half the
+time by VGN's rule of when it is empty, executes some of the candidates and carries away what it
+grips (`envs.floating_execution`): half of them drawn at random, the others those of the rest that
+the shipped critic likes best, so that the next one learns what this one overrates. The examples of
+a scene are a pure function of the config, its number and the shipped critic.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _LAYOUTS = {
 _LARGE, _LARGE_SHARE = {"random_urdfs": 1.0, "primitives": 1.3}, 0.35
 _OWN_SETS = {
     "tall": ("tall",), "wall": ("tall", "flat"), "shelf": ("tall",), "flat": ("flat",),
-    "household": ("household",),
+    "household": ("household", "rounded"),
 }  # fmt: skip
 _NOISES = {"none": 0.25, "realsense": 0.35, "gaussian": 0.2, "kinect": 0.1, "gamma": 0.1}
 _FROM_ABOVE = 0.4  # share of cameras within 15 degrees of the vertical; the others up to 65
@@ -225,7 +225,7 @@ def _planners_of(config: Config, as_vgn: bool) -> list[WithCritic]:
 @kept
 def _sets_of(config: Config) -> dict[str, ObjectSet]:
     """Of each name, and those of `_LARGE` once more as NAME, large."""
-    names = dict.fromkeys([*usual_sets(config), "tall", "flat"])
+    names = dict.fromkeys([*usual_sets(config), "tall", "flat", "rounded"])
     kinds = {name: (name, config.objects.scale) for name in names}
     kinds |= {_large(name): (name, scale) for name, scale in _LARGE.items() if name in names}
     settings = config.objects.model_dump() | {"split": "train"}

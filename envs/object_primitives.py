@@ -1,11 +1,12 @@
 """Procedural solids: eleven families, four that no training sees, four of thin and dark things,
-three of tall, three of flat and ten of household ones, each object determined by its index alone.
+three of tall, three of flat, ten of household and four of rounded ones, each object determined by
+its index alone.
 
-A hand that opens 0.08 m can grasp every one of them, but for flat and household ones, in every
-resting pose: across the whole, across a bar, or across a wall with one finger inside. Flat ones are
-wider than the hand and too thin to be gripped from above where they lie on a table. Household ones
-have the sizes and masses of what lies in kitchens and on workbenches: some are wider than the hand
-as they lie, or however they lie. This module knows no simulator.
+A hand that opens 0.08 m can grasp every one of them, but for flat, household and rounded ones, in
+every resting pose: across the whole, across a bar, or across a wall with one finger inside. Flat
+ones are wider than the hand and too thin to be gripped from above where they lie on a table. House-
+hold and rounded ones have the sizes and masses of what lies in kitchens and on workbenches: some
+are wider than the hand as they lie, or however they lie. This module knows no simulator.
 """
 
 from __future__ import annotations
@@ -32,10 +33,16 @@ HOUSEHOLD_MASSES = {
     "toy": (0.03, 0.2), "banana": (0.05, 0.2),
 }  # fmt: skip
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD_MASSES)
+# Soft or worn ones, without an edge: fingers slip off where their sides lean.
+ROUNDED_MASSES = {
+    "soap": (0.05, 0.2), "loaf": (0.1, 0.8), "cushion": (0.01, 0.3), "pebble": (0.03, 0.4),
+}  # fmt: skip
+ROUNDED_FAMILIES = tuple(ROUNDED_MASSES)
 _STREAMS = {
     FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,), TALL_FAMILIES: (3,),
-    FLAT_FAMILIES: (4,), HOUSEHOLD_FAMILIES: (5,),
+    FLAT_FAMILIES: (4,), HOUSEHOLD_FAMILIES: (5,), ROUNDED_FAMILIES: (6,),
 }  # fmt: skip
+_MASSES = HOUSEHOLD_MASSES | ROUNDED_MASSES
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _DENSITIES, _MASS_RANGE = (300, 1500), (0.03, 0.3)  # of the other families
@@ -103,8 +110,8 @@ def make_primitive(
     else:
         parts = tuple(scale * part for part in shape)
         volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)
-    if family in HOUSEHOLD_MASSES:
-        mass = rng.uniform(*HOUSEHOLD_MASSES[family])
+    if family in _MASSES:
+        mass = rng.uniform(*_MASSES[family])
         density = float(np.clip(mass / volume, *_HOUSEHOLD_DENSITIES))
     else:
         masses = (mass / volume for mass in _MASS_RANGE)
@@ -438,6 +445,46 @@ def _banana(rng) -> list[np.ndarray]:
     return _ribbon(_arc(length, rng.uniform(0.4, 1.6), 6), side, (0, side))
 
 
+def _superellipsoid(half: np.ndarray, upright: float, around: float) -> list[np.ndarray]:
+    """One convex solid |(x/a)^(2/n) + (y/b)^(2/n)|^(n/e) + |z/c|^(2/e) <= 1 (Barr, IEEE Computer
+    Graphics and Applications 1981): a box where both exponents e, `upright`, and n, `around`, are
+    small, an ellipsoid where they are 1. half: (3,) a, b and c, metres."""
+    height = np.linspace(-np.pi / 2, np.pi / 2, 9)[:, None]
+    turn = np.arange(_SEGMENTS) * 2 * np.pi / _SEGMENTS
+
+    def power(value: np.ndarray, exponent: float) -> np.ndarray:
+        return np.sign(value) * np.abs(value) ** exponent
+
+    out = power(np.cos(height), upright)
+    x, y = out * power(np.cos(turn), around), out * power(np.sin(turn), around)
+    z = power(np.sin(height), upright) + 0 * x
+    corners = half * np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return [np.asarray(trimesh.convex.convex_hull(corners).vertices)]
+
+
+def _soap(rng) -> list[np.ndarray]:
+    half = rng.uniform((0.025, 0.018, 0.01), (0.055, 0.036, 0.022))
+    return _superellipsoid(half, *rng.uniform((0.3, 0.3), (0.9, 1.0)))
+
+
+def _loaf(rng) -> list[np.ndarray]:
+    """Bread, a box whose edges are worn; half of them are wider than the hand."""
+    half = rng.uniform((0.04, 0.025, 0.02), (0.09, 0.055, 0.04))
+    return _superellipsoid(half, *rng.uniform((0.15, 0.15), (0.6, 0.7)))
+
+
+def _cushion(rng) -> list[np.ndarray]:
+    """A sponge or a filled pouch: its sides lean from the middle of its height on."""
+    half = rng.uniform((0.035, 0.022, 0.006), (0.075, 0.055, 0.02))
+    return _superellipsoid(half, *rng.uniform((0.6, 0.15), (1.5, 0.7)))
+
+
+def _pebble(rng) -> list[np.ndarray]:
+    """A potato or a stone."""
+    half = rng.uniform((0.02, 0.015, 0.01), (0.06, 0.042, 0.035))
+    return _superellipsoid(half, *rng.uniform((0.8, 0.8), (1.2, 1.2)))
+
+
 # Bounds in metres. Of a convex solid of the first families the two smaller sides stay below 0.06:
 # one of them is always across when it lies on a face.
 _SHAPES = {
@@ -490,4 +537,8 @@ _SHAPES = {
     "board": _board,
     "toy": _toy,
     "banana": _banana,
+    "soap": _soap,
+    "loaf": _loaf,
+    "cushion": _cushion,
+    "pebble": _pebble,
 }

@@ -28,6 +28,7 @@ from envs.object_primitives import (
     FAMILIES,
     FLAT_FAMILIES,
     HOUSEHOLD_FAMILIES,
+    ROUNDED_FAMILIES,
     TALL_FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
@@ -50,7 +51,7 @@ SMALL = {"train": 0, "test": 200, "sealed": 250, "end": 300}
 # The families and the splits of each procedural set besides `primitives`.
 SPECIAL = {
     "thin": (THIN_FAMILIES, SMALL), "tall": (TALL_FAMILIES, SMALL), "flat": (FLAT_FAMILIES, SMALL),
-    "household": (HOUSEHOLD_FAMILIES, LARGE),
+    "household": (HOUSEHOLD_FAMILIES, LARGE), "rounded": (ROUNDED_FAMILIES, LARGE),
 }  # fmt: skip
 PRIMITIVES_UNSEEN = 100
 BROKEN_RANDOM_URDFS = (168,)  # its OBJ holds vertices that are not numbers
