@@ -35,7 +35,7 @@ HOUSEHOLD_MASSES = {
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD_MASSES)
 # Soft or worn ones, without an edge: fingers slip off where their sides lean.
 ROUNDED_MASSES = {
-    "soap": (0.05, 0.2), "loaf": (0.1, 0.8), "cushion": (0.01, 0.3), "pebble": (0.03, 0.4),
+    "soap": (0.05, 0.2), "loaf": (0.1, 0.8), "cushion": (0.02, 0.3), "pebble": (0.03, 0.4),
 }  # fmt: skip
 ROUNDED_FAMILIES = tuple(ROUNDED_MASSES)
 _STREAMS = {

@@ -10,6 +10,7 @@ from envs.object_primitives import (
     FAMILIES,
     FLAT_FAMILIES,
     HOUSEHOLD_FAMILIES,
+    ROUNDED_FAMILIES,
     TALL_FAMILIES,
     THIN_FAMILIES,
     UNSEEN_FAMILIES,
@@ -223,6 +224,37 @@ def test_household_things_are_as_large_as_such_things(family, sides):
         assert shape.name == f"{family}_{index:04d}"
         own = np.ptp(np.concatenate(shape.parts), axis=0)
         assert (own <= np.array(sides) + 1e-9).all() and (own > 0.15 * np.array(sides)).all()
+
+
+@pytest.mark.parametrize(("family", "sides"), [
+    ("soap", (0.11, 0.072, 0.044)), ("loaf", (0.18, 0.11, 0.08)), ("cushion", (0.15, 0.11, 0.04)),
+    ("pebble", (0.12, 0.084, 0.07)),
+])  # fmt: skip
+def test_rounded_things_are_superellipsoids_as_large_as_such_things(tmp_path, family, sides):
+    """Barr's two exponents from three corners of the grid; then all corners fulfil his equation."""
+    for k in range(5):
+        index = ROUNDED_FAMILIES.index(family) + k * len(ROUNDED_FAMILIES)
+        shape = make_primitive(index, families=ROUNDED_FAMILIES)
+        assert shape.name == f"{family}_{index:04d}"
+        (corners,) = shape.parts
+        half = np.abs(corners).max(axis=0)
+        assert (2 * half <= np.array(sides) + 1e-9).all() and (
+            2 * half > 0.25 * np.array(sides)
+        ).all()
+        part = np.abs(corners) / half
+        middle, side = part[:, 2] < 1e-9, part[:, 1] < 1e-9
+        # At 45 degrees around the middle, and at 45 degrees over it, both coordinates are
+        # sqrt(1/2) to the power of the exponent.
+        around = part[middle & np.isclose(part[:, 0], part[:, 1], rtol=1e-6)][0, 0]
+        upright = part[side & np.isclose(part[:, 0], part[:, 2], rtol=1e-6)][0, 0]
+        n, e = (np.log(value) / np.log(np.sqrt(0.5)) for value in (around, upright))
+        x, y, z = part.T
+        value = (x ** (2 / n) + y ** (2 / n)) ** (n / e) + z ** (2 / e)
+        np.testing.assert_allclose(value, 1.0, atol=1e-6)
+        model = load_object_set("rounded", split="train", cache_dir=tmp_path)[index]
+        assert model.mass == pytest.approx(
+            shape.density * trimesh.convex.convex_hull(corners).volume
+        )
 
 
 def test_a_band_has_the_volume_of_its_line():
