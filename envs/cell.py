@@ -16,7 +16,7 @@ import numpy as np
 from typing_extensions import Self
 
 from envs.board import Board
-from envs.cell_layout import EMPTY, Box, Scene, on_table
+from envs.cell_layout import EMPTY, TRAY_HEIGHT, Box, Scene, on_table
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
@@ -35,7 +35,7 @@ from utils.geometry import (
 )
 from utils.random_streams import Stream
 from utils.random_view import RandomView
-from utils.transforms import RGBDFrame, look_at
+from utils.transforms import RGBDFrame, look_at, transform_points
 
 # The light of every picture that names no other. The keys are those of PyBullet's getCameraImage:
 # lightDirection points towards the light, lightDistance is in metres, shadow is 0 or 1.
@@ -327,21 +327,21 @@ class Cell(ABC):
 
     def retire(self, index: int) -> None:
         """Take an object out of the round: it collides no more. It stays visible where all of it
-        lies over the tray; else it is put out of sight, as a camera would show a planner what no
-        hand can touch."""
+        lies in the tray; else it is put out of sight, under the table, as a camera would show a
+        planner what no hand can touch."""
         self.remaining.discard(index)
         T = self.object_pose(index)
-        if not self._over_tray(index, T):
-            T[2, 3] = -_HIDDEN_DEPTH
+        if not self._in_tray(index, T):
+            T[:3, 3] = *self.config.workspace.center, -_HIDDEN_DEPTH
             self.carry(index, T, np.zeros(3), 0.0)
         self._immobilise(index)
 
-    def _over_tray(self, index: int, T_WO: np.ndarray) -> bool:
-        """Whether all of an object at T_WO (4, 4) lies above the square that the tray covers."""
-        solids = self.scene.placements[index].model.geometry()
-        corners = np.concatenate([solid.transformed(T_WO).vertices for solid in solids])
-        away = np.abs(corners[:, :2] - TRAY_CENTRE).max()
-        return bool(away <= TRAY_HALF_SIZE + TRAY_WALL and corners[:, 2].max() > 0)
+    def _in_tray(self, index: int, T_WO: np.ndarray) -> bool:
+        """Whether an object at T_WO (4, 4) lies within the tray's sides and reaches down into it."""
+        corners = np.concatenate(self.scene.placements[index].model.parts)
+        corners = transform_points(T_WO, corners)
+        away, low = np.abs(corners[:, :2] - TRAY_CENTRE).max(), corners[:, 2].min()
+        return bool(away <= TRAY_HALF_SIZE + TRAY_WALL and abs(low) <= TRAY_HEIGHT)
 
     @abstractmethod
     def _immobilise(self, index: int) -> None:

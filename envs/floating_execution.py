@@ -48,7 +48,7 @@ def execute_floating(cell: Cell, grasp: Grasp) -> GraspOutcome:
     Success: after a retreat of RETREAT, along the approach or, from a side where nothing hangs over
     the table, straight up, both fingers grip one object and are more than gripper.least_held apart.
     `missed`: nothing was ever between the fingers, or too narrow a thing. `slipped`: an object was,
-    and was lost. A picked object is removed. With execution.strict, an object may also not move in
+    and was lost. A picked object is retired. With execution.strict, an object may also not move in
     the hand. At the end of an attempt the hand is away and the objects have come to rest. Raises
     PhysicsError when the simulation blows up.
     """

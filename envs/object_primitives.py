@@ -4,9 +4,9 @@ its index alone.
 
 A hand that opens 0.08 m can grasp every one of them, but for flat, household and rounded ones, in
 every resting pose: across the whole, across a bar, or across a wall with one finger inside. Flat
-ones are wider than the hand and too thin to be gripped from above where they lie on a table. House-
-hold and rounded ones have the sizes and masses of what lies in kitchens and on workbenches: some
-are wider than the hand as they lie, or however they lie. This module knows no simulator.
+ones are wider than the hand and too thin to be gripped from above where they lie on a table. Of the
+others, which have sizes and masses of what lies in kitchens and on workbenches, some are wider than
+the hand as they lie, and some household ones however they lie. This module knows no simulator.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ HOUSEHOLD_MASSES = {
     "toy": (0.03, 0.2), "banana": (0.05, 0.2),
 }  # fmt: skip
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD_MASSES)
-# Soft or worn ones, without an edge: fingers slip off where their sides lean.
-ROUNDED_MASSES = {
-    "soap": (0.05, 0.2), "loaf": (0.1, 0.8), "cushion": (0.02, 0.3), "pebble": (0.03, 0.4),
+# Densities in kg/m3 of things without edges, whose sides lean, so that fingers slip off them: from
+# foam and bread to what floats just so, and stones.
+ROUNDED_DENSITIES = {
+    "soap": (850, 1150), "loaf": (150, 700), "cushion": (50, 700), "pebble": (900, 2600),
 }  # fmt: skip
-ROUNDED_FAMILIES = tuple(ROUNDED_MASSES)
+ROUNDED_FAMILIES = tuple(ROUNDED_DENSITIES)
 _STREAMS = {
     FAMILIES: (), UNSEEN_FAMILIES: (1,), THIN_FAMILIES: (2,), TALL_FAMILIES: (3,),
     FLAT_FAMILIES: (4,), HOUSEHOLD_FAMILIES: (5,), ROUNDED_FAMILIES: (6,),
 }  # fmt: skip
-_MASSES = HOUSEHOLD_MASSES | ROUNDED_MASSES
 _SEED = 20240501
 _SEGMENTS = 16  # convex pieces of a round wall
 _DENSITIES, _MASS_RANGE = (300, 1500), (0.03, 0.3)  # of the other families
@@ -110,8 +110,10 @@ def make_primitive(
     else:
         parts = tuple(scale * part for part in shape)
         volume = sum(trimesh.convex.convex_hull(part).volume for part in parts)
-    if family in _MASSES:
-        mass = rng.uniform(*_MASSES[family])
+    if family in ROUNDED_DENSITIES:
+        density = float(rng.uniform(*ROUNDED_DENSITIES[family]))
+    elif family in HOUSEHOLD_MASSES:
+        mass = rng.uniform(*HOUSEHOLD_MASSES[family])
         density = float(np.clip(mass / volume, *_HOUSEHOLD_DENSITIES))
     else:
         masses = (mass / volume for mass in _MASS_RANGE)
@@ -446,13 +448,14 @@ def _banana(rng) -> list[np.ndarray]:
 
 
 def _superellipsoid(half: np.ndarray, upright: float, around: float) -> list[np.ndarray]:
-    """One convex solid |(x/a)^(2/n) + (y/b)^(2/n)|^(n/e) + |z/c|^(2/e) <= 1 (Barr, IEEE Computer
+    """One convex solid (|x/a|^(2/n) + |y/b|^(2/n))^(n/e) + |z/c|^(2/e) <= 1 (Barr, IEEE Computer
     Graphics and Applications 1981): a box where both exponents e, `upright`, and n, `around`, are
     small, an ellipsoid where they are 1. half: (3,) a, b and c, metres."""
     height = np.linspace(-np.pi / 2, np.pi / 2, 9)[:, None]
     turn = np.arange(_SEGMENTS) * 2 * np.pi / _SEGMENTS
 
     def power(value: np.ndarray, exponent: float) -> np.ndarray:
+        value = value.round(12)  # the cosine of a right angle is 0
         return np.sign(value) * np.abs(value) ** exponent
 
     out = power(np.cos(height), upright)

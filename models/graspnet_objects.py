@@ -3,7 +3,9 @@
 At each pixel the head predicts the offset to the centre of mass of the object there. All parts of
 one object point at one place, even where objects touch, so the places where many votes meet are the
 objects (a Hough vote with learnt offsets: Kendall, Gal and Cipolla, CVPR 2018; Cheng et al.,
-Panoptic-DeepLab, CVPR 2020). Parts whose votes do not meet keep the height map's label.
+Panoptic-DeepLab, CVPR 2020). Parts that turn out to be one object are joined
+(`models.graspnet_parts`). What is left, whose votes do not meet, is one object in each piece of the
+height map.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from models.graspnet_parts import joined_parts
+from models.graspnet_parts import PartSettings, joined_parts
 from utils.compiled import compiled
 from utils.depth_holes import nearest_values
 from utils.height_map import HeightMap, base_heights, local_maxima
@@ -44,9 +46,9 @@ def labelled_by_centres(
 
     offset: (2, h, w) pixels to the centre of mass, at the network's scale; `scaling` takes the
     frame's pixels to it. Every labelled cell keeps a label. The votes give a centre's place in the
-    image, unless the votes of several parts of one object met (`models.graspnet_parts`); else its
-    place and always its height are those of the centroid of the columns under the object's visible
-    surface, an estimate that is too low where the object rests on others.
+    image, where most of an object votes for one; else its place, and always its height, are those
+    of the centroid of the columns under the object's surface, an estimate that is too low where the
+    object rests on others.
     """
     row, column = np.nonzero(heights.label >= 0)
     height = heights.height[row, column]
@@ -60,49 +62,93 @@ def labelled_by_centres(
     within = np.clip(place, 0, limits)
     u, v = np.rint(within).astype(int).T
     votes = within + offset[:, v, u].T
-    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else. Nor
-    # do those outside the image, which belong to what the border shows.
+    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
     shown = heights.ceiling[row, column] <= height
     behind = np.zeros(len(row), bool)
     if frame.second is not None:
         behind = hides(frame, surface)
     shown &= ~behind
+    # Nor do those outside the image, which belong to what the border shows.
     seen = shown & (np.abs(place - within) <= 1).all(axis=1)
     centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
-    if len(centres) == 0:
+    count = len(centres)
+    if count == 0:
         return heights
-    count, piece = len(centres), heights.label[row, column]
-    owner = _nearest(votes, centres, settings.reach)
-    owner = np.where(owner >= 0, owner, count + piece)
-    part = np.full(heights.label.shape, -1)
-    part[row[shown], column[shown]] = owner[shown]
-    colour, most = colours_at(frame.rgb, pixels[shown]), count + len(heights.centres)
-    whole = joined_parts(part, votes[shown], height[shown], colour, most, heights.cell)
-    owner = whole[owner]
-    label = np.minimum(heights.label, -1)  # table and walls stay
-    label[row, column] = owner
-    if behind.any():
-        rest = whole[count + piece[behind]]
-        label = _as_beside(label, heights.label, row[behind], column[behind], rest)
 
-    parts = np.bincount(whole)
-    base = np.full(len(parts), heights.table_height)
-    if heights.fixed is not None:
-        on = base_heights(label, heights.fixed, heights.table_height)
-        base[: len(on)] = on
-    rise = np.maximum(height - base[owner], 0.0)
-    total = np.maximum(np.bincount(owner, rise, len(parts)), 1e-9)
-    middle = base + np.bincount(owner, rise**2, len(parts)) / (2 * total)
-    ahead = deproject(scaling.original_pixels(centres), np.ones(count), frame.K, frame.T_WC)
-    eye = frame.T_WC[:3, 3]
-    share = (middle[whole[:count]] - eye[2]) / (ahead[:, 2] - eye[2])
-    found = np.empty((len(parts), 3))
-    found[whole] = np.concatenate([eye + share[:, None] * (ahead - eye), heights.centres])
-    several = parts > 1
-    if several.any():  # the votes of parts say nothing of the whole's centre
-        place = [np.bincount(owner, rise * along, len(parts)) / total for along in surface.T[:2]]
-        found[several] = np.column_stack([*place, middle])[several]
+    part = np.full(heights.label.shape, -1)
+    part[row, column] = np.where(behind, -1, _nearest(votes, centres, settings.reach))
+    piece_of_patch = _add_patches(part, heights.label, count, heights.cell)
+    own = part[row, column]
+    shown &= own >= 0
+    known = np.full(part.shape, -1)
+    known[row[shown], column[shown]] = own[shown]
+    colour, parts = colours_at(frame.rgb, pixels[shown]), count + len(piece_of_patch)
+    whole = joined_parts(known, votes[shown], height[shown], colour, parts, heights.cell)
+    # A patch that was joined with nothing is the rest of its piece, as is what is in no part.
+    first_piece, alone = int(whole.max()) + 1, np.bincount(whole)[whole] == 1
+    alone[:count] = False
+    whole[alone] = first_piece + piece_of_patch[alone[count:]]
+    label = np.minimum(heights.label, -1)  # table and walls stay
+    label[row, column] = np.where(own >= 0, whole[own], first_piece + heights.label[row, column])
+    if behind.any():
+        label = _as_beside(label, heights.label, row[behind], column[behind])
+
+    kept, owner = _numbered(label[row, column], first_piece + len(heights.centres))
+    label[row, column] = owner
+    found = _column_centres(replace(heights, label=label), len(kept), owner, surface)
+    rest = kept >= first_piece
+    found[rest] = heights.centres[kept[rest] - first_piece]
+    # An object is where its votes met, unless they met in several places and none of these has the
+    # most of it.
+    number = np.full(first_piece + len(heights.centres), -1)
+    number[kept] = np.arange(len(kept))
+    cells, object_of = np.bincount(own[own >= 0], minlength=parts)[:count], number[whole[:count]]
+    stands = 2 * cells > np.bincount(owner)[object_of]
+    eye, object_of = frame.T_WC[:3, 3], object_of[stands]
+    there = scaling.original_pixels(centres[stands])
+    ahead = deproject(there, np.ones(len(there)), frame.K, frame.T_WC)
+    share = (found[object_of, 2] - eye[2]) / (ahead[:, 2] - eye[2])
+    found[object_of] = eye + share[:, None] * (ahead - eye)
     return replace(heights, label=label, centres=found)
+
+
+def _add_patches(part: np.ndarray, piece: np.ndarray, count: int, cell: float) -> np.ndarray:
+    """Number the patches of labelled cells that are in none of the `count` parts, from `count` on,
+    in place: each is of one `piece`, goes on without a gap, and is large enough to be joined.
+    part, piece: (R, C). Returns (K,) their pieces."""
+    left = ((part < 0) & (piece >= 0)).astype(np.uint8)
+    least = PartSettings().surface / cell**2
+    pieces = []
+    if left.sum() >= least:
+        total, patch, stats, _ = cv2.connectedComponentsWithStats(left, connectivity=4)
+        for number in 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= least):
+            here = patch == number
+            for one in np.unique(piece[here]):
+                part[here & (piece == one)] = count + len(pieces)
+                pieces.append(one)
+    return np.array(pieces, int)
+
+
+def _numbered(ids: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """The ids that occur among ids (N,) under `end`, in order, and for each of the N its place in
+    that list."""
+    occurs = np.zeros(end, bool)
+    occurs[ids] = True
+    return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[ids]
+
+
+def _column_centres(
+    heights: HeightMap, count: int, owner: np.ndarray, surface: np.ndarray
+) -> np.ndarray:
+    """(count, 3) centroids of the columns under the surface (N, 3) of the objects `owner` (N,), on
+    what each of them rests on."""
+    base = np.full(count, heights.table_height)
+    if heights.fixed is not None:
+        base[:] = base_heights(heights.label, heights.fixed, heights.table_height)
+    rise = np.maximum(surface[:, 2] - base[owner], 0.0)
+    total = np.maximum(np.bincount(owner, rise, count), 1e-9)
+    x, y = (np.bincount(owner, rise * along, count) / total for along in surface[:, :2].T)
+    return np.column_stack([x, y, base + np.bincount(owner, rise**2, count) / (2 * total)])
 
 
 def colours_at(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -128,14 +174,13 @@ def _nearest(votes: np.ndarray, centres: np.ndarray, reach: float) -> np.ndarray
 
 
 def _as_beside(
-    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray, rest: np.ndarray
+    label: np.ndarray, piece: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
     """Labels (R, C) whose cells (N,) that only a second frame shows are those of the nearest other
-    cell of the same `piece` (R, C), or their `rest` (N,) where there is none."""
+    cell of the same `piece` (R, C), where there is one."""
     others = label >= 0
     others[row, column] = False
     label = label.copy()
-    label[row, column] = rest
     if others.any():
         nearest, its_piece = (nearest_values(values, others) for values in (label, piece))
         same = its_piece[row, column] == piece[row, column]

@@ -1,9 +1,9 @@
 """Parts of one object put together: the votes of a large object meet in several places.
 
 The network learned from objects of the hand's size, so that it takes a hammer or a cereal box for
-several. Where two of its objects touch and are one, the surface goes on, the colour is the same,
-and the votes turn gradually from the one place to the other; between two objects at least one of
-these breaks off (as regions are merged by the evidence along their common boundary: Felzenszwalb
+several. Where two of its objects touch and are one, the surface goes on, the colour differs in
+lightness alone, and the votes turn gradually from the one place to the other; between two objects
+at least one of these breaks off (as regions are merged by the evidence along their common boundary: Felzenszwalb
 and Huttenlocher, IJCV 2004). This module knows no network.
 """
 
@@ -23,17 +23,18 @@ from utils.compiled import compiled
 class PartSettings:
     """Up to which limits two parts are one object, chosen on training objects (docs/choices.md).
 
-    votes: pixels of the network's image between those of two neighbouring cells; step: m between
-    the heights `inside` cells on both sides of the border, where no pixel shows both parts; of each
-    the median along the border. hue: in units of CIELAB, between the parts' medians without
-    lightness, which light changes.
+    votes: pixels of the network's image between those of two neighbouring cells of 2 mm. step: m
+    between the heights `inside` cells beyond these two, where no pixel shows both parts: over the
+    default 10 mm, a slope of 45 degrees. Of each the median along the border counts. tint: distance
+    in the plane of CIELAB's a* and b* between the parts' medians, without the lightness, which
+    light changes more: all greys are alike.
     """
 
     votes: float = 4.0
     step: float = 0.010
     inside: int = 2
-    hue: float = 6.0
-    border: int = 5  # cells at least
+    tint: float = 6.0
+    border: int = 5  # pairs of neighbouring cells at least
     surface: float = 4e-4  # m2 of each part at least: smaller ones may be pixels that show both
 
 
@@ -58,11 +59,11 @@ def joined_parts(
     border, alike = _borders(label, large, votes, height, limits, settings.inside)
     border, alike = border + border.T, alike + alike.transpose(0, 2, 1)
     one = (border >= settings.border) & (2 * alike > border).all(axis=0)
-    hue = np.zeros((count, 2))
+    tint = np.zeros((count, 2))
     for part in np.flatnonzero(one.any(axis=0)):
-        tone = cv2.cvtColor(colour[None, owner == part], cv2.COLOR_RGB2Lab)
-        hue[part] = np.median(tone[0, :, 1:], axis=0)
-    one &= np.hypot(*(hue.T[:, :, None] - hue.T[:, None])) < settings.hue
+        lab = cv2.cvtColor(colour[None, owner == part], cv2.COLOR_RGB2Lab)
+        tint[part] = np.median(lab[0, :, 1:], axis=0)
+    one &= np.hypot(*(tint.T[:, :, None] - tint.T[:, None])) < settings.tint
     if not one.any():
         return np.arange(count)
     return connected_components(csr_array(one), directed=False)[1]
@@ -77,8 +78,9 @@ def _borders(
     limits: tuple[float, float],
     inside: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many cells (M, M) the borders between `large` parts (M,) have, and how many of them
-    (2, M, M) are alike in votes and in height. limits: of these two."""
+    """How many pairs of neighbouring cells (M, M) lie in one and the other of `large` parts (M,),
+    the first one to the left or above, and how many of these pairs (2, M, M) are alike in votes and
+    in height. limits: of these two."""
     rows, columns = label.shape
     number = np.full((rows, columns), -1)
     filled = 0

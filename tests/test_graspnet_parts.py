@@ -60,15 +60,15 @@ def test_the_median_along_the_border_counts(name, least, most, alike, expected):
     assert joined(halves(), **{name: values}) == expected
 
 
-def test_the_difference_of_hues_is_cielabs():
+def test_the_difference_of_tints_is_cielabs():
     """Three greys with more and more blue, all of some 50 in lightness."""
     colours = np.array([(120, 120, 120), (119, 120, 130), (118, 120, 140)])
     near, far = (np.linalg.norm((cielab(colours[0]) - cielab(other))[1:]) for other in colours[1:])
-    assert PartSettings().hue - 1 < near < far / 1.8
+    assert USUAL.tint - 1 < near < far / 1.8
     for other, apart in zip(colours[1:], (near, far)):
         for limit, expected in ((apart + 1, [0, 0]), (apart - 1, [0, 1])):
             pair = (colours[0], other)
-            assert joined(halves(), colours=pair, settings=PartSettings(hue=limit)) == expected
+            assert joined(halves(), colours=pair, settings=PartSettings(tint=limit)) == expected
 
 
 def test_light_and_shadow_are_no_border():

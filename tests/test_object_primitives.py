@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from envs.object_bodies import MIN_MASS
 from envs.object_primitives import (
     FAMILIES,
     FLAT_FAMILIES,
     HOUSEHOLD_FAMILIES,
+    ROUNDED_DENSITIES,
     ROUNDED_FAMILIES,
     TALL_FAMILIES,
     THIN_FAMILIES,
@@ -251,10 +253,12 @@ def test_rounded_things_are_superellipsoids_as_large_as_such_things(tmp_path, fa
         x, y, z = part.T
         value = (x ** (2 / n) + y ** (2 / n)) ** (n / e) + z ** (2 / e)
         np.testing.assert_allclose(value, 1.0, atol=1e-6)
+        hull = trimesh.convex.convex_hull(corners)
+        assert hull.is_volume
+        low, high = ROUNDED_DENSITIES[family]
+        assert low <= shape.density <= high
         model = load_object_set("rounded", split="train", cache_dir=tmp_path)[index]
-        assert model.mass == pytest.approx(
-            shape.density * trimesh.convex.convex_hull(corners).volume
-        )
+        assert model.mass == pytest.approx(max(shape.density * hull.volume, MIN_MASS))
 
 
 def test_a_band_has_the_volume_of_its_line():
