@@ -337,7 +337,7 @@ class Cell(ABC):
         self._immobilise(index)
 
     def _in_tray(self, index: int, T_WO: np.ndarray) -> bool:
-        """Whether an object at T_WO (4, 4) lies within the tray's sides and reaches down into it."""
+        """Whether an object at T_WO (4, 4) lies within the tray's sides, not in the air."""
         corners = np.concatenate(self.scene.placements[index].model.parts)
         corners = transform_points(T_WO, corners)
         away, low = np.abs(corners[:, :2] - TRAY_CENTRE).max(), corners[:, 2].min()

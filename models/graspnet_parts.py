@@ -3,8 +3,8 @@
 The network learned from objects of the hand's size, so that it takes a hammer or a cereal box for
 several. Where two of its objects touch and are one, the surface goes on, the colour differs in
 lightness alone, and the votes turn gradually from the one place to the other; between two objects
-at least one of these breaks off (as regions are merged by the evidence along their common boundary: Felzenszwalb
-and Huttenlocher, IJCV 2004). This module knows no network.
+at least one of these breaks off (as regions are merged by the evidence along their common boundary:
+Felzenszwalb and Huttenlocher, IJCV 2004). This module knows no network.
 """
 
 from __future__ import annotations

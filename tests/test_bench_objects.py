@@ -1,9 +1,13 @@
 """What counts as an object that the votes cut, or join with another one."""
 
+import json
+
 import numpy as np
 import pytest
 
+from benchmarks import bench_objects
 from benchmarks.bench_objects import faults
+from models import graspnet_objects
 
 
 def halves(left: int, right: int, columns: int = 20) -> np.ndarray:
@@ -33,3 +37,15 @@ def test_what_is_hardly_seen_does_not_count():
     hidden = truth.copy()
     hidden[:, 6:] = -1
     assert faults(hidden, truth).shape == (0, 2)
+
+
+@pytest.mark.parametrize("more", [[], ["--one-colour"]])
+def test_a_benchmark_counts_the_objects_of_its_scenes(tmp_path, monkeypatch, more):
+    pytest.importorskip("pybullet")
+    monkeypatch.setattr(bench_objects, "SCENES", {"pair": ("flat", "flat", "scene.count=2")})
+    colours_at, file = graspnet_objects.colours_at, tmp_path / "objects.json"
+    bench_objects.main(["--quick", "--json", str(file), *more])
+    found = {name: one["value"] for name, one in json.loads(file.read_text()).items()}
+    assert list(found) == ["pair_objects", "pair_cut", "pair_joined"]
+    assert 1 <= found["pair_objects"] <= 3 and 0 <= found["pair_cut"] <= 100
+    assert graspnet_objects.colours_at is colours_at

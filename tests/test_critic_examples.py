@@ -116,3 +116,4 @@ def test_a_third_of_the_scenes_of_a_set_hold_its_larger_objects(monkeypatch) -> 
     layouts = [layout for layout, _ in drawn]
     assert layouts.count("household") / 2000 == pytest.approx(0.29, abs=0.03)
     assert {name for layout, name in drawn if layout == "shelf"} == {"tall"}
+    assert {name for layout, name in drawn if layout == "household"} == {"household", "rounded"}

@@ -444,7 +444,9 @@ def test_older_data_that_may_have_a_shape_in_both_splits_are_made_anew(tmp_path)
     assert mark in data_generation._content(load_config(None, usual))
 
 
-@pytest.mark.parametrize("name, families", [("thin", 4), ("household", 10), ("primitives", 11)])
+@pytest.mark.parametrize(
+    "name, families", [("thin", 4), ("household", 10), ("rounded", 4), ("primitives", 11)]
+)
 def test_every_family_is_learned_and_validated(name, families):
     """Families take turns, so that a stride might meet some of them alone."""
     parts = object_sets(load_config(None, [f"data.object_sets={name}"]))

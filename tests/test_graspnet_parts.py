@@ -27,7 +27,7 @@ def joined(label, votes=1.0, step=0.0, colours=(BROWN, BROWN), settings=USUAL):
     )
     colour = np.array(colours, np.uint8)[label[label >= 0]]
     votes = np.column_stack([votes, np.zeros(len(votes))])
-    return joined_parts(label, votes, step, colour, 2, CELL, settings).tolist()
+    return joined_parts(label, votes, step.astype(np.float32), colour, 2, CELL, settings).tolist()
 
 
 def cielab(colour):
@@ -39,8 +39,9 @@ def cielab(colour):
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def test_parts_of_one_surface_and_colour_are_one_object():
-    assert joined(halves()) == [0, 0]
+@pytest.mark.parametrize("turns", range(4))
+def test_parts_of_one_surface_and_colour_are_one_object(turns):
+    assert joined(np.rot90(halves(), turns).copy()) == [0, 0]
 
 
 @pytest.mark.parametrize(

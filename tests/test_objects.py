@@ -97,12 +97,17 @@ def test_other_special_sets_are_split_alike(tmp_path, name):
     assert len(set().union(*parts)) == 300
 
 
-def test_household_things_weigh_what_such_things_do(tmp_path):
-    parts = [load_object_set("household", split=split, cache_dir=tmp_path)
+@pytest.mark.parametrize("name", ["household", "rounded"])
+def test_large_sets_are_in_three_parts(tmp_path, name):
+    parts = [load_object_set(name, split=split, cache_dir=tmp_path)
              for split in ("train", "test", "sealed")]  # fmt: skip
     assert [len(part) for part in parts] == [900, 100, 100]
     assert len({index for part in parts for index in part.indices}) == 1100
-    for model in (parts[0][index] for index in range(30)):
+
+
+def test_household_things_weigh_what_such_things_do(tmp_path):
+    things = load_object_set("household", split="train", cache_dir=tmp_path)
+    for model in (things[index] for index in range(30)):
         low, high = HOUSEHOLD_MASSES[model.name.split("_")[0]]
         volume = sum(trimesh.convex.convex_hull(part).volume for part in model.parts)
         # As drawn, but no matter is lighter than 100 kg/m3 nor heavier than 2,500.

@@ -16,7 +16,7 @@ def test_the_shipped_configs_name_entries_of_the_registries():
 
 @pytest.mark.parametrize("key", [*REGISTRIES, *OBJECT_SET_KEYS])
 def test_any_entry_can_be_named(key):
-    sets = ("box", "primitives", "random_urdfs", "thin", "tall", "flat", "household")
+    sets = ("box", "primitives", "random_urdfs", "thin", "tall", "flat", "household", "rounded")
     known = REGISTRIES.get(key, sets)
     for name in known:
         check_names(load_config(None, [f"{key}={name}", "env.goal=object"]))
