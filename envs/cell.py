@@ -338,6 +338,7 @@ class Cell(ABC):
 
     def _in_tray(self, index: int, T_WO: np.ndarray) -> bool:
         """Whether an object at T_WO (4, 4) lies within the tray's sides, not in the air."""
+        assert self.scene is not None  # there is an object
         corners = np.concatenate(self.scene.placements[index].model.parts)
         corners = transform_points(T_WO, corners)
         away, low = np.abs(corners[:, :2] - TRAY_CENTRE).max(), corners[:, 2].min()
