@@ -56,60 +56,63 @@ def labelled_by_centres(
         [heights.origin + heights.cell * np.column_stack([column, row]), height]
     )
     pixels, _ = project(surface, frame.K, frame.T_WC)
-    # NaN, behind the camera, is outside the image, too.
-    place = np.nan_to_num(scaling.pixels(pixels), nan=-2.0)
-    limits = offset.shape[2] - 1, offset.shape[1] - 1
-    within = np.clip(place, 0, limits)
-    u, v = np.rint(within).astype(int).T
-    votes = within + offset[:, v, u].T
-    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else.
-    shown = heights.ceiling[row, column] <= height
+    votes, within = _votes(scaling.pixels(pixels), offset)
     behind = np.zeros(len(row), bool)
     if frame.second is not None:
         behind = hides(frame, surface)
-    shown &= ~behind
-    # Nor do those outside the image, which belong to what the border shows.
-    seen = shown & (np.abs(place - within) <= 1).all(axis=1)
-    centres = vote_centres(votes[seen], offset.shape[1:], heights.cell, settings)
-    count = len(centres)
-    if count == 0:
+    # Hidden cells do not vote: their height is borrowed, and their pixel shows something else. Nor
+    # do those outside the image, which belong to what the border shows.
+    shown = (heights.ceiling[row, column] <= height) & ~behind
+    centres = vote_centres(votes[shown & within], offset.shape[1:], heights.cell, settings)
+    if len(centres) == 0:
         return heights
 
     part = np.full(heights.label.shape, -1)
     part[row, column] = np.where(behind, -1, _nearest(votes, centres, settings.reach))
-    piece_of_patch = _add_patches(part, heights.label, count, heights.cell)
-    own = part[row, column]
+    piece_of_patch = _add_patches(part, heights.label, len(centres), heights.cell)
+    own, parts = part[row, column], len(centres) + len(piece_of_patch)
     shown &= own >= 0
     known = np.full(part.shape, -1)
     known[row[shown], column[shown]] = own[shown]
-    colour, parts = colours_at(frame.rgb, pixels[shown]), count + len(piece_of_patch)
+    colour = colours_at(frame.rgb, pixels[shown])
     whole = joined_parts(known, votes[shown], height[shown], colour, parts, heights.cell)
     # A patch that was joined with nothing is the rest of its piece, as is what is in no part.
     first_piece, alone = int(whole.max()) + 1, np.bincount(whole)[whole] == 1
-    alone[:count] = False
-    whole[alone] = first_piece + piece_of_patch[alone[count:]]
+    alone[: len(centres)] = False
+    whole[alone] = first_piece + piece_of_patch[alone[len(centres) :]]
     label = np.minimum(heights.label, -1)  # table and walls stay
     label[row, column] = np.where(own >= 0, whole[own], first_piece + heights.label[row, column])
     if behind.any():
         label = _as_beside(label, heights.label, row[behind], column[behind])
 
-    kept, owner = _numbered(label[row, column], first_piece + len(heights.centres))
+    kept, owner = np.unique(label[row, column], return_inverse=True)
     label[row, column] = owner
     found = _column_centres(replace(heights, label=label), len(kept), owner, surface)
     rest = kept >= first_piece
     found[rest] = heights.centres[kept[rest] - first_piece]
-    # An object is where its votes met, unless they met in several places and none of these has the
-    # most of it.
-    number = np.full(first_piece + len(heights.centres), -1)
-    number[kept] = np.arange(len(kept))
-    cells, object_of = np.bincount(own[own >= 0], minlength=parts)[:count], number[whole[:count]]
-    stands = 2 * cells > np.bincount(owner)[object_of]
-    eye, object_of = frame.T_WC[:3, 3], object_of[stands]
-    there = scaling.original_pixels(centres[stands])
-    ahead = deproject(there, np.ones(len(there)), frame.K, frame.T_WC)
-    share = (found[object_of, 2] - eye[2]) / (ahead[:, 2] - eye[2])
-    found[object_of] = eye + share[:, None] * (ahead - eye)
+    # Where votes of most of an object met, that is its place, whatever hides the rest of it.
+    cells = np.bincount(own[own >= 0], minlength=parts)[: len(centres)]
+    there = np.minimum(np.searchsorted(kept, whole[: len(centres)]), len(kept) - 1)
+    most = 2 * cells > np.bincount(owner)[there]
+    there, place = there[most], scaling.original_pixels(centres[most])
+    found[there] = _at_height(frame, place, found[there, 2])
     return replace(heights, label=label, centres=found)
+
+
+def _votes(pixels: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2) pixels that those of N cells (N, 2) vote for, and which of the cells (N,) the image
+    shows: others vote as the nearest pixel of its border does. offset: (2, h, w)."""
+    place = np.nan_to_num(pixels, nan=-2.0)  # behind the camera, which is outside the image, too
+    nearest = np.clip(place, 0, (offset.shape[2] - 1, offset.shape[1] - 1))
+    u, v = np.rint(nearest).astype(int).T
+    return nearest + offset[:, v, u].T, (np.abs(place - nearest) <= 1).all(axis=1)
+
+
+def _at_height(frame: RGBDFrame, pixels: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """(M, 3) points in W, `height` (M,) m high, that a frame shows at pixels (M, 2)."""
+    eye = frame.T_WC[:3, 3]
+    ahead = deproject(pixels, np.ones(len(pixels)), frame.K, frame.T_WC) - eye
+    return eye + ((height - eye[2]) / ahead[:, 2])[:, None] * ahead
 
 
 def _add_patches(part: np.ndarray, piece: np.ndarray, count: int, cell: float) -> np.ndarray:
@@ -120,21 +123,13 @@ def _add_patches(part: np.ndarray, piece: np.ndarray, count: int, cell: float) -
     least = PartSettings().surface / cell**2
     pieces = []
     if left.sum() >= least:
-        total, patch, stats, _ = cv2.connectedComponentsWithStats(left, connectivity=4)
+        _, patch, stats, _ = cv2.connectedComponentsWithStats(left, connectivity=4)
         for number in 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= least):
             here = patch == number
             for one in np.unique(piece[here]):
                 part[here & (piece == one)] = count + len(pieces)
                 pieces.append(one)
     return np.array(pieces, int)
-
-
-def _numbered(ids: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """The ids that occur among ids (N,) under `end`, in order, and for each of the N its place in
-    that list."""
-    occurs = np.zeros(end, bool)
-    occurs[ids] = True
-    return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[ids]
 
 
 def _column_centres(
