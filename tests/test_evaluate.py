@@ -375,7 +375,7 @@ def test_ctrl_c_writes_what_was_measured(tmp_path):
         (["evaluate.rounds=many"], "got 'many' (command line); expected a whole number >= 1"),
         (
             ["evaluate.object_sets=no/such/folder"],
-            "household, an existing folder or an import path module:name",
+            "household, rounded, an existing folder or an import path module:name",
         ),
         (["--config", "missing.yaml"], "missing.yaml: no such config file; check the path"),
         (["--resume", "nowhere"], "--resume nowhere: no such folder; give the folder of a run"),
