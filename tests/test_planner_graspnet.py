@@ -331,6 +331,19 @@ def test_a_long_beam_is_one_object_unless_it_has_several_colours() -> None:
     assert len(set(found.label[found.label >= 0])) == 3
 
 
+def test_hidden_cells_join_nothing() -> None:
+    """The same beam; nothing was seen of it around the places where one part meets another."""
+    frame = boxes_frame([((0.02, 0.24, 0.04), 0.0, (0.5, 0.0))])
+    heights = height_map_from_frame(frame, Workspace())
+    along = heights.origin[1] + heights.cell * np.arange(len(heights.height))
+    ceiling = heights.ceiling.copy()
+    ceiling[(np.abs(along) > 0.03) & (np.abs(along) < 0.055)] += 0.05
+    found = labelled_by_centres(replace(heights, ceiling=ceiling), frame, SAME, three_votes(frame))
+    assert ((found.label >= 0) == (heights.label >= 0)).all()
+    middle, one, other = (found.label[found.index(np.array([0.5, y]))] for y in (0.0, -0.1, 0.1))
+    assert len({middle, one, other}) == 3
+
+
 def test_a_joined_object_rests_on_what_it_lies_on() -> None:
     """The same beam, of which the lower half is a fixture."""
     frame = boxes_frame([((0.02, 0.24, 0.04), 0.0, (0.5, 0.0))])
