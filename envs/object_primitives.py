@@ -465,27 +465,11 @@ def _superellipsoid(half: np.ndarray, upright: float, around: float) -> list[np.
     return [np.asarray(trimesh.convex.convex_hull(corners).vertices)]
 
 
-def _soap(rng) -> list[np.ndarray]:
-    half = rng.uniform((0.025, 0.018, 0.01), (0.055, 0.036, 0.022))
-    return _superellipsoid(half, *rng.uniform((0.3, 0.3), (0.9, 1.0)))
-
-
-def _loaf(rng) -> list[np.ndarray]:
-    """Bread, a box whose edges are worn; half of them are wider than the hand."""
-    half = rng.uniform((0.04, 0.025, 0.02), (0.09, 0.055, 0.04))
-    return _superellipsoid(half, *rng.uniform((0.15, 0.15), (0.6, 0.7)))
-
-
-def _cushion(rng) -> list[np.ndarray]:
-    """A sponge or a filled pouch: its sides lean from the middle of its height on."""
-    half = rng.uniform((0.035, 0.022, 0.006), (0.075, 0.055, 0.02))
-    return _superellipsoid(half, *rng.uniform((0.6, 0.15), (1.5, 0.7)))
-
-
-def _pebble(rng) -> list[np.ndarray]:
-    """A potato or a stone."""
-    half = rng.uniform((0.02, 0.015, 0.01), (0.06, 0.042, 0.035))
-    return _superellipsoid(half, *rng.uniform((0.8, 0.8), (1.2, 1.2)))
+def _rounded(rng, least: tuple, most: tuple, boxy: tuple, oval: tuple) -> list[np.ndarray]:
+    """A superellipsoid of half sides (3,) between `least` and `most`, m, and of exponents (2,),
+    `upright` and `around`, between `boxy` and `oval`."""
+    half, exponents = rng.uniform(least, most), rng.uniform(boxy, oval)
+    return _superellipsoid(half, *exponents)
 
 
 # Bounds in metres. Of a convex solid of the first families the two smaller sides stay below 0.06:
@@ -540,8 +524,19 @@ _SHAPES = {
     "board": _board,
     "toy": _toy,
     "banana": _banana,
-    "soap": _soap,
-    "loaf": _loaf,
-    "cushion": _cushion,
-    "pebble": _pebble,
+    "soap": lambda rng: _rounded(
+        rng, (0.025, 0.018, 0.01), (0.055, 0.036, 0.022), (0.3, 0.3), (0.9, 1.0)
+    ),
+    # Bread, or a box whose edges are worn; half of them are wider than the hand.
+    "loaf": lambda rng: _rounded(
+        rng, (0.04, 0.025, 0.02), (0.09, 0.055, 0.04), (0.15, 0.15), (0.6, 0.7)
+    ),
+    # A sponge or a filled pouch: its sides lean from the middle of its height on.
+    "cushion": lambda rng: _rounded(
+        rng, (0.035, 0.022, 0.006), (0.075, 0.055, 0.02), (0.6, 0.15), (1.5, 0.7)
+    ),
+    # A potato or a stone.
+    "pebble": lambda rng: _rounded(
+        rng, (0.02, 0.015, 0.01), (0.06, 0.042, 0.035), (0.8, 0.8), (1.2, 1.2)
+    ),
 }
