@@ -106,6 +106,12 @@ def test_the_table_says_what_is_missing(lines):
     assert any("transfer.cornell" in note for note in transfer_notes(lines[:2], COLUMNS))
 
 
+def test_a_rate_below_one_is_not_printed_as_100_percent(lines):
+    scores = {"pybullet": Score(249, 250)}
+    table = format_transfer([TransferLine(lines[0].row, "pile", scores)], COLUMNS)
+    assert "99.6 % [98, 100] 249/250" in table and "100 %" not in table
+
+
 def test_results_and_picture(lines):
     content = json.loads(json.dumps(transfer_content(lines, COLUMNS), allow_nan=False))
     assert content["rows"][1]["columns"]["mujoco"]["success_rate"] == 0.9

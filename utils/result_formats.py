@@ -135,7 +135,7 @@ def aligned(
     )
 
 
-def _share(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
+def share_in_words(rate: float | None, interval: tuple[float, float], k: int, n: int) -> str:
     """' 50 % [19, 81] 3/6'; '-' for an undefined rate."""
     if rate is None:
         return "-"
@@ -169,7 +169,7 @@ def failures_in_words(row: Row) -> str:
 def cleared_in_words(row: Row) -> str:
     """' 50 % [19, 81] 3/6'; '-' where one object was wanted: its round ends once it is in hand."""
     rate = None if row.targets else row.cleared_rate
-    return _share(rate, row.cleared_ci95, row.objects_cleared, row.objects_total)
+    return share_in_words(rate, row.cleared_ci95, row.objects_cleared, row.objects_total)
 
 
 def firm_in_words(row: Row) -> str:
@@ -216,7 +216,7 @@ COLUMNS = (
     TableColumn("rounds", lambda row: str(row.rounds), number=True, printed=False),
     TableColumn(
         "target in hand",
-        lambda row: _share(
+        lambda row: share_in_words(
             row.target_in_hand_rate, row.target_in_hand_ci95, row.targets_in_hand, row.targets
         ),
         known=lambda row: row.targets > 0,
@@ -229,7 +229,7 @@ COLUMNS = (
     ),
     TableColumn(
         "success",
-        lambda row: _share(row.success_rate, row.success_ci95, row.successes, row.attempts),
+        lambda row: share_in_words(row.success_rate, row.success_ci95, row.successes, row.attempts),
     ),
     TableColumn("firm", firm_in_words, number=True),
     TableColumn("cleared", cleared_in_words, known=lambda row: row.targets == 0),

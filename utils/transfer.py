@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from utils.atomic_files import write_atomic
 from utils.config import Config, TransferPolicy
-from utils.result_formats import aligned
+from utils.result_formats import aligned, share_in_words
 from utils.result_records import RoundRecord
 from utils.runs import save_results
 from utils.statistics import (
@@ -150,10 +150,9 @@ def format_transfer(lines: Sequence[TransferLine], columns: Mapping[str, Column]
 
 
 def _cell(score: Score | None) -> str:
-    if score is None or score.rate is None:
+    if score is None:
         return "-"
-    low, high = (100 * bound for bound in score.ci95)
-    return f"{100 * score.rate:3.0f} % [{low:.0f}, {high:.0f}] {score.successes}/{score.trials}"
+    return share_in_words(score.rate, score.ci95, score.successes, score.trials)
 
 
 def transfer_notes(lines: Sequence[TransferLine], columns: Mapping[str, Column]) -> list[str]:
