@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from models.planner_candidates import Candidates
 from models.planners import PLANNERS, make_planner, needs_truth, reset_planner
 from tests.helpers.box_frames import bin_walls, boxes_frame
 from utils.errors import UserError
-from utils.geometry import GripperGeometry, Workspace
+from utils.geometry import ConvexSolid, GripperGeometry, Workspace
 from utils.grasp_labels import dense_labels
 from utils.runs import REPOSITORY
 from utils.transforms import Grasp, RGBDFrame, angle_difference
@@ -216,6 +217,24 @@ def test_an_empty_table_has_nothing_to_grasp(name: str) -> None:
 def test_a_box_wider_than_the_gripper_is_left_alone(name: str, degrees: int) -> None:
     frame = boxes_frame([((0.09, 0.10, 0.05), np.deg2rad(degrees), (0.5, 0.0))])
     assert planner(name)(frame) == []
+
+
+@pytest.mark.parametrize("high, grasped", [(0.010, False), (0.014, True)])
+def test_a_critic_alone_holds_no_wide_box_by_a_low_flange(monkeypatch, high, grasped) -> None:
+    """The fingers reach 4 or 8 mm below the top of a flange. Its one side is upright and the other
+    leans by 55 degrees: no contacts are antipodal, and the pads do not slip off, as the faces rise
+    by 27.5 degrees on average. A critic that calls everything certain decides."""
+    monkeypatch.setattr("models.planners.shipped_critic", lambda: SimpleNamespace(
+        chance=lambda inputs: np.ones(len(inputs.facts))
+    ))  # fmt: skip
+    frame, lean = boxes_frame([((0.10, 0.10, 0.05), 0.0, (0.5, 0.0))]), np.tan(np.deg2rad(55))
+    (box,), width = frame.truth.objects, 0.008
+    profile = [(0.0, 0.05), (0.0, 0.05 + high), (width, 0.05 + high), (width + lean * high, 0.05)]
+    corners = [(0.48 + x, y, z) for x, z in profile for y in (-0.04, 0.04)]
+    flange = ConvexSolid.from_vertices(np.array(corners))
+    whole = replace(box, solids=(*box.solids, flange))
+    frame = replace(frame, truth=replace(frame.truth, objects=(whole,)))
+    assert bool(planner("oracle")(frame)) == grasped
 
 
 @pytest.mark.parametrize("name", DELIBERATE)
