@@ -103,8 +103,10 @@ def _plain_name(name: str) -> str:
 
 RunName = Annotated[Name, AfterValidator(_plain_name)]
 SimulatorName = Annotated[Name, AfterValidator(_installed_simulator)]
-_TO_TRAIN = ("random_urdfs", "primitives", "thin", "household", "rounded")
-TrainingSets = Annotated[Names, AfterValidator(lambda names: _offered_sets(names, _TO_TRAIN))]
+TrainingSets = Annotated[
+    Names,
+    AfterValidator(lambda names: _offered_sets(names, ("random_urdfs", "primitives", "thin"))),
+]
 TestSets = Annotated[Names, AfterValidator(lambda names: _offered_sets(names, ("random_urdfs",)))]
 
 
