@@ -47,9 +47,11 @@ STAMP := [0-9]*-[0-9][0-9][0-9][0-9][0-9][0-9]
 calibration: $(INSTALLED)
 	$(BIN)/python evaluate.py --config configs/calibration.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_household.yaml
+	$(BIN)/python evaluate.py --config configs/calibration_rounded.yaml
 	$(BIN)/python evaluate.py --config configs/calibration_flat.yaml
 	$(BIN)/python -m benchmarks.calibrate $$(ls -d runs/evaluate/$(STAMP)-calibration | tail -1) \
 		$$(ls -d runs/evaluate/$(STAMP)-calibration-household | tail -1) \
+		$$(ls -d runs/evaluate/$(STAMP)-calibration-rounded | tail -1) \
 		$$(ls -d runs/evaluate/$(STAMP)-calibration-flat | tail -1) --output checkpoints/calibration.json
 
 test: $(VENV)/.installed-dev

@@ -12,9 +12,11 @@ the runs do not have keep theirs. A planner of your own reads its fit from a fil
 
     python evaluate.py --config configs/calibration.yaml
     python evaluate.py --config configs/calibration_household.yaml
+    python evaluate.py --config configs/calibration_rounded.yaml
     python evaluate.py --config configs/calibration_flat.yaml
     python -m benchmarks.calibrate runs/evaluate/<time>-calibration \\
-        runs/evaluate/<time>-calibration-household runs/evaluate/<time>-calibration-flat \\
+        runs/evaluate/<time>-calibration-household runs/evaluate/<time>-calibration-rounded \\
+        runs/evaluate/<time>-calibration-flat \\
         --output checkpoints/calibration.json
 """
 

@@ -232,7 +232,7 @@ def test_one_command_plays_every_config_and_fits_to_all_their_runs() -> None:
 def test_make_calibration_takes_its_own_runs_alone():
     text = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
     (stamp,) = re.findall(r"^STAMP := (.*)$", text, re.MULTILINE)
-    assert text.count("runs/evaluate/$(STAMP)-calibration") == 3
+    assert text.count("runs/evaluate/$(STAMP)-calibration") == 4
     own = "20261127-171555-calibration"
     assert fnmatch(own, f"{stamp}-calibration")
     for other in ("20261127-171555-my-calibration", f"{own}-household", f"{own}-flat"):
