@@ -131,8 +131,8 @@ class HeuristicPlanner(SearchPlanner):
 # What it is less sure of loses more than its chance, because the contacts speak against it: on
 # training rounds, 30 of 41 of chances over 0.8 succeeded, and 7 of 26 of chances around 0.5.
 _FALLBACK, _UNSURE_POWER = 0.02, 3
-# Nor does it decide alone where the fingers reach less deep, as those of a relaxed search may: all
-# six grips of a can's flange, 3 mm deep, slipped off, with chances of 0.65 to 0.90.
+# m; it does not decide where the fingers reach less deep, as those of a relaxed search may: all six
+# grips of a YCB can's flange, 3 mm deep, slipped off, with chances of 0.65 to 0.90.
 _LEAST_ENGAGEMENT = SearchSettings().min_engagement
 _OVERHEAD = np.array((0.0, 0.0, 1.0))  # towards a camera that hides nothing from an oracle
 

@@ -235,7 +235,7 @@ def test_make_calibration_takes_its_own_runs_alone():
     assert text.count("runs/evaluate/$(STAMP)-calibration") == 4
     own = "20261127-171555-calibration"
     assert fnmatch(own, f"{stamp}-calibration")
-    for other in ("20261127-171555-my-calibration", f"{own}-household", f"{own}-flat"):
+    for other in ("20261127-171555-my-calibration", f"{own}-household", f"{own}-rounded"):
         assert not fnmatch(other, f"{stamp}-calibration")
 
 
