@@ -1,18 +1,18 @@
 """Ranked grasps for your own RGB-D image, of all that it shows or of one object.
 
     python predict.py --rgb rgb.png --depth depth.png --intrinsics 615 615 320 240
-    python predict.py ... --intrinsics intrinsics.json      # {"fx": 615, "fy": 615, "cx": 320, ...}
+    python predict.py ... --intrinsics camera.json          # {"fx": 615, "fy": 615, "cx": 320, ...}
     python predict.py ... --camera-pose T_WC.txt --table-height 0.02    # grasps in your world, too
     python predict.py ... --point 312 200                   # grasp that one
     python predict.py --export graspnet.onnx                            # the network for ONNX
 
 Both images are those of a pinhole (undistorted), and the depth is registered to the colour image:
---depth is a PNG, TIFF or NPY file of its size. Whole numbers are millimetres, floats
-metres; --depth-scale sets another unit. --intrinsics are fx fy cx cy in pixels, with integers at
-pixel centres, or a JSON file with these keys (and width and height, which are checked), as
-`python -m envs.studio --rgbd FOLDER` writes it. --camera-pose is T_WC, 4x4, .npy, .txt, .json or
-.yaml: it takes a point in the camera's optical frame (x right, y down, z forward) to the world,
-whose z is up.
+--depth is a PNG, TIFF or NPY file of its size. Whole numbers are millimetres, floats metres;
+--depth-scale sets another unit, and --from-base reads distances from a robot's base, as Cornell's
+data set has them. --intrinsics are fx fy cx cy in pixels, with integers at pixel centres, or a JSON
+or YAML file with these keys, as `python -m envs.studio --rgbd FOLDER` writes it, or with K as ROS
+and Open3D write it. --camera-pose is T_WC, 4x4, .npy, .txt, .json or .yaml: it takes a point in the
+camera's optical frame (x right, y down, z forward) to the world, whose z is up.
 
 The grasps are those of a planner (docs/planner.md): --planner graspnet, graspnet_direct, heuristic,
 heuristic6d, whose hand comes from any side, or graspnet6d, which leans it where it has to.
@@ -70,6 +70,7 @@ from utils.runs import run_script, timed_folder
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
 from utils.user_view import (
+    as_depths,
     check_found,
     check_mask,
     check_view,
@@ -152,9 +153,10 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image, PNG or JPEG")
     parser.add_argument("--depth", type=Path, metavar="FILE", help="depth, PNG, TIFF or NPY")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres for 1 in the file")
-    parser.add_argument(
-        "--intrinsics", nargs="+", metavar="F", help="fx fy cx cy, or a JSON file with these keys"
-    )
+    base = "--depth holds distances from a robot's base, as Cornell's images do"
+    parser.add_argument("--from-base", action="store_true", help=base)
+    lens = "fx fy cx cy, or a JSON or YAML file with them or K"
+    parser.add_argument("--intrinsics", nargs="+", metavar="F", help=lens)
     parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
     parser.add_argument("--table-height", type=float, metavar="Z", help="m in the world")
     parser.add_argument("--planner", metavar="NAME", help=f"{', '.join(PLANNERS)}")
@@ -181,7 +183,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     image = {name: getattr(options, name) for name in ("rgb", "depth", "intrinsics")}
     others = [options.depth_scale, options.camera_pose, options.table_height, options.out]
     others += [*image.values(), options.count, options.planner, options.workspace]
-    others += [options.point, options.box, options.mask]
+    others += [options.point, options.box, options.mask, options.from_base or None]
     if options.export is not None and any(part is not None for part in others):
         raise UserError("--export writes the network and takes only --checkpoint beside it")
     if options.export is None and (missing := [k for k, part in image.items() if part is None]):
@@ -214,7 +216,7 @@ def read_image(options: argparse.Namespace) -> RGBDFrame:
     rgb, depth = read_rgb(options.rgb), read_depth(options.depth, options.depth_scale)
     check_rgbd(rgb, depth)
     K = read_intrinsics(options.intrinsics, rgb.shape[1], rgb.shape[0])
-    return RGBDFrame(rgb, depth, K, np.eye(4))
+    return RGBDFrame(rgb, as_depths(depth, K, options.from_base), K, np.eye(4))
 
 
 def new_planner(

@@ -33,6 +33,7 @@ from tests.helpers.hand_made import (
 from utils.errors import UserError
 from utils.geometry import GripperGeometry, Workspace
 from utils.image_overlay import grasp_picture, is_grasp_picture
+from utils.table_plane import distances
 from utils.transforms import Grasp, RGBDFrame, look_at, project, transform_points
 
 PICTURE = predict.grasp_picture
@@ -367,6 +368,11 @@ def zero_depth(files):
     Image.fromarray(np.zeros((240, 320), np.uint16)).save(files.folder / "depth.png")
 
 
+def distances_from_a_base(files):
+    np.save(files.folder / "base.npy", distances(files.frame.depth, files.frame.K))
+    return {"depth": files.folder / "base.npy"}
+
+
 def nan_depth(files):
     np.save(files.folder / "nan.npy", np.full((240, 320), np.nan))
     return {"depth": files.folder / "nan.npy"}
@@ -558,6 +564,8 @@ def only_a_count_beside_export(files):
     [
         (small_rgb, "differ in size: 320x100 and 320x240"),
         (metres_wanted, "median is [5-9].. m.*check its unit"),
+        (distances_from_a_base, "seems to hold distances from a robot's base.*give --from-base"),
+        (options(from_base=[]), "--from-base: the depth image does not seem to hold distances"),
         (options(depth_scale=1.0), "median is [5-9].. m.*check its unit"),
         (options(depth_scale=-1), "--depth-scale"),
         (options(depth_scale="nan"), "--depth-scale"),
@@ -577,7 +585,7 @@ def only_a_count_beside_export(files):
         (options(intrinsics=[481, 0, 160, 120]), "positive"),
         (options(intrinsics=[481, -481, 160, 120]), "positive"),
         (options(intrinsics=[481, "nan", 160, 120]), "finite"),
-        (options(intrinsics=["K.txt", 481, 160, 120]), "4 numbers fx fy cx cy or a FILE.json"),
+        (options(intrinsics=["K.txt", 481, 160, 120]), "4 numbers fx fy cx cy, or a FILE.json"),
         (options(intrinsics="nowhere.json"), "nowhere.json: no such file"),
         (options(intrinsics=[481, 160, 481, 120]), "order is fx fy cx cy"),
         (options(intrinsics=[481, 481, 960, 120]), "far outside"),

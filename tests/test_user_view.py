@@ -7,13 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from models import photographs
+from tests.helpers.real_images import CORNELL
 from utils.errors import UserError
 from utils.geometry import Workspace
+from utils.table_plane import DEPTHS, FROM_BASE, distances, table_misses
 from utils.transforms import RGBDFrame, look_at
 from utils.user_view import (
     LARGEST,
+    MISREAD,
     SMALLEST,
     _check_units,
+    as_depths,
     check_found,
     check_view,
     corrected_view,
@@ -149,10 +154,6 @@ def test_what_may_be_in_another_unit_is_remarked_upon() -> None:
     assert f"spans {SIDE * depth / FOCAL:.3g} m x" in remark and "unit of the depth" in remark
     near = replace(frame, depth=np.full_like(frame.depth, 0.05 * FOCAL / SIDE))
     assert "spans" in _check_units(near)[0]
-    T_WC = frame.T_WC.copy()
-    T_WC[:3, 3] = (500, 0, 800)  # of a camera half a metre off and 0.8 m up, in millimetres
-    (remark,) = _check_units(replace(frame, T_WC=T_WC))
-    assert remark.startswith("the camera stands 943.4 m from the world's origin")
 
 
 def test_single_pixels_of_noise_do_not_count() -> None:
@@ -264,3 +265,32 @@ def test_an_image_without_a_grasp_says_why() -> None:
     (empty,) = check_found(0, scene(), Workspace((0.3, -0.2)))
     (full,) = check_found(0, scene((0.3, -0.2, 0.06)), Workspace((0.3, -0.2)))
     assert "nothing there rises 4 mm" in empty and "too wide for the hand" in full
+
+
+def test_distances_from_a_base_are_told_from_depths_and_become_depths() -> None:
+    frame = scene((0.3, -0.2, 0.06))
+    far = distances(frame.depth, K)  # from a place behind the camera, as in Cornell's images
+    with pytest.raises(UserError, match="seems to hold distances from a robot's base.*--from-base"):
+        as_depths(far, K, from_base=False)
+    np.testing.assert_allclose(as_depths(far, K, from_base=True), frame.depth, atol=2e-4)
+    assert as_depths(frame.depth, K, from_base=False) is frame.depth
+    with pytest.raises(UserError, match="does not seem to hold distances from a robot's base"):
+        as_depths(frame.depth, K, from_base=True)
+
+
+def test_depths_of_a_table_s_edge_are_no_distances() -> None:
+    """Two planes, of which the higher one fills more than half of the image."""
+    v, _ = np.mgrid[:SIDE, :SIDE]
+    depth = np.where(v > 0.6 * SIDE, 0.9 * UP, 0.6 * UP).astype(np.float32)
+    assert as_depths(depth, K, from_base=False) is depth
+
+
+@pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")
+def test_cornell_s_depth_images_are_told_from_depths() -> None:
+    """Every eighth; MISREAD lies between these ratios and those of depths."""
+    for sample in photographs.photographs(CORNELL)[::8]:
+        misses = table_misses(sample.depth, photographs.K)
+        assert misses[DEPTHS] > 3 * MISREAD * misses[FROM_BASE], sample.name
+        depth = as_depths(sample.depth, photographs.K, from_base=True)
+        misses = table_misses(depth, photographs.K)
+        assert misses[DEPTHS] < MISREAD / 3 * misses[FROM_BASE], sample.name

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from utils.config import YAML_ERRORS, load_yaml
 from utils.depth_holes import nearest_values
-from utils.errors import UserError
+from utils.errors import UserError, one_line
 from utils.geometry import Workspace
 from utils.transforms import RGBDFrame, deproject, known_depth, look_at, project
 
@@ -211,18 +211,20 @@ def read_mask(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
+# Keys of its matrix: ROS 1 and ROS 2 (CameraInfo), calibrations of ROS and OpenCV, Open3D.
+MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix")
 # Keys under which cameras' drivers and calibrations write the coefficients of a lens.
 DISTORTION = (
-    "coeffs", "D", "dist_coeffs", "distortion", "distortion_coefficients",
+    "coeffs", "D", "d", "dist_coeffs", "distortion", "distortion_coefficients",
     "k1", "k2", "k3", "p1", "p2",
 )  # fmt: skip
 
 
 def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray:
     """The (3, 3) K of an image of that size: from the four numbers fx fy cx cy as text, or from one
-    JSON file that names them, and may also name the width and height they belong to."""
-    if len(given) == 1 and Path(given[0]).suffix.lower() == ".json":
-        path = Path(given[0])
+    JSON or YAML file that names them, or their matrix as ROS and Open3D write it, and that may also
+    name the width and height they belong to."""
+    if len(given) == 1 and (path := Path(given[0])).suffix.lower() in (".json", ".yaml", ".yml"):
         values = _intrinsics_in(path)
         size = values.get("width", width), values.get("height", height)
         if size != (width, height):
@@ -236,21 +238,37 @@ def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray
         numbers = [float(text) for text in given]
     except ValueError:
         raise UserError(
-            f"--intrinsics: got {' '.join(given)}, expected 4 numbers fx fy cx cy or a FILE.json"
+            f"--intrinsics: got {' '.join(given)}, expected 4 numbers fx fy cx cy, or a FILE.json "
+            "or FILE.yaml"
         ) from None
     return intrinsics_matrix(numbers, width, height)
 
 
-def _intrinsics_in(path: Path) -> dict[str, float]:
+def _intrinsics_in(path: Path) -> dict[str, Any]:
+    """The content of a file, with the entries INTRINSICS, and width and height where it has them
+    under any of their names."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix.lower() == ".json" else load_yaml(text)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: cannot be read as JSON ({error})") from error
-    missing = [key for key in INTRINSICS if not isinstance(values, dict) or key not in values]
+    except (OSError, *YAML_ERRORS) as error:  # a ValueError is also what JSON raises
+        kind = path.suffix[1:].upper()
+        raise UserError(f"{path}: cannot be read as {kind} ({one_line(error)})") from error
+    if not isinstance(values, dict):
+        values = {}
+    for key in ("width", "height"):
+        if f"image_{key}" in values:  # as in calibrations of ROS
+            values.setdefault(key, values[f"image_{key}"])
+    named = [key for key in MATRICES if key in values]
+    if named and not any(key in values for key in INTRINSICS):
+        values |= dict(zip(INTRINSICS, _of_matrix(values[named[0]], f"{path}: {named[0]}")))
+    missing = [key for key in INTRINSICS if key not in values]
     if missing:
-        raise UserError(f"{path}: has no {', '.join(missing)}; expected {', '.join(INTRINSICS)}")
+        raise UserError(
+            f"{path}: has no {', '.join(missing)}; expected {', '.join(INTRINSICS)}, or one of "
+            f"{', '.join(MATRICES)} with the nine numbers of the camera's matrix"
+        )
     for key in (*INTRINSICS, "width", "height"):
         value = values.get(key, 0)
         if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
@@ -265,8 +283,27 @@ def _intrinsics_in(path: Path) -> dict[str, float]:
     return values
 
 
+def _of_matrix(content: object, name: str) -> list[float]:
+    """[fx, fy, cx, cy] of a camera's matrix: nine numbers, row by row or, as Open3D has them,
+    column by column; in lists, or under `data`."""
+    numbers = _numbers_in(
+        content["data"] if isinstance(content, dict) and "data" in content else content
+    )
+    if len(numbers) != 9:
+        raise UserError(f"{name}: holds {len(numbers)} numbers, expected the 9 of a 3x3 matrix")
+    K = np.array(numbers, dtype=float).reshape(3, 3)
+    if K[0, 2] == K[1, 2] == 0:
+        K = K.T
+    if not np.allclose([K[0, 1], K[1, 0], *K[2]], [0, 0, 0, 0, 1]):
+        raise UserError(
+            f"{name}: {_listed(numbers)}: expected fx 0 cx 0 fy cy 0 0 1, the matrix of a pinhole "
+            "without skew"
+        )
+    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+
+
 def _numbers_in(value: object) -> list[float]:
-    """The numbers of a value of a JSON file, however deep in lists and objects."""
+    """The numbers of a value of a file, however deep in lists and objects."""
     if isinstance(value, (list, dict)):
         parts = value.values() if isinstance(value, dict) else value
         return [number for part in parts for number in _numbers_in(part)]
@@ -333,6 +370,11 @@ def read_pose(path: Path) -> np.ndarray:
             f"{path}: the camera pose is not rigid: its 3x3 part must be a rotation "
             f"(determinant {np.linalg.det(R):.3g}, expected 1)"
         )
+    if (far := float(np.linalg.norm(T[:3, 3]))) > FARTHEST_CAMERA:
+        raise UserError(
+            f"{path}: the camera stands {far:.4g} m from the world's origin, at most "
+            f"{FARTHEST_CAMERA:g} m are allowed; is the pose in millimetres?"
+        )
     rigid = np.eye(4)
     rigid[:3, :3] = Rotation.from_matrix(R).as_matrix()
     rigid[:3, 3] = T[:3, 3]
@@ -380,6 +422,7 @@ def _pose_numbers(path: Path) -> np.ndarray:
         raise UserError(f"{path}: cannot be read as a 4x4 camera pose ({error})") from error
 
 
+FARTHEST_CAMERA = 50.0  # m; 5 cm in millimetres
 LARGEST_POSE = 10_000  # bytes of a text
 
 

@@ -11,6 +11,7 @@ module knows no file format, no network and no simulator.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -351,7 +352,12 @@ def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
 
     misses = {FROM_BASE: _fit_distances(rays, seen)[1]}
     for reading, stretch in ((DEPTHS, np.ones_like(slant)), (FROM_CAMERA, slant)):
-        misses[reading] = robust_fit(off, STEEP, FLAT, args=(stretch,))[1]
+        starts = [STEEP]
+        # From one start the fit may end at a plane across two surfaces, as a table's edge shows.
+        with contextlib.suppress(UserError):  # where no plane dominates
+            plane = dominant_plane(rays * (seen / stretch)[:, None])
+            starts.append(-plane.normal / plane.distance)
+        misses[reading] = min(robust_fit(off, start, FLAT, args=(stretch,))[1] for start in starts)
     return misses
 
 
