@@ -39,7 +39,7 @@ from utils.calibration import LEAST_CHANCE, ROUNDING, Calibration, calibration_e
 from utils.config import load_config
 from utils.errors import UserError
 from utils.plugins import is_import_path
-from utils.result_formats import aligned
+from utils.result_formats import aligned, rate_in_percent
 from utils.result_records import RoundRecord, read_rounds
 from utils.runs import begun_with, run_script
 
@@ -228,7 +228,7 @@ def errors(fitted: Calibration, rounds: Sequence[RoundRecord]) -> list[str]:
     chances = fitted(scores, roughness, failed)
     unlikely = successes[chances < LEAST_CHANCE]
     return [
-        str(len(stated)), f"{100 * successes.mean():.0f} %",
+        str(len(stated)), f"{rate_in_percent(successes.mean())} %",
         f"{calibration_error(np.clip(stated, 0, 1), successes):.3f}",
         f"{calibration_error(chances, successes):.3f}",
         f"{unlikely.sum()}/{len(unlikely)}",

@@ -9,7 +9,8 @@ the candidate that is ranked first succeeds, of those that were drawn at random,
 alone, by the critic that it began with, and by the new one, how far the stated chances of all are
 from frequencies, and their log loss. It trains on a GPU where there is one (`train.device`).
 Written to checkpoints/critic.pt, the critic is what graspnet, graspnet_direct and graspnet6d rank
-by from then on; their chances of success are then fitted again (`benchmarks.calibrate`). With
+by from then on, and oracle where no contacts are antipodal; the chances of these four are then
+fitted again (`benchmarks.calibrate`). With
 `--folds K` it writes no weights, and compares for kinds of hands and cameras the critic that it
 begins with and what becomes of it: each Kth of the scenes is judged by weights that learned from
 the others.

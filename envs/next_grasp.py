@@ -73,7 +73,7 @@ def choose(
         worth = elsewhere_first(worth, failures.in_round)
     chosen = first_untried(within_reach(cell, worth), failures.in_a_row)
     if chosen is None:
-        return None, f"all planned grasps ({len(worth)}) are out of reach"
+        return None, _out_of_reach(len(worth), len(grasps))
     return now(no_deeper(chosen, failures.in_a_row, failures.palm_stops)), ""
 
 
@@ -81,6 +81,13 @@ def _abstained(grasps: Iterable[Grasp], least: float) -> str:
     """Why none of the grasps is tried; empty where there are none."""
     best = max((grasp.quality for grasp in grasps), default=None)
     return "" if best is None else f"abstained: the best quality is {best:.4g}, under {least:g}"
+
+
+def _out_of_reach(worth: int, planned: int) -> str:
+    """Why none of the planned grasps is tried of which so many are worth it."""
+    if worth == planned:
+        return f"all planned grasps ({planned}) are out of reach"
+    return f"all planned grasps that are worth trying ({worth} of {planned}) are out of reach"
 
 
 def least_quality(planner: Planner, abstain: float | None, has_arm: bool) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -131,9 +132,6 @@ class HeuristicPlanner(SearchPlanner):
 # What it is less sure of loses more than its chance, because the contacts speak against it: on
 # training rounds, 30 of 41 of chances over 0.8 succeeded, and 7 of 26 of chances around 0.5.
 _FALLBACK, _UNSURE_POWER = 0.02, 3
-# m; it does not decide where the fingers reach less deep, as those of a relaxed search may: all six
-# grips of a YCB can's flange, 3 mm deep, slipped off, with chances of 0.65 to 0.90.
-_LEAST_ENGAGEMENT = SearchSettings().min_engagement
 _OVERHEAD = np.array((0.0, 0.0, 1.0))  # towards a camera that hides nothing from an oracle
 
 
@@ -142,7 +140,8 @@ class OraclePlanner(SearchPlanner):
 
     Where no contacts are antipodal, the critic's chances decide (`models.grasp_critic`): it has
     learned which grasps hold all the same, as one of a bowl's rim does, which turns until its wall
-    is parallel to the pads.
+    is parallel to the pads. It does not decide where the object rises less than
+    `settings.min_engagement` over the fingertips, which a relaxed search allows.
 
     judged: number of candidates whose contacts are computed.
     """
@@ -172,8 +171,9 @@ class OraclePlanner(SearchPlanner):
         ones = np.ones(len(found))  # as if a grasp network valued all of them
         inputs = critic_inputs(found, aimed, ones, _OVERHEAD, self.gripper.least_held)
         fallback = _FALLBACK * shipped_critic().chance(inputs) ** _UNSURE_POWER
-        engagement = found.facts[:, FACTS.index("engagement")]
-        fallback = np.where(engagement < _LEAST_ENGAGEMENT, 0.0, fallback)
+        # All six grips of a YCB can's flange, 3 mm deep, slipped off, with chances of 0.65 to 0.90.
+        shallow = found.facts[:, FACTS.index("engagement")] < self.settings.min_engagement
+        fallback = np.where(shallow, 0.0, fallback)
         buried = buried_share(truth, heights)
         return self.grasps(scored_by_contacts(found, truth, self.gripper, buried, fallback))
 
@@ -226,8 +226,14 @@ def make_planner(
     """
     if name in PLANNERS:
         planner = PLANNERS[name](gripper, workspace, seed)
-        if name in calibrations() and hasattr(planner, "calibration"):
-            planner.calibration = calibrations()[name]
+        if hasattr(planner, "calibration"):
+            planner.calibration = calibrations().get(name)
+            if planner.calibration is None:
+                warnings.warn(
+                    f"{CALIBRATIONS}: holds no chances of {name}: its qualities are scores, and an "
+                    "evaluation tries all of its grasps; restore the file, or run make calibration",
+                    stacklevel=2,
+                )
         return planner
     if name == "ppo" or name.startswith(("ppo:", "sb3:")):
         raise UserError(

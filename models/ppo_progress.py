@@ -58,9 +58,14 @@ def announcement(config: Config, run: Path, ppo: GraspPPO) -> str:
     seen = ", ".join(part.key for part in (*layout.images, *layout.state))
     hidden = ", ".join(part.key for part in layout.privileged)
     estimated = ", ".join(settings.estimated_observations or ())
+    targets = {"success": settings.target_success, "return": settings.target_return}
+    ends = " or ".join(
+        f"{name} of {value:g}" for name, value in targets.items() if value is not None
+    )
     return (
         f"PPO on {settings.env_id}: {settings.envs} environments, {updates_of(config)} updates of "
-        f"{settings.envs * settings.rollout_steps:,} steps each, "
+        f"{settings.envs * settings.rollout_steps:,} steps each"
+        f"{f' at most, until an evaluation has a {ends}' if ends else ''}, "
         f"{sum(p.numel() for p in ppo.network.parameters()):,} parameters, "
         f"{processes.ranks} process(es), {processes.device}, seed {config.seed}; "
         f"the policy sees {seen}"

@@ -275,6 +275,14 @@ def test_where_every_grasp_succeeded_the_chance_is_laplaces() -> None:
     np.testing.assert_allclose(fitted([0.1, 0.5, 1.0]), 99 / 100, atol=2e-3)
 
 
+def test_a_planner_whose_chances_are_missing_says_so(monkeypatch) -> None:
+    monkeypatch.setattr("models.planners.calibrations", dict)
+    with pytest.warns(UserWarning, match="holds no chances of heuristic: its qualities are scores"):
+        heuristic = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
+    assert heuristic.calibration is None
+    make_planner("random", GripperGeometry(), Workspace(), 0)  # states none
+
+
 def test_planners_state_chances_in_the_order_of_their_scores() -> None:
     frame = boxes_frame([((0.05, 0.05, 0.05), 0.4, (0.47, 0.03))])
     gripper, workspace = GripperGeometry(), Workspace()

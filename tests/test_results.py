@@ -283,8 +283,11 @@ def test_picks_to_a_target_are_a_mean():
 
 
 def test_planning_takes_time_without_a_success_too():
-    (row,) = summarise([a_round("x", 0, 5, 0, [attempt("missed", plan=0.01)])], seed=0)
+    missed = [attempt("missed", plan=seconds) for seconds in (0.01, 0.01, 0.01, 2.0, 3.0)]
+    (row,) = summarise([a_round("x", 0, 5, 0, missed)], seed=0)
     assert row.plan_ms_median == pytest.approx(10) and row.picks_per_hour is None
+    (row,) = summarise([a_round("x", 0, 5, 0, missed[1:])], seed=0)
+    assert row.plan_ms_median is None  # half of them are the first of a worker
 
 
 def test_a_success_needs_no_reason():

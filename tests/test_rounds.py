@@ -182,6 +182,12 @@ def test_what_the_arm_cannot_reach_is_passed_over(cell, box_set) -> None:
     )  # fmt: skip
     assert (record.ended, record.executed) == ("no_plan", 0)  # nothing moved
     assert record.attempts[0].detail == "all planned grasps (2) are out of reach"
+    plan = planner_of([away, replace(cube_grasp(), quality=0.4)])
+    record = run_round(
+        cell, cube_scene(box_set), plan, policy="x", objects="box", max_failures=2, abstain=0.5
+    )
+    some = "all planned grasps that are worth trying (1 of 2) are out of reach"
+    assert record.attempts[0].detail == some
 
 
 def test_a_palm_that_was_stopped_comes_down_less_deep(cell, box_set) -> None:

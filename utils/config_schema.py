@@ -463,7 +463,7 @@ class RLConfig(Section):
             beside = [*[n for n in sizes if n < batch][-1:], *[n for n in sizes if n > batch][:1]]
             raise ValueError(
                 f"batch_size ({batch}) must divide envs x rollout_steps ({steps}); use "
-                f"batch_size={' or '.join(map(str, beside))}"
+                f"rl.batch_size={' or '.join(map(str, beside))}"
             )
         return self
 

@@ -4,6 +4,7 @@ It is written for every Python 3, and imports nothing that has to be installed.
 """
 
 import importlib.util
+import os
 import sys
 
 # The packages of requirements.txt, under the names by which they are imported. PyBullet is not
@@ -30,6 +31,11 @@ def problem(version=sys.version_info, packages=PACKAGES):
         )
     return None
 
+
+# Progress bars, where no terminal redraws them, are a line every half minute of a log. tqdm reads
+# this when it is imported.
+if sys.stderr is None or not sys.stderr.isatty():
+    os.environ.setdefault("TQDM_MININTERVAL", "30")
 
 _problem = problem()
 if _problem is not None:

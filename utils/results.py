@@ -38,6 +38,7 @@ from utils.statistics import (
     wilson_interval,
 )
 
+LEAST_PLANS = 5  # calls of a planner, from which the median of their times is stated
 CLUTTER = ("packed", "pile")  # scenarios that are also compared together
 SEVERAL = " + "  # between the names of these scenarios and their object sets
 
@@ -50,7 +51,8 @@ class Row:
 
     attempts: executed grasps. The 95 % intervals take whole rounds as independent, not their
         attempts or objects (`utils.statistics.clustered_interval`).
-    plan_ms_median: over all calls of the planner, also those that found nothing.
+    plan_ms_median: over all calls of the planner, also those that found nothing; None for fewer
+        than LEAST_PLANS, most of which the first ones of workers, which load and compile, would be.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
     turned, slid: successes in which the object moved in the hand by more than 15 degrees or 1 cm.
         firm: successes in which it did neither.
@@ -136,7 +138,9 @@ def _row(key: _Key, rounds: Sequence[RoundRecord], seed: int) -> Row:
         success_ci95=clustered_interval([(r.successes, r.executed) for r in rounds]),
         cleared_rate=cleared / total if total else None,
         cleared_ci95=clustered_interval([(r.objects_cleared, r.objects_total) for r in rounds]),
-        plan_ms_median=1000 * median(call.plan_seconds for call in calls) if calls else None,
+        plan_ms_median=1000 * median(call.plan_seconds for call in calls)
+        if len(calls) >= LEAST_PLANS
+        else None,
         sim_seconds_per_pick=per_pick,
         picks_per_hour=3600 / per_pick if per_pick else None,
         failures={reason: reasons[reason] for reason in FAILURES},
