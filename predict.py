@@ -60,12 +60,13 @@ from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.atomic_files import check_writable, write_atomic
 from utils.calibration import unlikely_ones
+from utils.camera_files import read_intrinsics, read_pose
 from utils.depth_holes import check_rgbd
 from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain, scene_as_plain
 from utils.image_overlay import grasp_picture
-from utils.images import read_depth, read_intrinsics, read_mask, read_pose, read_rgb
+from utils.images import read_depth, read_mask, read_rgb
 from utils.runs import run_script, timed_folder
 from utils.target import check_target, marked_pixels, target_at, target_in_box
 from utils.transforms import RGBDFrame
@@ -166,13 +167,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--point", type=float, nargs=2, metavar=("U", "V"), help="on the object")
-    which.add_argument(
-        "--box",
-        type=float,
-        nargs=4,
-        metavar=("U0", "V0", "U1", "V1"),
-        help="around the object, corners in any order",
-    )
+    corners, around = ("U0", "V0", "U1", "V1"), "around the object, corners in any order"
+    which.add_argument("--box", type=float, nargs=4, metavar=corners, help=around)
     which.add_argument("--mask", type=Path, metavar="FILE", help="the object's pixels, PNG or NPY")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: runs/predict/<time>-<name of --rgb>"

@@ -32,13 +32,14 @@ from models.graspnet import create_model
 from models.graspnet_io import load_graspnet, save_graspnet
 from models.ppo import KIND as POLICY
 from utils.atomic_files import write_atomic
+from utils.camera_files import read_intrinsics, read_pose
 from utils.checkpoint import save_checkpoint
 from utils.config import load_config
 from utils.errors import UserError, one_line
 from utils.geometry import SceneGeometry, SolidObject
 from utils.grasp_data import LabelledFrame, SimulatedDataset, read_trials, write_shard
 from utils.grasp_labels import GraspLabels, Trial
-from utils.images import read_depth, read_intrinsics, read_pose, read_rgb
+from utils.images import read_depth, read_rgb
 from utils.result_records import (
     AttemptRecord,
     RoundRecord,

@@ -1,5 +1,6 @@
 """What a script says where it cannot run, and that it imports nothing else before."""
 
+import os
 import re
 import subprocess
 import sys
@@ -43,3 +44,15 @@ def test_without_packages_a_script_ends_in_one_sentence(script):
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2 and done.stdout == ""
     assert line.startswith("error: ") and f" lacks {', '.join(PACKAGES)}; " in line
+
+
+@pytest.mark.parametrize(("given", "seconds"), [(None, "30"), ("2", "2")])
+def test_progress_in_a_log_is_a_line_every_half_minute(given, seconds):
+    """Without a terminal, unless the user has set another interval."""
+    code = "import os, utils.installation; print(os.environ['TQDM_MININTERVAL'])"
+    known = {name: value for name, value in os.environ.items() if name != "TQDM_MININTERVAL"}
+    known |= {} if given is None else {"TQDM_MININTERVAL": given}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, env=known, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, seconds), done.stderr

@@ -167,8 +167,9 @@ def corrected_view(frame: RGBDFrame, table_height: float) -> tuple[RGBDFrame, li
         remarks.append(
             f"the table is rough by {1000 * after.roughness:.1f} mm in the depth image: what has "
             "its colour may be taken for it, and what lies on something else for a bump, up to a "
-            f"height of {1000 * bump_height(after.roughness):.0f} mm; check the camera's pose, or "
-            "lay a cloth of another colour below"
+            f"height of {1000 * bump_height(after.roughness):.0f} mm; check the depth image, the "
+            "intrinsics and the camera's pose if one was given, or lay a cloth of another colour "
+            "below"
         )
     return after, remarks
 
