@@ -41,7 +41,7 @@ OFF_CENTRE = 0.3  # of half the image, a principal point from its middle
 MARGIN = 0.02  # m around what stands on the table
 ROUGH = 0.002  # m, standard deviation of a table whose bumps are as high as what a hand grasps
 # How many times better a table fits as distances from a base than as depths, from which an image is
-# read so: 13 and more for Cornell's 80, at most 1.5 for 90 images of the cell (scenes of all kinds,
+# read so: 17 and more for Cornell's 80, at most 1.5 for 90 images of the cell (scenes of all kinds,
 # 0 to 65 degrees off the vertical, with all depth noises).
 MISREAD = 4.0
 _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
