@@ -11,8 +11,9 @@ Both images are those of a pinhole (undistorted), and the depth is registered to
 --depth-scale sets another unit, and --from-base reads distances from a robot's base, as Cornell's
 data set has them. --intrinsics are fx fy cx cy in pixels, with integers at pixel centres, or a JSON
 or YAML file with these keys, as `python -m envs.studio --rgbd FOLDER` writes it, or with K as ROS
-and Open3D write it. --camera-pose is T_WC, 4x4, .npy, .txt, .json or .yaml: it takes a point in the
-camera's optical frame (x right, y down, z forward) to the world, whose z is up.
+and Open3D write it; width and height in it are checked. --camera-pose is T_WC, 4x4, .npy, .txt,
+.json or .yaml: it takes a point in the camera's optical frame (x right, y down, z forward) to the
+world, whose z is up.
 
 The grasps are those of a planner (docs/planner.md): --planner graspnet, graspnet_direct, heuristic,
 heuristic6d, whose hand comes from any side, or graspnet6d, which leans it where it has to.
@@ -155,7 +156,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--depth", type=Path, metavar="FILE", help="depth, PNG, TIFF or NPY")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres for 1 in the file")
     base = "--depth holds distances from a robot's base, as Cornell's images do"
-    parser.add_argument("--from-base", action="store_true", help=base)
+    parser.add_argument("--from-base", action=argparse.BooleanOptionalAction, help=base)
     lens = "fx fy cx cy, or a JSON or YAML file with them or K"
     parser.add_argument("--intrinsics", nargs="+", metavar="F", help=lens)
     parser.add_argument("--camera-pose", type=Path, metavar="FILE", help="T_WC, 4x4")
@@ -179,7 +180,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     image = {name: getattr(options, name) for name in ("rgb", "depth", "intrinsics")}
     others = [options.depth_scale, options.camera_pose, options.table_height, options.out]
     others += [*image.values(), options.count, options.planner, options.workspace]
-    others += [options.point, options.box, options.mask, options.from_base or None]
+    others += [options.point, options.box, options.mask, options.from_base]
     if options.export is not None and any(part is not None for part in others):
         raise UserError("--export writes the network and takes only --checkpoint beside it")
     if options.export is None and (missing := [k for k, part in image.items() if part is None]):

@@ -84,7 +84,8 @@ def _abstained(grasps: Iterable[Grasp], least: float) -> str:
 
 
 def _out_of_reach(worth: int, planned: int) -> str:
-    """Why none of the planned grasps is tried of which so many are worth it."""
+    """Says that no grasp is within reach. worth: the number of those that are good enough to try;
+    planned: of all."""
     if worth == planned:
         return f"all planned grasps ({planned}) are out of reach"
     return f"all planned grasps that are worth trying ({worth} of {planned}) are out of reach"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -49,7 +50,13 @@ def test_intrinsics_from_numbers_and_from_a_file_are_the_same(tmp_path):
         ("ros2.yaml", "height: 480\nwidth: 640\nd: [0.0, 0.0]\n"
          "k: [615.0, 0.0, 320.0, 0.0, 614.0, 240.0, 0.0, 0.0, 1.0]\n"),
         ("calibration.yml", "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n"
-         "  cols: 3\n  data: [615, 0, 320, 0, 614, 240, 0, 0, 1]\n"),
+         "  cols: 3\n  data: [615, 0, 320, 0, 614, 240, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+         "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.0, 0.0, 0, 0, 0]\n"),
+        ("echo.yaml", "header:\n  frame_id: camera\nheight: 480\nwidth: 640\nD: [0.0]\n"
+         "K: [615.0, 0.0, 320.0, 0.0, 614.0, 240.0, 0.0, 0.0, 1.0]\nbinning_x: 0\n---\n"),
+        ("camera.json", '{"extrinsic": [1], "intrinsic": {"width": 640, "height": 480, '
+         '"intrinsic_matrix": [615, 0, 0, 0, 614, 0, 320, 240, 1]}}'),
+        ("both.json", '{"fx": 615, "K": [615, 0, 320, 0, 614, 240, 0, 0, 1]}'),
         ("open3d.json", '{"width": 640, "height": 480, '
          '"intrinsic_matrix": [615, 0, 0, 0, 614, 0, 320, 240, 1]}'),
         ("nested.json", '{"K": [[615, 0, 320], [0, 614, 240], [0, 0, 1]]}'),
@@ -73,7 +80,7 @@ def test_intrinsics_as_ros_and_open3d_write_them(tmp_path, recwarn, name, text):
         ('{"fx": 600, "fy": 600, "cx": 160}', "has no cy"),
         ('{"K": [600, 0, 160, 0, 600, 120]}', "K: holds 6 numbers, expected the 9"),
         ('{"K": [600, 2, 160, 0, 600, 120, 0, 0, 1]}', "K: 600 2 160 .* without skew"),
-        ('{"K": [600, 0, 160, 0, 600, 120, 0, 0, NaN]}', "without skew"),
+        ('{"K": [600, 0, 160, 0, 600, 120, 0, 0, NaN]}', "K: holds nan, expected"),
         ("[600, 600, 160, 120]", "has no fx, fy, cx, cy"),
         ('{"fx": "a", "fy": 600, "cx": 160, "cy": 120}', "fx is 'a', expected a number"),
         ('{"fx": 600, "fy": 600, "cx": 160, "cy": 120, "width": 640, "height": 480}',
@@ -102,13 +109,43 @@ def test_a_lens_that_distorts_is_remarked_upon(tmp_path, lens):
 def test_a_lens_that_does_not_distort_may_say_so(tmp_path, recwarn):
     text = '{"fx": 600, "fy": 600, "cx": 160, "cy": 120, "model": "pinhole", "coeffs": [0, 0.0]}'
     (tmp_path / "k.json").write_text(text)
-    assert not recwarn.list
     assert read_intrinsics([str(tmp_path / "k.json")], 320, 240)[0, 0] == 600
+    assert not recwarn.list
 
 
-def test_an_intrinsics_file_in_yaml_that_cannot_be_read_is_refused(tmp_path):
-    (tmp_path / "k.yaml").write_text("%YAML:1.0\nK: !!opencv-matrix\n")
-    with pytest.raises(UserError, match="cannot be read as YAML"):
+@pytest.mark.parametrize("first_line", ["%YAML 1.0", "%YAML:1.0"])
+def test_intrinsics_as_opencv_writes_them(tmp_path, recwarn, first_line):
+    """The second first line is that of its versions before 3.2."""
+    expected = np.array([[615.0, 0, 320], [0, 614, 240], [0, 0, 1]])
+    path = tmp_path / "calibration.yml"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", 640)
+    file.write("camera_matrix", expected)
+    file.write("distortion_coefficients", np.zeros((1, 5)))
+    file.release()
+    _, _, rest = path.read_text().partition("\n")
+    path.write_text(f"{first_line}\n{rest}")
+    np.testing.assert_array_equal(read_intrinsics([str(path)], 640, 480), expected)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("K: [615", "cannot be read as YAML"),
+        ("K: !!python/name:os.system", "cannot be read as YAML"),
+        ("K: [" + 400 * "9" + ", 0, 160, 0, 600, 120, 0, 0, 1]", "K: holds 9.*expected a number"),
+        ("K: [false, 0, 160, 0, 600, 120, 0, 0, 1]", "K: holds False, expected a number"),
+        ('K: ["600", 0, 160, 0, 600, 120, 0, 0, 1]', "K: holds '600', expected a number"),
+        ("K: [600, 0, x, 160, 0, 600, 120, 0, 0, 1]", "K: holds 10 numbers"),
+        ("K: " + 900 * "[" + 900 * "]", "K: holds 1 numbers|cannot be read as YAML"),
+        ("K: {rows: 3}", "K: holds 0 numbers"),
+        ("# " + 200_000 * "x", "has more than 100000 bytes"),
+    ],
+)
+def test_a_hostile_intrinsics_file_is_one_sentence(tmp_path, text, message):
+    (tmp_path / "k.yaml").write_text(text)
+    with pytest.raises(UserError, match=message):
         read_intrinsics([str(tmp_path / "k.yaml")], 320, 240)
 
 

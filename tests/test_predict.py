@@ -565,7 +565,6 @@ def only_a_count_beside_export(files):
         (small_rgb, "differ in size: 320x100 and 320x240"),
         (metres_wanted, "median is [5-9].. m.*check its unit"),
         (distances_from_a_base, "seems to hold distances from a robot's base.*give --from-base"),
-        (options(from_base=[]), "--from-base: the depth image does not seem to hold distances"),
         (options(depth_scale=1.0), "median is [5-9].. m.*check its unit"),
         (options(depth_scale=-1), "--depth-scale"),
         (options(depth_scale="nan"), "--depth-scale"),

@@ -11,7 +11,7 @@ from models import photographs
 from tests.helpers.real_images import CORNELL
 from utils.errors import UserError
 from utils.geometry import Workspace
-from utils.table_plane import DEPTHS, FROM_BASE, distances, table_misses
+from utils.table_plane import BEHIND, DEPTHS, FROM_BASE, distances, table_misses
 from utils.transforms import RGBDFrame, look_at
 from utils.user_view import (
     LARGEST,
@@ -267,22 +267,69 @@ def test_an_image_without_a_grasp_says_why() -> None:
     assert "nothing there rises 4 mm" in empty and "too wide for the hand" in full
 
 
-def test_distances_from_a_base_are_told_from_depths_and_become_depths() -> None:
+BESIDE = np.array([0.3, 1.0, 0.4])  # of a robot's base, in the optical frame of a camera 1.5 m up
+
+
+@pytest.mark.parametrize(("origin", "noise"), [(BEHIND, 0.0), (BESIDE, 0.001)])
+def test_distances_from_a_base_are_told_from_depths_and_become_depths(origin, noise) -> None:
     frame = scene((0.3, -0.2, 0.06))
-    far = distances(frame.depth, K)  # from a place behind the camera, as in Cornell's images
+    rng = np.random.default_rng(0)
+    depth = (frame.depth + rng.normal(0, noise, frame.depth.shape)).astype(np.float32)
+    far = distances(depth, K, origin)
     with pytest.raises(UserError, match="seems to hold distances from a robot's base.*--from-base"):
-        as_depths(far, K, from_base=False)
-    np.testing.assert_allclose(as_depths(far, K, from_base=True), frame.depth, atol=2e-4)
-    assert as_depths(frame.depth, K, from_base=False) is frame.depth
-    with pytest.raises(UserError, match="does not seem to hold distances from a robot's base"):
-        as_depths(frame.depth, K, from_base=True)
+        as_depths(far, K)
+    np.testing.assert_allclose(as_depths(far, K, from_base=True), depth, atol=2e-3)
+    assert as_depths(far, K, from_base=False) is far
+    assert as_depths(depth, K) is depth
+
+
+def test_distances_from_the_camera_are_told_from_depths() -> None:
+    frame = scene((0.3, -0.2, 0.06))
+    ranges = np.linalg.norm(frame.points() - frame.T_WC[:3, 3], axis=-1)
+    with pytest.raises(UserError, match="seems to hold distances from the camera: .* divide each"):
+        as_depths(ranges, K)
+
+
+def test_a_scene_without_a_table_holds_no_distances_from_a_base() -> None:
+    steps = np.random.default_rng(0).uniform(0.8, 1.2, (30, 30))
+    depth = np.kron(steps, np.ones((16, 16))).astype(np.float32)
+    assert as_depths(depth, K) is depth
+    with pytest.raises(UserError, match="--from-base: the depth image shows no flat table"):
+        as_depths(depth, K, from_base=True)
 
 
 def test_depths_of_a_table_s_edge_are_no_distances() -> None:
     """Two planes, of which the higher one fills more than half of the image."""
     v, _ = np.mgrid[:SIDE, :SIDE]
     depth = np.where(v > 0.6 * SIDE, 0.9 * UP, 0.6 * UP).astype(np.float32)
-    assert as_depths(depth, K, from_base=False) is depth
+    assert as_depths(depth, K) is depth
+
+
+@pytest.mark.parametrize("height", [0.2, 0.7])
+@pytest.mark.parametrize("size", [(1080, 1920), (720, 1280), (240, 424), (60, 60)])
+def test_depths_at_any_resolution_are_no_distances(size, height) -> None:
+    """A table from near and far, with a ball half as wide as the image is high, which six
+    parameters fit better than three where it fills what is looked at; 1 mm of noise."""
+    focal, middle = 0.73 * size[1], (np.array(size[::-1]) - 1) / 2
+    K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1.0]])
+    v, u = np.mgrid[: size[0], : size[1]]
+    rays = np.stack([(u - middle[0]) / focal, (v - middle[1]) / focal, np.ones(size)], axis=-1)
+    radius = 0.2 * height * size[0] / focal
+    square, along = (rays**2).sum(axis=-1), height * np.ones(size)
+    root = along**2 - square * (height**2 - radius**2)
+    ball = (along - np.sqrt(np.maximum(root, 0))) / square
+    depth = np.where(root > 0, ball, height) + np.random.default_rng(0).normal(0, 0.001, size)
+    assert as_depths(depth.astype(np.float32), K) is not None
+
+
+@pytest.mark.parametrize("unknown", [0.0, 0.6])
+def test_small_and_incomplete_images_are_no_distances(unknown) -> None:
+    rng = np.random.default_rng(0)
+    for side in (6, 8, 12, 16, 32):
+        small = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
+        depth = rng.normal(0.8, 0.001, (side, side)).astype(np.float32)
+        depth[rng.random((side, side)) < unknown] = 0
+        assert as_depths(depth, small) is depth
 
 
 @pytest.mark.skipif(not CORNELL.is_dir(), reason=f"no Cornell data at {CORNELL}")
@@ -290,7 +337,7 @@ def test_cornell_s_depth_images_are_told_from_depths() -> None:
     """Every eighth; MISREAD lies between these ratios and those of depths."""
     for sample in photographs.photographs(CORNELL)[::8]:
         misses = table_misses(sample.depth, photographs.K)
-        assert misses[DEPTHS] > 3 * MISREAD * misses[FROM_BASE], sample.name
+        assert misses[DEPTHS] > 4 * MISREAD * misses[FROM_BASE], sample.name
         depth = as_depths(sample.depth, photographs.K, from_base=True)
         misses = table_misses(depth, photographs.K)
         assert misses[DEPTHS] < MISREAD / 3 * misses[FROM_BASE], sample.name

@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,15 +21,15 @@ from utils.errors import UserError, one_line
 from utils.images import load_array
 
 FARTHEST_CAMERA = 50.0  # m; 5 cm in millimetres
-LARGEST_POSE = 10_000  # bytes of a text
+LARGEST_POSE, LARGEST_INTRINSICS = 10_000, 100_000  # bytes of a text
 RIGID_TOLERANCE = 1e-3  # of a rotation's orthonormality: poses are often printed with 4 digits
 MAX_PIXEL_ASPECT = 1.5  # fx / fy: real sensors stay well below; swapped numbers do not
 INTRINSICS = ("fx", "fy", "cx", "cy")  # keys of an intrinsics file, pixels
 # Keys of its matrix: ROS 1 and ROS 2 (CameraInfo), calibrations of ROS and OpenCV, Open3D.
-MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix")
+MATRICES = ("K", "k", "camera_matrix", "cameraMatrix", "intrinsic_matrix")
 # Keys under which cameras' drivers and calibrations write the coefficients of a lens.
 DISTORTION = (
-    "coeffs", "D", "d", "dist_coeffs", "distortion", "distortion_coefficients",
+    "coeffs", "D", "d", "dist_coeffs", "distCoeffs", "distortion", "distortion_coefficients",
     "k1", "k2", "k3", "p1", "p2",
 )  # fmt: skip
 
@@ -61,21 +61,12 @@ def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray
 def _intrinsics_in(path: Path) -> dict[str, Any]:
     """The content of a file, with the entries INTRINSICS, and width and height where it has them
     under any of their names."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix.lower() == ".json" else load_yaml(text)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except (OSError, *YAML_ERRORS) as error:  # a ValueError is also what JSON raises
-        kind = path.suffix[1:].upper()
-        raise UserError(f"{path}: cannot be read as {kind} ({one_line(error)})") from error
-    if not isinstance(values, dict):
-        values = {}
+    values = _mapping_in(path)
     for key in ("width", "height"):
         if f"image_{key}" in values:  # as in calibrations of ROS
             values.setdefault(key, values[f"image_{key}"])
     named = [key for key in MATRICES if key in values]
-    if named and not any(key in values for key in INTRINSICS):
+    if named and not all(key in values for key in INTRINSICS):
         values |= dict(zip(INTRINSICS, _of_matrix(values[named[0]], f"{path}: {named[0]}")))
     missing = [key for key in INTRINSICS if key not in values]
     if missing:
@@ -84,10 +75,9 @@ def _intrinsics_in(path: Path) -> dict[str, Any]:
             f"{', '.join(MATRICES)} with the nine numbers of the camera's matrix"
         )
     for key in (*INTRINSICS, "width", "height"):
-        value = values.get(key, 0)
-        if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
+        if not _is_number(value := values.get(key, 0)):
             raise UserError(f"{path}: {key} is {value!r:.40}, expected a number")
-    bent = [key for key in DISTORTION if key in values and np.any(_numbers_in(values[key]))]
+    bent = [key for key in DISTORTION if any(map(_bends, _entries(values.get(key))))]
     if bent:
         warnings.warn(
             f"{path}: {bent[0]} says that the lens distorts, and images are read as those of a "
@@ -97,31 +87,72 @@ def _intrinsics_in(path: Path) -> dict[str, Any]:
     return values
 
 
+def _mapping_in(path: Path) -> dict[str, Any]:
+    """The first document of a JSON or YAML file, or what it holds under `intrinsic`; empty where
+    that is no mapping."""
+    kind = path.suffix[1:].upper()
+    try:
+        if path.stat().st_size > LARGEST_INTRINSICS:
+            raise UserError(f"{path}: has more than {LARGEST_INTRINSICS} bytes, this is no camera")
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if kind == "JSON" else load_yaml(_first_document(text))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (OSError, *YAML_ERRORS) as error:  # a ValueError is also what JSON raises
+        raise UserError(f"{path}: cannot be read as {kind} ({one_line(error)})") from error
+    if isinstance(values, dict) and isinstance(values.get("intrinsic"), dict):
+        values = values["intrinsic"]  # Open3D's PinholeCameraParameters
+    return values if isinstance(values, dict) else {}
+
+
+def _first_document(text: str) -> str:
+    """A YAML text up to where its second document begins, as messages printed by ROS end, without
+    the directive and the type that OpenCV's FileStorage writes, which are no YAML 1.1."""
+    lines = text.replace("!!opencv-matrix", "").splitlines()
+    if lines and lines[0].startswith("%YAML"):
+        del lines[0]
+    if lines and lines[0].rstrip() == "---":
+        del lines[0]
+    ends = [number for number, line in enumerate(lines) if line.rstrip() in ("---", "...")]
+    return "\n".join(lines[: ends[0]] if ends else lines)
+
+
 def _of_matrix(content: object, name: str) -> list[float]:
     """[fx, fy, cx, cy] of a camera's matrix: nine numbers, row by row or, as Open3D has them,
-    column by column; in lists, or under `data`."""
-    numbers = _numbers_in(
-        content["data"] if isinstance(content, dict) and "data" in content else content
-    )
-    if len(numbers) != 9:
-        raise UserError(f"{name}: holds {len(numbers)} numbers, expected the 9 of a 3x3 matrix")
-    K = np.array(numbers, dtype=float).reshape(3, 3)
+    column by column; in one list or three, or under `data`."""
+    entries = _entries(content)
+    if len(entries) != 9:
+        raise UserError(f"{name}: holds {len(entries)} numbers, expected the 9 of a 3x3 matrix")
+    wrong = [entry for entry in entries if not _is_number(entry)]
+    if wrong:
+        raise UserError(f"{name}: holds {wrong[0]!r:.40}, expected a number")
+    K = np.array(entries, dtype=float).reshape(3, 3)
     if K[0, 2] == K[1, 2] == 0:
         K = K.T
     if not np.allclose([K[0, 1], K[1, 0], *K[2]], [0, 0, 0, 0, 1]):
         raise UserError(
-            f"{name}: {_listed(numbers)}: expected fx 0 cx 0 fy cy 0 0 1, the matrix of a pinhole "
+            f"{name}: {_listed(entries)}: expected fx 0 cx 0 fy cy 0 0 1, the matrix of a pinhole "
             "without skew"
         )
     return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
 
 
-def _numbers_in(value: object) -> list[float]:
-    """The numbers of a value of a file, however deep in lists and objects."""
-    if isinstance(value, (list, dict)):
-        parts = value.values() if isinstance(value, dict) else value
-        return [number for part in parts for number in _numbers_in(part)]
-    return [value] if type(value) in (int, float) else []
+def _entries(value: object) -> list[object]:
+    """The entries of a list, of lists in a list, or of these under `data`; a lone value as one."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    if not isinstance(value, list):
+        return [] if value is None else [value]
+    return [part for row in value for part in (row if isinstance(row, list) else [row])]
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
+
+
+def _bends(value: object) -> bool:
+    """Whether an entry of a lens's coefficients is a number other than 0."""
+    return _is_number(value) and value != 0
 
 
 def intrinsics_matrix(

@@ -258,8 +258,10 @@ def table_at_height(height: float, points: np.ndarray, T_WC: np.ndarray) -> Tabl
 # images made from them, as `DepthImage.from_pcd` of github.com/dougsm/ggcnn does, hold the length
 # of each point's coordinates. Taken for depths they bend the table by centimetres; as distances
 # from the robot they leave it flat, and reveal where camera and robot are.
-SIDE = 400  # pixels of the square in the image's middle in which the table is searched
-STEP = 8  # pixels between the pixels that the fit uses
+# Pixels, in an image 640 wide, of the square in its middle in which the table is searched, and
+# between those that the fit uses; in others in proportion.
+SIDE, STEP, WIDTH = 400, 8, 640
+LEAST_PIXELS = 50  # from which six parameters are told from three
 FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel counts ever less
 # Where the search starts: a camera one metre from the table that looks at it from half above, and
 # the robot on the camera's side of the table.
@@ -339,12 +341,16 @@ def find_table_camera(distance: np.ndarray, K: np.ndarray) -> TableCamera:
 def table_misses(image: np.ndarray, K: np.ndarray) -> dict[str, float]:
     """How badly a table explains an image (H, W) of metres, for each reading of its values.
 
-    The value is the median distance, in metres, of the middle's pixels from the table that fits
-    best. Six parameters explain an image of distances from a base, three an image of depths or of
+    The value is the median distance, in metres, of the middle's known pixels from the table that
+    fits best; infinite for all where fewer than LEAST_PIXELS are known.
+
+    Six parameters explain an image of distances from a base, three an image of depths or of
     distances from the camera; so the former is never much worse, even where one of the latter is
     the truth.
     """
     rays, seen = _middle(image, K)
+    if len(seen) < LEAST_PIXELS:
+        return dict.fromkeys((FROM_BASE, DEPTHS, FROM_CAMERA), np.inf)
     slant = np.linalg.norm(rays, axis=1)
 
     def off(guess: np.ndarray, stretch: np.ndarray) -> np.ndarray:
@@ -384,8 +390,10 @@ def _fit_distances(rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def _middle(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) rays of pixels in the middle of an image, and its values (n,) there."""
-    return _middle_rays(image.shape, K), image[_middle_of(image.shape)].ravel().astype(float)
+    """(n, 3) rays of pixels in the middle of an image whose values are known, and these (n,)."""
+    values = image[_middle_of(image.shape)].ravel().astype(float)
+    known = known_depth(values)
+    return _middle_rays(image.shape, K)[known], values[known]
 
 
 def _middle_rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
@@ -393,8 +401,9 @@ def _middle_rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:
 
 
 def _middle_of(shape: tuple[int, ...]) -> tuple[slice, ...]:
+    side, step = (max(round(pixels * shape[1] / WIDTH), 1) for pixels in (SIDE, STEP))
     return tuple(
-        slice(max(0, (length - SIDE) // 2), (length + SIDE) // 2, STEP) for length in shape
+        slice(max(0, (length - side) // 2), (length + side) // 2, step) for length in shape
     )
 
 

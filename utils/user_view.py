@@ -17,11 +17,11 @@ from utils.depth_holes import check_rgbd, depth_of_plane
 from utils.errors import UserError
 from utils.geometry import Workspace
 from utils.height_map import LABEL_FLOOR
-from utils.real_data import fill_depth_holes
 from utils.table_plane import (
     DEPTHS,
     FLAT,
     FROM_BASE,
+    FROM_CAMERA,
     TOLERANCE,
     Table,
     find_table,
@@ -40,9 +40,9 @@ HIGH_TABLE, WIDE_TABLE, LAYER = 0.25, 0.2, 0.02
 OFF_CENTRE = 0.3  # of half the image, a principal point from its middle
 MARGIN = 0.02  # m around what stands on the table
 ROUGH = 0.002  # m, standard deviation of a table whose bumps are as high as what a hand grasps
-# How many times better a table fits as distances from a base than as depths, from which an image is
-# read so: 17 and more for Cornell's 80, at most 1.5 for 90 images of the cell (scenes of all kinds,
-# 0 to 65 degrees off the vertical, with all depth noises).
+# An image is not taken for depths where a flat table fits another reading at least so many times
+# better: as distances from a base 17 times and more for Cornell's 80, at most 1.5 times for 90
+# images of the cell (scenes of all kinds, 0 to 65 degrees off the vertical, all depth noises).
 MISREAD = 4.0
 _BIN, _FILLED = 0.01, 0.2  # m, and the share of such a square that counts as matter: not noise
 
@@ -92,25 +92,36 @@ def workspace_of(
     return Workspace(_pair(centre), LARGEST, table_height), [remark]
 
 
-def as_depths(image: np.ndarray, K: np.ndarray, from_base: bool) -> np.ndarray:
+def as_depths(image: np.ndarray, K: np.ndarray, from_base: bool | None = None) -> np.ndarray:
     """(H, W) metres along the optical axis of an image (H, W) of depths, or of distances in metres
-    `from_base` of a robot, as Cornell's depth images hold them. Raises UserError for an image that
-    a flat table explains far better as one of the other kind."""
-    filled = fill_depth_holes(image)
-    misses = table_misses(filled, K)
-    base, depths = misses[FROM_BASE], misses[DEPTHS]
-    fits = f"a flat table fits to {1000 * base:.2g} mm so, to {1000 * depths:.2g} mm as {DEPTHS}"
-    if base <= FLAT and depths > MISREAD * base:
-        if from_base:
-            return find_table_camera(filled, K).depth(image, K)
-        raise UserError(
-            f"--depth seems to hold {FROM_BASE}, as Cornell's depth images do ({fits}); give "
-            "--from-base, and they are turned into depths"
-        )
+    `from_base` of a robot, as Cornell's depth images hold them; 0 where unknown.
+
+    from_base: what the user says; None for nothing. Then the image is taken for depths. Raises
+    UserError where distances from a base or from the camera explain a flat table far better, and
+    for distances from a base that no flat table explains.
+    """
+    if from_base is False:
+        return image
+    misses = table_misses(image, K)
+    base, camera, depths = (misses[reading] for reading in (FROM_BASE, FROM_CAMERA, DEPTHS))
+    fits = f"fits to {1000 * base:.2g} mm so, to {1000 * depths:.2g} mm as {DEPTHS}"
     if from_base:
+        if base > FLAT:
+            raise UserError(
+                f"--from-base: the depth image shows no flat table: it {fits}, at most "
+                f"{1000 * FLAT:g} mm are allowed; leave the option out if it holds depths"
+            )
+        return find_table_camera(image, K).depth(image, K)
+    if camera <= FLAT and depths > MISREAD * camera:
         raise UserError(
-            f"--from-base: the depth image does not seem to hold {FROM_BASE} ({fits}); leave the "
-            "option out"
+            f"--depth seems to hold {FROM_CAMERA}: a flat table fits to {1000 * camera:.2g} mm so, "
+            f"to {1000 * depths:.2g} mm as {DEPTHS}; divide each by the length of its pixel's ray "
+            "((u - cx) / fx, (v - cy) / fy, 1), or give --no-from-base if it holds depths"
+        )
+    if base <= FLAT and depths > MISREAD * base:
+        raise UserError(
+            f"--depth seems to hold {FROM_BASE}, as Cornell's depth images do: a flat table {fits};"
+            " give --from-base, and they are turned into depths, or --no-from-base if they are"
         )
     return image
 
