@@ -51,7 +51,7 @@ from utils.errors import UserError
 from utils.grasp_labels import ANGLE_BINS
 from utils.real_data import KEY, UnlabelledImages
 from utils.rectangles import RealSample, View
-from utils.table_plane import FLAT, FROM_BASE, find_table_camera, table_misses
+from utils.table_plane import EXACT, FLAT, FROM_BASE, find_table_camera, table_misses
 
 STATE = "adaptation"  # the entry of a checkpoint's `extra` that a resumed training needs
 # The photographs change in the same ways as the simulated training images, so that no change
@@ -68,9 +68,6 @@ CHECKED = 12  # images of a folder, spread over it, whose distances are checked
 # degrees from straight down, with a Kinect's noise, it is below 1.1, for distances made of these
 # above 3. Tests hold both, and Cornell's.
 DISTINCT = 2.0
-# m: better fits count as this good, because the ratio of two fits that are exact but for rounding
-# and steps of depth means nothing: 0.03 mm and 0.01 mm, for depths in the cell.
-EXACT = 0.0005
 INFORMATION_STEP = 4  # pixels between the predictions that count; neighbours predict the same
 
 

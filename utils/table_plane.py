@@ -261,6 +261,9 @@ def table_at_height(height: float, points: np.ndarray, T_WC: np.ndarray) -> Tabl
 # Pixels, in an image 640 wide, of the square in its middle in which the table is searched, and
 # between those that the fit uses; in others in proportion.
 SIDE, STEP, WIDTH = 400, 8, 640
+# m: better fits count as this good, because the ratio of two fits that are exact but for rounding
+# and steps of depth means nothing: 0.03 mm and 0.01 mm, for depths in the cell.
+EXACT = 0.0005
 LEAST_PIXELS = 50  # from which six parameters are told from three
 FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel counts ever less
 # Where the search starts: a camera one metre from the table that looks at it from half above, and

@@ -19,6 +19,7 @@ from utils.geometry import Workspace
 from utils.height_map import LABEL_FLOOR
 from utils.table_plane import (
     DEPTHS,
+    EXACT,
     FLAT,
     FROM_BASE,
     FROM_CAMERA,
@@ -112,13 +113,13 @@ def as_depths(image: np.ndarray, K: np.ndarray, from_base: bool | None = None) -
                 f"{1000 * FLAT:g} mm are allowed; leave the option out if it holds depths"
             )
         return find_table_camera(image, K).depth(image, K)
-    if camera <= FLAT and depths > MISREAD * camera:
+    if camera <= FLAT and depths > MISREAD * max(camera, EXACT):
         raise UserError(
             f"--depth seems to hold {FROM_CAMERA}: a flat table fits to {1000 * camera:.2g} mm so, "
             f"to {1000 * depths:.2g} mm as {DEPTHS}; divide each by the length of its pixel's ray "
             "((u - cx) / fx, (v - cy) / fy, 1), or give --no-from-base if it holds depths"
         )
-    if base <= FLAT and depths > MISREAD * base:
+    if base <= FLAT and depths > MISREAD * max(base, EXACT):
         raise UserError(
             f"--depth seems to hold {FROM_BASE}, as Cornell's depth images do: a flat table {fits};"
             " give --from-base, and they are turned into depths, or --no-from-base if they are"
