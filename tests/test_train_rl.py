@@ -396,9 +396,9 @@ def test_a_run_goes_on_without_the_file_of_its_first_weights(finished, tmp_path,
         (["rl.device=tpu"], "rl.device: got 'tpu'"),
         (
             ["rl.batch_size=12"],
-            r"batch_size \(12\) must divide envs x rollout_steps \(32\); use batch_size=8 or 16",
+            r"batch_size \(12\) must divide envs x rollout_steps \(32\); use rl.batch_size=8 or 16",
         ),
-        (["rl.batch_size=64"], r"envs x rollout_steps \(32\); use batch_size=32"),
+        (["rl.batch_size=64"], r"envs x rollout_steps \(32\); use rl.batch_size=32"),
         (["rl.initial=nowhere.pt"], "nowhere.pt"),
     ],
 )
