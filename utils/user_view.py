@@ -122,7 +122,7 @@ def as_depths(image: np.ndarray, K: np.ndarray, from_base: bool | None = None) -
     if base <= FLAT and depths > MISREAD * max(base, EXACT):
         raise UserError(
             f"--depth seems to hold {FROM_BASE}, as Cornell's depth images do: a flat table {fits};"
-            " give --from-base, and they are turned into depths, or --no-from-base if they are"
+            " give --from-base, which turns them into depths, or --no-from-base if it holds depths"
         )
     return image
 
