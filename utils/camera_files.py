@@ -36,8 +36,8 @@ DISTORTION = (
 
 def read_intrinsics(given: Sequence[str], width: int, height: int) -> np.ndarray:
     """The (3, 3) K of an image of that size: from the four numbers fx fy cx cy as text, or from one
-    JSON or YAML file that names them, or their matrix as ROS and Open3D write it, and that may also
-    name the width and height they belong to."""
+    JSON or YAML file that names them, or their matrix as ROS, OpenCV and Open3D write it, and that
+    may also name the width and height they belong to. Raises UserError, naming file or option."""
     if len(given) == 1 and (path := Path(given[0])).suffix.lower() in (".json", ".yaml", ".yml"):
         values = _intrinsics_in(path)
         size = values.get("width", width), values.get("height", height)
@@ -98,6 +98,8 @@ def _mapping_in(path: Path) -> dict[str, Any]:
         values = json.loads(text) if kind == "JSON" else load_yaml(_first_document(text))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
+    except UserError:
+        raise
     except (OSError, *YAML_ERRORS) as error:  # a ValueError is also what JSON raises
         raise UserError(f"{path}: cannot be read as {kind} ({one_line(error)})") from error
     if isinstance(values, dict) and isinstance(values.get("intrinsic"), dict):
@@ -138,9 +140,10 @@ def _of_matrix(content: object, name: str) -> list[float]:
 
 
 def _entries(value: object) -> list[object]:
-    """The entries of a list, of lists in a list, or of these under `data`; a lone value as one."""
+    """The entries of a list, of lists in a list, or of these under `data`; without that name, the
+    values of a mapping; a lone value as one."""
     if isinstance(value, dict):
-        value = value.get("data")
+        value = value.get("data", list(value.values()))
     if not isinstance(value, list):
         return [] if value is None else [value]
     return [part for row in value for part in (row if isinstance(row, list) else [row])]
