@@ -18,7 +18,7 @@ import numpy as np
 
 from envs.cell import Cell, Intrinsics
 from envs.cell_layout import ObjectModel, Placement, Scene
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.objects import load_object_set
 from envs.simulators import cell_class
 from utils.image_overlay import picture_path, write_picture

@@ -19,7 +19,7 @@ import numpy as np
 from typing_extensions import Self
 
 from envs.object_files import FineVisual
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from utils.config import Config
 from utils.geometry import TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_WALL, ConvexSolid
 

@@ -27,7 +27,7 @@ from envs.cell_layout import (
     table_box,
 )
 from envs.mujoco_panda import load_mujoco
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from utils.config import Config
 from utils.transforms import position_quaternion
 

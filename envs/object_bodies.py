@@ -19,7 +19,8 @@ from envs.cell_layout import ObjectModel
 from envs.object_files import DEFAULT_DENSITY, Inertial, colour, fine_visual, read_object
 from envs.object_meshes import ObjectError, decompose, write_parts_obj
 from envs.object_parts import MassProperties
-from envs.object_primitives import NativeShape, Primitive, random_color
+from envs.object_primitives import Primitive, random_color
+from envs.object_shapes import NativeShape
 
 # An inertia below this share of that of a solid of even density is a placeholder, too.
 LEAST_INERTIA = 0.1

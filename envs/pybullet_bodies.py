@@ -34,7 +34,7 @@ from envs.cell_layout import (
     tray_walls,
 )
 from envs.object_files import FineVisual
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from utils.config import Config, SimConfig
 from utils.transforms import position_quaternion
 

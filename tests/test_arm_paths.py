@@ -9,7 +9,7 @@ from envs.cell_layout import TRAY_CENTRE, TRAY_HALF_SIZE, Box, Placement, Scene
 from envs.execution import execute_grasp, reaches
 from envs.next_grasp import within_reach
 from envs.object_bodies import native_object
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.robot_kinematics import UnreachableError, forward_kinematics
 from envs.rounds import run_round
 from envs.simulators import make_cell

@@ -19,7 +19,7 @@ from envs.execution import (
     reaches,
 )
 from envs.object_bodies import native_object
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.robot_kinematics import forward_kinematics
 from tests.helpers.cubes import cube_grasp, cube_scene
 from tests.helpers.simulators import needs_pybullet, pybullet

@@ -13,7 +13,7 @@ from envs.floating_execution import PREGRASP, attempt, clears_table, execute_flo
 from envs.floating_hand import meets_box
 from envs.grasping_env import RobotGraspingEnv
 from envs.object_bodies import native_object
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.objects import load_object_set
 from envs.robot_motion import SCurve
 from envs.rounds import run_round

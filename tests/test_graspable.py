@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from envs.object_primitives import NativeShape, make_primitive
+from envs.object_primitives import make_primitive
+from envs.object_shapes import NativeShape
 from models.graspable import is_graspable, resting_poses
 from utils.geometry import ConvexSolid, GripperGeometry
 

@@ -11,7 +11,8 @@ from envs.cell import Cell
 from envs.cell_layout import Placement, Scene, square_walls
 from envs.execution import close_fingers, execute_grasp, give_way, open_loop
 from envs.object_bodies import compound_object
-from envs.object_primitives import NativeShape, Primitive
+from envs.object_primitives import Primitive
+from envs.object_shapes import NativeShape
 from envs.objects import load_object_set
 from envs.panda_model import PATCH_RADIUS
 from envs.simulators import make_cell

@@ -12,7 +12,7 @@ from envs.cell_scenes import make_scene
 from envs.execution import execute_grasp
 from envs.mujoco_bodies import wake
 from envs.mujoco_cell import MujocoCell
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.objects import load_object_set
 from models.planners import make_planner
 from tests.helpers.cubes import cube_scene

@@ -11,7 +11,7 @@ import pybullet
 
 from envs.cell import Intrinsics
 from envs.object_bodies import native_object
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.pybullet_bodies import spawn, static_box
 from envs.pybullet_camera import PybulletCamera, _egl_plugin, load_renderer
 from utils.errors import UserError

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.show_bar import grip, solid
 from envs.cell import Cell
 from envs.cell_layout import EMPTY
-from envs.object_primitives import NativeShape
+from envs.object_shapes import NativeShape
 from envs.robot_kinematics import JOINT_VELOCITY, choose_posture, forward_kinematics
 from envs.robot_motion import Trajectory
 from envs.simulators import make_cell
