@@ -31,12 +31,12 @@ _FIRST = 3  # of the links that are looked at: the lower ones turn over the robo
 
 
 def arm_is_clear(cell: Cell, q: np.ndarray) -> bool:
-    """Whether the arm, but for its hand, stays clear of table, tray, walls and its joints' limits
-    at joint positions q (N, 7)."""
+    """Whether the arm, but for its hand, stays clear of table, tray, the walls whose place is known
+    (`Scene.known_walls`) and its joints' limits at joint positions q (N, 7)."""
     margin = cell.config.safety.joint_margin
     if (q < JOINT_LOWER + margin).any() or (q > JOINT_UPPER - margin).any():
         return False  # where a curve between waypoints may leave the limits
-    boxes = [table_box(), *tray_walls(), *(cell.scene.walls if cell.scene else ())]
+    boxes = [table_box(), *tray_walls(), *_known_walls(cell)]
     poses = link_poses(q)[:, _FIRST - 1 :]
     return all(
         _is_clear(places, points, box)
@@ -61,15 +61,18 @@ def _placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def hand_is_clear(cell: Cell, q: np.ndarray, held: np.ndarray | None = None) -> bool:
-    """Whether the hand stays clear of the scene's walls at joint positions q (N, 7). held: (M, 3)
-    metres in E, points on an object that it holds."""
+    """Whether the hand stays clear of the walls whose place is known at joint positions q (N, 7).
+    held: (M, 3) metres in E, points on an object that it holds."""
     poses = np.array([forward_kinematics(at) for at in q])
-    walls = cell.scene.walls if cell.scene else ()
     return all(
         _is_clear(poses, hand_points(cell.gripper), wall)
         and (held is None or _is_clear(poses, held, wall, _HELD_MARGIN))
-        for wall in walls
+        for wall in _known_walls(cell)
     )
+
+
+def _known_walls(cell: Cell) -> tuple[Box, ...]:
+    return cell.scene.known_walls if cell.scene else ()
 
 
 def held_points(T_WE: np.ndarray) -> np.ndarray:

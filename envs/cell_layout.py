@@ -189,9 +189,14 @@ class Scene:
     target: int | None = None
 
     @property
+    def known_walls(self) -> tuple[Box, ...]:
+        """Those whose place planners, and the arm, know."""
+        return self.walls if self.fixed else ()
+
+    @property
     def fixtures(self) -> tuple[ConvexSolid, ...]:
-        """Solids in W whose place planners know."""
-        return tuple(wall.solid() for wall in self.walls) if self.fixed else ()
+        """Solids in W of the `known_walls`."""
+        return tuple(wall.solid() for wall in self.known_walls)
 
 
 EMPTY = Scene("isolated", 0, ())

@@ -121,6 +121,7 @@ class PybulletHand(Hand):
             "numSolverIterations"
         ]
         self._set_iterations(CARRYING_EFFORT * iterations)
+        self._contacts_from = None  # what was found before was of another grip
         try:
             yield
         finally:

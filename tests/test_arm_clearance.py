@@ -1,5 +1,7 @@
 """Whether arm and hand are clear of boxes: their shapes are those that the simulators move."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,8 @@ def test_points_cover_a_surface():
 
 
 def _wall_before(x: float) -> Scene:
-    return Scene("wall", 0, (), (Box(np.array([0.05, 1.0, 1.0]), np.array([x + 0.05, 0.0, 1.0])),))
+    box = Box(np.array([0.05, 1.0, 1.0]), np.array([x + 0.05, 0.0, 1.0]))
+    return Scene("wall", 0, (), (box,), fixed=True)
 
 
 @pytest.mark.parametrize(("gap", "clear"), [(0.012, True), (0.004, False), (-0.03, False)])
@@ -51,6 +54,9 @@ def test_the_farthest_corner_of_all_links_decides(cell, monkeypatch, gap, clear)
     )
     monkeypatch.setattr(cell, "scene", _wall_before(farthest + gap))
     assert arm_is_clear(cell, q) is clear
+    # A wall that somebody has brought is not known to the arm.
+    monkeypatch.setattr(cell, "scene", replace(cell.scene, layout="bin", fixed=False))
+    assert arm_is_clear(cell, q)
 
 
 @pytest.mark.parametrize(("gap", "clear"), [(0.012, True), (0.004, False)])
@@ -60,7 +66,9 @@ def test_the_hand_is_as_long_as_it_is(cell, monkeypatch, gap, clear):
     x, y, z = forward_kinematics(HOME)[:3, 3]
     tips = z - cell.gripper.tip_below_centre
     board = Box(np.array([0.2, 0.2, 0.01]), np.array([x, y, tips - gap - 0.01]))
-    monkeypatch.setattr(cell, "scene", Scene("shelf", 0, (), (board,)))
+    monkeypatch.setattr(cell, "scene", Scene("shelf", 0, (), (board,), fixed=True))
     assert hand_is_clear(cell, q) is clear
     below = np.array([[0.0, 0.0, 0.03]])  # of what hangs 3 cm below E
     assert not hand_is_clear(cell, q, below)
+    monkeypatch.setattr(cell, "scene", replace(cell.scene, fixed=False))
+    assert hand_is_clear(cell, q, below)

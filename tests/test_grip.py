@@ -123,6 +123,35 @@ def test_contacts_turn_with_the_hand(cell, config):
 
 
 @needs_pybullet
+def test_each_carrying_counts_the_turns_of_the_hand_anew(bullet_cell, box_set, monkeypatch):
+    """With the arm at home the hand has turned by 45 degrees since the first carrying ended: what a
+    second one holds is not let go of by the first renewal."""
+    import pybullet
+
+    renewed = []
+    forget = pybullet.setCollisionFilterGroupMask
+    monkeypatch.setattr(
+        pybullet, "setCollisionFilterGroupMask",
+        lambda body, link, *rest, **more: (renewed.append(link), forget(body, link, *rest, **more)),
+    )  # fmt: skip
+    bullet_cell.load(cube_scene(box_set))
+    robot = bullet_cell.robot
+    home = bullet_cell.home
+    turned = home - np.deg2rad([0, 0, 0, 0, 0, 0, 45])
+    renewed.clear()
+    for at in (turned, home):
+        robot.place(at)
+        with robot.carrying():
+            robot.renew_contacts()
+    assert not renewed
+    with robot.carrying():
+        robot.renew_contacts()
+        robot.place(turned)
+        robot.renew_contacts()
+    assert renewed == robot.fingers
+
+
+@needs_pybullet
 def test_the_solver_works_harder_while_the_hand_carries(bullet_cell, box_set, monkeypatch):
     """Not before, and not afterwards, however the carrying ends."""
     import pybullet
