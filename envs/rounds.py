@@ -25,7 +25,14 @@ import numpy as np
 from envs.cell import Cell, PhysicsError
 from envs.cell_layout import Scene
 from envs.closed_loop import ClosedLoop
-from envs.execution import Approach, ApproachResult, GraspOutcome, execute_grasp, open_loop
+from envs.execution import (
+    Approach,
+    ApproachResult,
+    GraspOutcome,
+    execute_grasp,
+    open_loop,
+    physics_errors,
+)
 from envs.floating_execution import execute_floating
 from envs.next_grasp import Failures, choose, least_quality
 from envs.objects import fits
@@ -36,6 +43,7 @@ from models.planners import Planner, calibration_of, needs_truth, reset_planner
 from utils.depth_correction import table_roughness
 from utils.errors import TargetLostError, one_line
 from utils.geometry import Workspace
+from utils.random_streams import planner_seed
 from utils.result_records import (
     FELL_OFF,
     NO_PLAN,
@@ -147,7 +155,7 @@ class _Round:
         """Work on the scene until the round ends; returns the key of ENDINGS."""
         try:
             with planner_errors(self.policy):
-                reset_planner(self.planner, self.scene.seed)
+                reset_planner(self.planner, planner_seed(self.scene.seed))
             while self.cell.remaining and len(self.failures.in_a_row) < max_failures:
                 ended = self.turn(on_attempt)
                 if ended is not None:
@@ -166,9 +174,13 @@ class _Round:
         """Look, plan and, where a grasp is likely enough, try it; returns the key of ENDINGS if the
         round ends with that, or else None."""
         self.plan_seconds, self.began = 0.0, self.cell.seconds
-        frame = self.look()
+        with physics_errors(self.cell):
+            frame = self.look()
         grasps = self.plan(frame)
-        grasp, why = choose(self.cell, grasps, self.failures, self.least, self.chances)
+        start = time.perf_counter()
+        with physics_errors(self.cell):
+            grasp, why = choose(self.cell, grasps, self.failures, self.least, self.chances)
+        self.plan_seconds += time.perf_counter() - start
         if grasp is None:
             return self.without_grasp(NO_PLAN, why)
         grasp, outcome = self.attempt(frame, grasp)

@@ -81,13 +81,15 @@ class SecondLook:
 
     def _taken(self, way: Trajectory) -> RGBDFrame:
         """The frame from the end of a way from home, to which the arm returns. Raises
-        ArmStoppedError where something is in its way."""
+        ArmStoppedError where something is in its way, PhysicsError where the simulation blows up.
+        """
         cell = self._cell
         careful = partial(cell.robot.stop_on_contact, cell.config.execution.contact_stop)
         follow(cell, way, careful)
         cell.step(round(_STILL_SECONDS / cell.dt))
         frame = self._calibrated(wrist_frame(cell))
         follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **scales(cell)))
+        cell.check_physics()
         return frame
 
 

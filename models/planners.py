@@ -35,7 +35,6 @@ from utils.errors import UserError, unknown_choice
 from utils.geometry import GripperGeometry, Workspace
 from utils.height_map import HeightMap, height_map_from_frame, height_map_from_scene
 from utils.plugins import is_import_path, load_plugin
-from utils.random_streams import Stream
 from utils.target import object_of_target, only_object, only_target
 from utils.transforms import Grasp, RGBDFrame
 
@@ -94,7 +93,7 @@ class RandomPlanner:
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
-        self._random = np.random.default_rng([seed, Stream.RANDOM_PLANNER])
+        self._random = np.random.default_rng(seed)
 
     def __call__(self, frame: RGBDFrame) -> list[Grasp]:
         points = frame.points().reshape(-1, 3)

@@ -6,7 +6,7 @@ from envs.cell_scenes import LAYOUTS
 from models.planners import make_planner
 from tests.helpers.box_frames import boxes_frame
 from utils.geometry import GripperGeometry, Workspace
-from utils.random_streams import Stream
+from utils.random_streams import Stream, planner_seed
 
 
 def first_numbers(*key: int) -> tuple[float, ...]:
@@ -33,7 +33,7 @@ def test_a_random_planner_draws_other_numbers_than_the_scene() -> None:
     ranks = []
     for seed in range(200):
         plan = make_planner("random", GripperGeometry(), Workspace(), 0)
-        plan.reset(seed)
+        plan.reset(planner_seed(seed))
         rank = np.searchsorted(top, plan(frame)[0].position[0]) / len(top)
         scene = np.random.default_rng([seed, LAYOUTS.index("isolated")])
         ranks.append((rank, scene.integers(900)))

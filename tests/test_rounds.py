@@ -11,7 +11,7 @@ from envs.cell_layout import Placement, Scene
 from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop
 from envs.execution import GraspFailure, GraspOutcome
-from envs.next_grasp import ROOM_OVER_TOUCH, within_reach
+from envs.next_grasp import ROOM_OVER_TOUCH, choose, within_reach
 from envs.objects import load_object_set
 from envs.rounds import run_round
 from models.planners import make_planner
@@ -19,7 +19,7 @@ from tests.helpers.cubes import cube_grasp, cube_scene
 from utils.calibration import Calibration
 from utils.config import with_settings
 from utils.geometry import GripperGeometry, Workspace
-from utils.random_streams import Stream
+from utils.random_streams import Stream, planner_seed
 from utils.result_formats import format_table
 from utils.results import summarise
 from utils.transforms import Grasp
@@ -377,7 +377,7 @@ class Planner:
 
 
 def test_a_planner_that_raises_ends_its_round_alone(cell, box_set):
-    planner, settings = Planner(failing_seed=1), {"objects": "box", "max_failures": 2}
+    planner, settings = Planner(failing_seed=planner_seed(1)), {"objects": "box", "max_failures": 2}
     scenes = [Scene("isolated", seed, cube_scene(box_set).placements) for seed in range(3)]
     rounds = [run_round(cell, scene, planner, policy="mine:plan", **settings) for scene in scenes]
     assert [record.ended for record in rounds] == ["cleared", "planner_error", "cleared"]
@@ -404,6 +404,37 @@ def test_a_call_that_raises_is_timed_itself(cell, box_set, monkeypatch):
     first, second = record.attempts
     assert second.reason == "planner_error"
     assert (first.plan_seconds, second.plan_seconds) == pytest.approx((0.3, 0.02))
+
+
+def test_the_search_for_what_the_arm_reaches_is_timed(cell, box_set, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("envs.rounds.time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def slow(*arguments):
+        now[0] += 0.5
+        return choose(*arguments)
+
+    monkeypatch.setattr("envs.rounds.choose", slow)
+    settings = {"policy": "x", "objects": "b", "max_failures": 1}
+    record = run_round(cell, cube_scene(box_set), lambda frame: [cube_grasp()], **settings)
+    assert [attempt.plan_seconds for attempt in record.attempts] == pytest.approx([0.5])
+
+
+def test_a_planner_is_reset_with_a_number_that_does_not_give_the_scene_away(cell, box_set):
+    class Planner:
+        seeds = []
+
+        def reset(self, seed):
+            self.seeds.append(seed)
+
+        def __call__(self, frame):
+            return []
+
+    scene = replace(cube_scene(box_set), seed=12)
+    for _ in range(2):
+        run_round(cell, scene, Planner(), policy="x", objects="b", max_failures=1)
+    first, second = Planner.seeds
+    assert first == second == planner_seed(12) != 12
 
 
 @pytest.mark.parametrize("result", [None, 3, [(0.5, 0.0, 0.1)], np.zeros((2, 3))])

@@ -10,7 +10,7 @@ import pytest
 
 from envs import second_look
 from envs.arm_paths import scales
-from envs.cell import ROBOT
+from envs.cell import ROBOT, PhysicsError
 from envs.cell_layout import Box, Scene
 from envs.evaluation_worker import check_everything
 from envs.robot_kinematics import choose_posture
@@ -159,6 +159,30 @@ def test_a_round_says_that_a_look_was_stopped(cell, box_set, monkeypatch) -> Non
     (attempt,), (frame,) = record.attempts, watcher.frames
     assert attempt.reason == "no_plan" and frame.second is None
     assert attempt.detail.startswith("the second look was stopped: contact with 100.0 N")
+
+
+@pytest.mark.parametrize("by_planning", [True, False])
+def test_physics_that_blow_up_during_a_look_end_the_round_alone(
+    cell, box_set, monkeypatch, by_planning
+) -> None:
+    """Planning from joints that are not finite raises ValueError; else the positions tell it."""
+    scene = two_cubes(box_set)
+    cell.load(scene)
+
+    def blown_up() -> None:
+        raise PhysicsError("the robot's joint positions are not finite")
+
+    def taken(cell) -> RGBDFrame:
+        monkeypatch.setattr(cell, "check_physics", blown_up)
+        if by_planning:
+            raise ValueError("`y` must contain only finite values")
+        return wrist_frame(cell)
+
+    monkeypatch.setattr(second_look, "wrist_frame", taken)
+    record = run_round(
+        cell, scene, Watcher(), policy="w", objects="box", max_failures=2, second_look=20.0
+    )
+    assert [attempt.reason for attempt in record.attempts] == [record.ended] == ["physics"]
 
 
 class Watcher:

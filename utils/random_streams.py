@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from enum import IntEnum, unique
 
+import numpy as np
+
 
 @unique
 class Stream(IntEnum):
@@ -26,5 +28,11 @@ class Stream(IntEnum):
     SIDE_VIEW = 11  # the pose of a camera at the side (`envs.views`)
     APPEARANCE = 13  # a randomised scene (`envs.simulators`)
     TRACKED_MOTION = 15  # of an object that is tracked (`benchmarks.bench_tracking`)
-    RANDOM_PLANNER = 17  # `models.planners.RandomPlanner`
+    PLANNER = 17  # `planner_seed`
     LABEL_TRIALS = 19  # the pairs that are executed (`benchmarks.bench_labels`)
+
+
+def planner_seed(scene_seed: int) -> int:
+    """The seed that a planner is reset with for a scene: its draws are none of the scene's, and the
+    scene, a pure function of its seed, cannot be made again from it."""
+    return int(np.random.default_rng([scene_seed, Stream.PLANNER]).integers(2**63))

@@ -76,7 +76,8 @@ class AttemptRecord:
 
     reason: "success" or a key of FAILURES; "no_plan" and "planner_error" are failures without an
         executed grasp.
-    plan_seconds: wall-clock time of the planner. sim_seconds: simulated time of the execution.
+    plan_seconds: wall-clock time of the planner and of the search for what the arm reaches.
+    sim_seconds: simulated time of the execution.
     grasp: the grasp on the image, for pictures.
     turn_ms, turn_ms_mean: 95th percentile and mean of the wall-clock time of a closed loop's turns,
         without rendering.
