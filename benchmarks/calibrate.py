@@ -41,7 +41,7 @@ from utils.errors import UserError
 from utils.plugins import is_import_path
 from utils.result_formats import aligned, rate_in_percent
 from utils.result_records import RoundRecord, read_rounds
-from utils.runs import begun_with, run_script
+from utils.runs import code_states, run_script
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -94,11 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def commit_of(runs: Sequence[Path]) -> str | None:
     """The commit that the runs were played at. Raises UserError if they differ in it, or where its
     files had been changed: chances belong to the code that the grasps were executed with."""
-    begun = {str(run): begun_with(run) for run in runs}
-    changed = [run for run, facts in begun.items() if facts.get("changes")]
+    played = [(run, facts) for run in runs for facts in code_states(run)]
+    changed = [run for run, facts in played if facts.get("changes")]
     if changed:
         raise UserError(f"{changed[0]} was played with uncommitted code; play it anew")
-    commits = {facts.get("commit") for facts in begun.values()}
+    commits = {facts.get("commit") for _, facts in played}
     if len(commits) > 1:
         found = ", ".join(sorted(map(str, commits)))
         raise UserError(f"the runs are of several commits ({found}); play them anew with one")

@@ -192,7 +192,8 @@ def test_what_the_critic_judges_has_no_penalty(tmp_path) -> None:
         grasps = [(0.9, True), (0.7, True), (0.6, False), (0.8, True)]
         append_round(tmp_path / "rounds.jsonl", played(name, grasps, roughness=0.0))
         rough = [(0.9, True), (0.7, False), (0.6, False), (0.8, False)]
-        append_round(tmp_path / "rounds.jsonl", played(name, rough, roughness=0.002))
+        later = replace(played(name, rough, roughness=0.002), seed=2)
+        append_round(tmp_path / "rounds.jsonl", later)
     assert main([str(tmp_path), "--output", str(tmp_path / "fits.json")]) == 0
     fits = load_calibrations(tmp_path / "fits.json")
     assert fits["graspnet"].penalty == fits["graspnet6d"].penalty == 0
@@ -250,3 +251,8 @@ def test_chances_belong_to_the_code_that_the_grasps_were_executed_with(tmp_path)
     (runs[1] / "environment.json").write_text(json.dumps({"commit": "2" * 40, "changes": "ab"}))
     with pytest.raises(UserError, match="b was played with uncommitted code"):
         commit_of(runs[1:])
+    # One that was continued with other code is of both.
+    facts = {"commit": "1" * 40, "continued": [{"commit": "3" * 40, "changes": None}]}
+    (runs[0] / "environment.json").write_text(json.dumps(facts))
+    with pytest.raises(UserError, match="of several commits .1111.*3333"):
+        commit_of(runs[:1])

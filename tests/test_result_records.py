@@ -107,7 +107,7 @@ def test_a_torn_last_line_of_the_journal_is_taken_off(journal):
     before = read_rounds(journal)
     assert before == read_rounds(journal) and journal.read_text() == torn, "readers write nothing"
     cut_torn_line(journal)
-    append_round(journal, before[0])
+    append_round(journal, replace(before[0], seed=7))
     assert len(read_rounds(journal)) == len(ROUNDS) + 1
 
 
@@ -199,6 +199,7 @@ def test_a_round_keeps_all_five_numbers_of_its_calibration(tmp_path):
     whole = replace(ROUNDS[0], calibration=(1.57, -0.53, 600.0, 0.4, 1.07))
     append_round(file, whole)
     (text,) = file.read_text().splitlines()
-    file.write_text(text + "\n" + text.replace(", 0.4, 1.07", "") + "\n")
-    read = [record.calibration for record in read_rounds(file, "none")]
-    assert read == [(1.57, -0.53, 600.0, 0.4, 1.07), (1.57, -0.53, 600.0, 0.0, 0.0)]
+    assert read_rounds(file) == [whole]
+    file.write_text(text.replace(", 0.4, 1.07", "") + "\n")
+    (read,) = read_rounds(file)
+    assert read.calibration == (1.57, -0.53, 600.0, 0.0, 0.0)

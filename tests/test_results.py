@@ -87,6 +87,20 @@ def test_comparison_adds_all_of_clutter():
     assert together.cleared.value == pytest.approx(0 / 15 - (2 * first + second) / 15)
 
 
+def test_what_both_share_of_clutter_names_the_row_that_adds_it_up():
+    """The first has packed scenes besides, which the second has not played."""
+    packed = replace(ROUNDS[0], scenario="packed")
+    pairs = compare([*ROUNDS, packed], seed=0)
+    assert [(pair.scenario, pair.success.rounds) for pair in pairs] == [("pile", 2)]
+    third = [replace(record, policy="oracle") for record in (ROUNDS[0], packed)]
+    found = {(one.first, one.second, one.scenario) for one in compare([*ROUNDS, packed, *third], 0)}
+    others = [("oracle", "heuristic"), ("oracle", "random"), ("random", "heuristic")]
+    together = ("oracle", "heuristic", "pile + packed")
+    assert found == {
+        *((*pair, "pile") for pair in others), ("oracle", "heuristic", "packed"), together
+    }  # fmt: skip
+
+
 def test_policies_are_compared_within_the_same_depth_noise():
     """The noisy heuristic clears nothing; clutter is added up for each noise alone."""
     lost = [replace(r, depth_noise="kinect", objects_cleared=0) for r in ROUNDS]
@@ -240,6 +254,13 @@ def test_runs_whose_scenes_do_not_match_are_refused(tmp_path):
     drawn = load_config(None, ["sim.renderer=tiny"])
     assert compare_runs(before, a_run(tmp_path / "drawn", ROUNDS, drawn)), "the same scenes"
     later = [replace(record, seed=record.seed + 100_000) for record in ROUNDS]
+    wide = load_config(None, ["gripper.opens_fully=true"])
+    assert compare_runs(before, a_run(tmp_path / "wide", ROUNDS, wide)), "the same scenes"
+    # What the hand can take decides which object is wanted.
+    wanted = [replace(record, target_in_hand=True, scenario="retrieve") for record in ROUNDS]
+    runs = a_run(tmp_path / "usual", wanted), a_run(tmp_path / "other hand", wanted, wide)
+    with pytest.raises(UserError, match="because gripper differs in their configs"):
+        compare_runs(*runs)
     with pytest.raises(UserError, match="no scene in common"):
         compare_runs(before, a_run(tmp_path / "later", later))
     with pytest.raises(UserError, match="not the folder of an evaluation"):

@@ -381,7 +381,7 @@ def test_a_planner_that_raises_ends_its_round_alone(cell, box_set):
     scenes = [Scene("isolated", seed, cube_scene(box_set).placements) for seed in range(3)]
     rounds = [run_round(cell, scene, planner, policy="mine:plan", **settings) for scene in scenes]
     assert [record.ended for record in rounds] == ["cleared", "planner_error", "cleared"]
-    assert planner.seeds == [0, 1, 2], "reset for every round"
+    assert planner.seeds == [planner_seed(seed) for seed in range(3)], "reset for every round"
     (attempt,) = rounds[1].attempts
     assert attempt.reason == "planner_error" and rounds[1].executed == 0
     assert "mine:plan raised RuntimeError: no idea" in attempt.detail

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from tests.helpers.processes import another_process_within
 from tests.helpers.records import CONFIG
 from tests.helpers.systems import needs_proc
+from utils import runs
 from utils.atomic_files import write_atomic, write_json_atomic
 from utils.config import ConfigError, load_config
 from utils.distributed import Team, run_folder
@@ -29,7 +30,9 @@ from utils.errors import UserError
 from utils.runs import (
     REPOSITORY,
     GitState,
+    begun_with,
     check_resume,
+    code_of,
     environment,
     git_state,
     named_files,
@@ -300,6 +303,24 @@ def test_what_changes_when_a_run_is_resumed_stays_changed(tmp_path):
         assert resumed == run
     again, _ = parse_args(["--resume", str(run)], "a script")
     assert again.evaluate.rounds == 70 and again == config
+
+
+def test_a_run_notes_with_which_code_it_was_continued(tmp_path, monkeypatch):
+    """Each change of the code once, and nothing where it is the same."""
+    config = load_config()
+    code = {"commit": "a" * 40, "changes": None}
+    monkeypatch.setattr(runs, "environment", lambda: dict(code))
+    with open_run(None, "evaluate", None, config, root=tmp_path) as run:
+        assert code_of(run) == ["commit aaaaaaaaaa"]
+    for commit, changes in (("a", None), ("b", "c" * 64), ("b", "c" * 64), ("a", None)):
+        code.update(commit=commit * 40, changes=changes)
+        with open_run(run, "evaluate", None, config):
+            pass
+    expected = ["aaaaaaaaaa", "bbbbbbbbbb with changes cccccccc", "aaaaaaaaaa"]
+    assert code_of(run) == [f"commit {one}" for one in expected]
+    assert begun_with(run)["commit"] == "a" * 40 and begun_with(run)["script"] == "evaluate"
+    (run / "environment.json").unlink()
+    assert code_of(run) == []
 
 
 def test_a_run_of_another_script_is_left_as_it_is(tmp_path):

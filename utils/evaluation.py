@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import platform
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -123,7 +122,7 @@ def tasks(config: Config, done: Sequence[RoundRecord]) -> Iterator[Task]:
     """The tasks that are not in `done` yet; every policy gets the same seeds."""
     plan = config.evaluate
     noises = depth_noises_of(config)
-    known = set(map(_identity, done))
+    known = {record.identity for record in done}
     for number in range(plan.rounds):
         seed = config.seed * 100_000 + number
         for objects in plan.object_sets:
@@ -184,23 +183,6 @@ def check_recorded(
                 f"with the depth noise {record.depth_noise}, which {whose} does not "
                 f"play; {advice}"
             )
-
-
-def check_played_once(rounds: Sequence[RoundRecord], source: str) -> None:
-    """Raise UserError for a round that is there twice: it would count twice, and hide one that is
-    missing."""
-    for (policy, scenario, objects, noise, seed), count in Counter(map(_identity, rounds)).items():
-        if count > 1:
-            raise UserError(
-                f"{source}: holds the round of {policy} on {objects} in the scenario {scenario}, "
-                f"with the depth noise {noise} and the seed {seed}, {count} times; delete all "
-                "lines of it but one, or start a new run"
-            )
-
-
-def _identity(record: RoundRecord) -> tuple[str, str, str, str, int]:
-    """Policy, scenario, object set, depth noise and seed, which no two rounds of a run share."""
-    return (record.policy, *record.kind, record.seed)
 
 
 def interruption(rounds_done: int, config: Config) -> str | None:
@@ -295,7 +277,6 @@ def _play(
     cut_torn_line(journal)
     outcome = Outcome(rounds=read_rounds(journal, config.camera.depth_noise))
     check_recorded(outcome.rounds, config, str(journal))
-    check_played_once(outcome.rounds, str(journal))
     films, gallery, shown = run / "films", run / "gallery.npz", config.evaluate.gallery
     outcome.gallery, written = read_gallery(gallery), time.monotonic()
     todo = tasks(config, outcome.rounds)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -164,6 +165,11 @@ class RoundRecord:
         return self.scenario, self.objects, self.depth_noise
 
     @property
+    def identity(self) -> tuple[str, str, str, str, int]:
+        """Policy, kind and seed, which no two rounds of a run share."""
+        return (self.policy, *self.kind, self.seed)
+
+    @property
     def planner(self) -> str:
         """The policy's name without its controller."""
         return self.policy.removesuffix(policy_name("", self.controller))
@@ -219,12 +225,28 @@ def read_rounds(path: Path, depth_noise: str = CLEAN) -> list[RoundRecord]:
 
     depth_noise: of the rounds of older files, which name none: their config's.
     A last line that a crash cut short does not count; any other line that is no round raises
-    UserError.
+    UserError, and so does a round that is there twice.
     """
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8", errors="replace")
-    return _parse(path, text.split("\n")[:-1], depth_noise)
+    rounds = _parse(path, text.split("\n")[:-1], depth_noise)
+    check_played_once(rounds, str(path))
+    return rounds
+
+
+def check_played_once(rounds: Sequence[RoundRecord], source: str) -> None:
+    """Raise UserError for a round that is there twice: it would count twice, and hide one that is
+    missing."""
+    for (policy, scenario, objects, noise, seed), count in Counter(
+        one.identity for one in rounds
+    ).items():
+        if count > 1:
+            raise UserError(
+                f"{source}: holds the round of {policy} on {objects} in the scenario {scenario}, "
+                f"with the depth noise {noise} and the seed {seed}, {count} times; delete all "
+                "lines of it but one, or start a new run"
+            )
 
 
 def _parse(
@@ -238,8 +260,8 @@ def _parse(
         # Missing entries and entries of other types are any of these; nesting without end is one.
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise UserError(
-                f"{path}, line {number}: not a recorded round ({error}); delete the line or start "
-                "a new run without --resume"
+                f"{path}, line {number}: not a recorded round ({error}); delete the line, or play "
+                "the rounds anew"
             ) from error
     return rounds
 

@@ -30,7 +30,7 @@ from utils.result_records import (
     loose,
     read_rounds,
 )
-from utils.runs import begun_with
+from utils.runs import code_of
 from utils.statistics import (
     Difference,
     clustered_interval,
@@ -248,18 +248,23 @@ class Comparison:
     cleared: Difference | None
 
 
+_Kind = tuple[str, str, str]  # scenario, object set and depth noise
+# The rounds of each policy by scenario, object set and seed.
+_Policies = dict[str, dict[tuple[str, str, int], RoundRecord]]
+
+
 def compare(
     rounds: Iterable[RoundRecord], seed: int, pairs: Collection[tuple[str, str]] | None = None
 ) -> list[Comparison]:
     """Paired differences of policies on each scenario, object set and depth noise that they share,
-    and at last, for each depth noise, on all their rounds in clutter together, where these are of
+    and at last, for each depth noise, on all that they share in clutter together, where this is of
     several scenarios or object sets.
 
     seed: of the bootstrap. pairs: the policies to compare, (first, second); None: every pair, the
     later one first.
     """
-    cells: dict[tuple[str, str, str], dict[str, dict[tuple, RoundRecord]]] = {}
-    clutter: dict[str, dict[str, dict[tuple, RoundRecord]]] = {}
+    cells: dict[_Kind, _Policies] = {}
+    clutter: dict[str, _Policies] = {}
     for record in rounds:
         scene = (record.scenario, record.objects, record.seed)
         policies = cells.setdefault(record.kind, {})
@@ -267,28 +272,37 @@ def compare(
         if record.scenario in CLUTTER:
             policies = clutter.setdefault(record.depth_noise, {})
             policies.setdefault(record.policy, {})[scene] = record
-    for noise, policies in clutter.items():
-        kinds = [kind for kind in cells if kind[0] in CLUTTER and kind[2] == noise]
-        if len(kinds) > 1:
-            scenarios, sets, _ = (list(dict.fromkeys(names)) for names in zip(*kinds))
-            cells[SEVERAL.join(scenarios), SEVERAL.join(sets), noise] = policies
-    return [
+    found = [
         _compared(first, second, kind, policies, seed)
         for kind, policies in cells.items()
-        for first, second in (_every_pair(list(policies)) if pairs is None else pairs)
-        if first in policies and second in policies
+        for first, second in _pairs_of(policies, pairs)
     ]
+    for noise, policies in clutter.items():
+        for first, second in _pairs_of(policies, pairs):
+            shared = policies[first].keys() & policies[second].keys()
+            kinds = [kind for kind in cells if any(scene[:2] == kind[:2] for scene in shared)]
+            scenarios, sets = (list(dict.fromkeys(kind[i] for kind in kinds)) for i in range(2))
+            if len(scenarios) > 1 or len(sets) > 1:
+                together = SEVERAL.join(scenarios), SEVERAL.join(sets), noise
+                found.append(_compared(first, second, together, policies, seed))
+    return found
 
 
-def _every_pair(names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(first, second) for i, second in enumerate(names) for first in names[i + 1 :]]
+def _pairs_of(
+    policies: _Policies, pairs: Collection[tuple[str, str]] | None
+) -> list[tuple[str, str]]:
+    """Those of the pairs, or of all, of which both have played."""
+    names = list(policies)
+    if pairs is None:
+        return [(first, second) for i, second in enumerate(names) for first in names[i + 1 :]]
+    return [pair for pair in pairs if policies.keys() >= {*pair}]
 
 
 def _compared(
     first: str,
     second: str,
-    kind: tuple[str, str, str],
-    rounds: dict[str, dict[tuple, RoundRecord]],
+    kind: _Kind,
+    rounds: _Policies,
     seed: int,
 ) -> Comparison:
     # Sorted, because a bootstrap depends on the order, and a journal on the workers' speed.
@@ -314,7 +328,7 @@ def _difference(
 
 # Sections and keys of the config that a scene is made from (`envs.cell_scenes.make_scene`): objects
 # come to rest in a simulator, so that the steps of the physics count, and some layouts choose what
-# the hand can span.
+# the hand can span, or, where one object is wanted, what the hand can take at all.
 SCENE_KEYS = (
     "scene", "objects", "workspace", "gripper.max_opening", "sim.frequency",
     "sim.solver_iterations",
@@ -331,7 +345,8 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
     Raises UserError where a folder holds no evaluation, and where the scenes do not match.
     """
     (config, before), (other, after) = (_read_run(folder) for folder in (first, second))
-    for key in SCENE_KEYS:
+    wanted = any(record.target_in_hand is not None for record in [*before, *after])
+    for key in [*SCENE_KEYS, *(["gripper"] if wanted else [])]:
         if _differ(config, other, key):
             raise UserError(
                 f"--compare {first} {second}: their scenes do not match, because {key} differs in "
@@ -348,11 +363,11 @@ def compare_runs(first: Path, second: Path) -> list[Comparison]:
             f"--compare {first} {second}: they have no scene in common; compare runs with the same "
             "seed, evaluate.scenarios, evaluate.object_sets and evaluate.depth_noises"
         )
-    one, another = (begun_with(folder).get("commit") for folder in (first, second))
+    one, another = (" and ".join(code_of(folder)) for folder in (first, second))
     if one and another and one != another:
         warnings.warn(
-            f"--compare {first} {second}: played at commit {one[:10]} and at {another[:10]}; "
-            "where these lay objects otherwise, scenes of the same seed are not the same",
+            f"--compare {first} {second}: played at {one}, and at {another}; where these lay "
+            "objects otherwise, scenes of the same seed are not the same",
             stacklevel=2,
         )
     names = [list(dict.fromkeys(record.policy for record in rounds)) for rounds in (before, after)]

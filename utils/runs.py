@@ -52,6 +52,7 @@ PACKAGES = (  # whose versions may change a result
     "h5py", "numba", "llvmlite",
 )  # fmt: skip
 SCHEMA = 1  # version of results.json
+CONTINUED = "continued"  # of environment.json
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of the container, where it has one
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit statuses
 UNREAD = 128 + 13  # as of SIGPIPE, which Windows has not
@@ -274,6 +275,7 @@ def open_run(
     refusal = "another process works in this run; wait until it has ended, or start a new run"
     with locked(run / ".lock", f"{run}: {refusal}"):
         if resumed is not None:
+            _note_code(run)
             write_atomic(run / "config.yaml", dump_config(config))
         yield run
 
@@ -360,6 +362,33 @@ def begun_with(run: Path) -> dict[str, Any]:
         return dict(json.loads((run / "environment.json").read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return {}
+
+
+def code_of(run: Path) -> list[str]:
+    """With which code a run was begun and continued, one entry for each change: 'commit 0123456789'
+    or 'commit 0123456789 with changes 01234567'; empty where that is not known."""
+    return [
+        f"commit {facts['commit'][:10]}"
+        + (f" with changes {facts['changes'][:8]}" if facts.get("changes") else "")
+        for facts in code_states(run)
+        if facts.get("commit")
+    ]
+
+
+def code_states(run: Path) -> list[dict[str, Any]]:
+    """The facts with which a run began, and commit and changes of the code whenever it was
+    continued with other ones."""
+    begun = begun_with(run)
+    return [begun, *begun.get(CONTINUED, [])]
+
+
+def _note_code(run: Path) -> None:
+    """Add the present code to a run's environment.json, where it is another than the last."""
+    begun, *later = code_states(run)
+    now = {name: value for name, value in environment().items() if name in ("commit", "changes")}
+    last = later[-1] if later else begun
+    if begun and any(last.get(name) != value for name, value in now.items()):
+        write_json_atomic(run / "environment.json", begun | {CONTINUED: [*later, now]})
 
 
 def _changed_since(run: Path, config: Config) -> list[str]:
@@ -507,9 +536,10 @@ def git_state(folder: Path = REPOSITORY) -> GitState:
 
 
 def _changes() -> str | None:
-    """A digest of the repository's uncommitted changes, but for those of pages and tables."""
+    """A digest of the repository's uncommitted changes, but for those of pages and tables; None
+    where there are no others."""
     changes = _git(REPOSITORY, "diff", "HEAD", "--", ".", ":(exclude)docs", ":(exclude)*.md")
-    return None if changes is None else hashlib.sha256(changes.encode()).hexdigest()
+    return hashlib.sha256(changes.encode()).hexdigest() if changes else None
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
