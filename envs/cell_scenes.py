@@ -103,11 +103,13 @@ def make_scene(layout: str, objects: ObjectSet, seed: int, config: Config) -> Sc
             target = _covered(placements, config) if layout == TARGET_LAYOUT else None
             if layout != TARGET_LAYOUT or target is not None:
                 return Scene(layout, seed, placements, walls, fixed, viewpoint, target)
-    covering = " with one under others" if layout == TARGET_LAYOUT else ""
+    also = {TARGET_LAYOUT: " with one under others", "wall": " with all leaning"}.get(layout, "")
+    fewer = "" if layout in _COUNTS else ", fewer (scene.count)"
     raise SceneError(
         f"no {layout} scene of {count} objects of {objects.name!r} (seed {seed}) came to rest "
-        f"inside the {config.workspace.size} m workspace{covering} in {_DRAWS} tries; use smaller "
-        "objects (objects.scale, objects.fit), fewer (scene.count) or a larger workspace.size"
+        f"inside the {config.workspace.size} m workspace{also} in {_DRAWS} tries; use smaller "
+        f"objects (objects.scale, or objects.fit for those of a folder){fewer} or a larger "
+        "workspace.size"
     )
 
 

@@ -76,9 +76,8 @@ class PybulletHand(Hand):
             pybullet.changeDynamics(
                 self.body, link, linearDamping=0, angularDamping=0, physicsClientId=self.client
             )
-        for (
-            link
-        ) in self.fingers:  # Bullet has no inertia of a joint's own, so that the finger has it
+        # Bullet has no inertia of a joint's own, so that the finger has it.
+        for link in self.fingers:
             mass = pybullet.getDynamicsInfo(self.body, link, physicsClientId=self.client)[0]
             pybullet.changeDynamics(
                 self.body, link, mass=mass + FINGER_DRIVE_INERTIA, physicsClientId=self.client

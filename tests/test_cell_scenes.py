@@ -319,5 +319,8 @@ def test_impossible_scene_is_refused(box_set, config):
     crowded = with_settings(config, "scene", {"count": 50})
     with pytest.raises(SceneError, match="scene.count"):
         make_scene("packed", box_set, 0, crowded)
+    tiny = with_settings(config, "workspace", {"size": 0.01})
+    with pytest.raises(SceneError, match=r"for those of a folder\) or a larger workspace.size"):
+        make_scene("dense", box_set, 0, tiny)  # whose number of objects is fixed
     with pytest.raises(SceneError, match="isolated, packed, pile"):
         make_scene("heap", box_set, 0, config)

@@ -83,6 +83,21 @@ def test_packages_that_make_the_bits_are_compared():
     assert all(facts[name] == version(name) for name in makers)
 
 
+def test_a_worker_with_other_weights_is_refused(tmp_path, monkeypatch):
+    """Those of the files in `checkpoints`, whatever their names are."""
+    (tmp_path / "checkpoints").mkdir()
+    weights = tmp_path / "checkpoints" / "critic.pt"
+    weights.write_bytes(b"one")
+    monkeypatch.setattr(worker_process, "REPOSITORY", tmp_path)
+    facts = facts_of([])
+    worker_process._content.cache_clear()  # as in a process that starts now
+    check(facts)
+    worker_process._content.cache_clear()
+    weights.write_bytes(b"another")
+    with pytest.raises(UserError, match="the content of checkpoints is .* there and .* here"):
+        check(facts)
+
+
 def test_a_worker_that_does_not_know_a_fact_is_refused():
     with pytest.raises(UserError, match="a package of tomorrow is missing there and 1.0 here"):
         check({"a package of tomorrow": "1.0"})

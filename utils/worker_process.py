@@ -172,9 +172,11 @@ def _keep_memory() -> None:
 
 def facts_of(modules: Sequence[str]) -> dict[str, str]:
     """What two processes must have in common to compute the same bits: the versions of Python and
-    of the packages, and the sources of `modules`, the project's packages or plug-ins."""
+    of the packages, the shipped weights and chances, and the sources of `modules`, the project's
+    packages or plug-ins."""
     facts = {"Python": ".".join(platform.python_version_tuple()[:2])}
     facts |= {name: package_version(name) or "missing" for name in PACKAGES}
+    facts["the content of checkpoints"] = _content(REPOSITORY / "checkpoints")
     return facts | {f"the source of {name}": _digest(name) for name in modules}
 
 
@@ -205,6 +207,15 @@ def _digest(module: str) -> str:
     files = [Path(found.origin)] if found.origin else []
     for folder in found.submodule_search_locations or ():
         files += sorted(Path(folder).glob("*.py"))
+    return _digest_of(files)
+
+
+@functools.cache  # the planners of a process keep the weights that they have loaded
+def _content(folder: Path) -> str:
+    return _digest_of(sorted(file for file in folder.iterdir() if file.is_file()))
+
+
+def _digest_of(files: Sequence[Path]) -> str:
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + file.read_bytes())
