@@ -70,6 +70,7 @@ from models.ppo_progress import (
     summary,
     time_in_words,
     updates_of,
+    warn_of_short_episodes,
 )
 from models.ppo_rollouts import (
     EVALUATION,
@@ -104,6 +105,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_names(config)
     check_weights_file("--weights", options.weights, KIND)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
+    if config.rl.env_id in OWN_ENVS:
+        warn_of_short_episodes(config)
     if config.rl.films:  # one that draws no pictures is told of now
         make_env(config, render_mode="rgb_array").close()
     if os.environ.get("LOCAL_RANK", "0") == "0":
@@ -205,7 +208,7 @@ def train(
                 rate = per_update / (time.perf_counter() - begun)
                 curves.add("time", step, {"steps_per_second": rate})
     except NotFinite as error:
-        raise UserError(f"{error}; {after_not_finite(run)}") from error
+        raise UserError(f"{error}; {after_not_finite(error, run)}") from error
     except WorkerError:
         print(f"after this error, {after_worker_error(run)}", file=sys.stderr)
         raise

@@ -266,6 +266,12 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
             f"rl.env_id {settings.env_id}, rl.env_kwargs {settings.env_kwargs}: "
             f"{type(error).__name__}: {one_line(error)}"
         ) from error
+    if env.spec is not None and env.spec.id in OWN_ENVS and settings.env_id not in OWN_ENVS:
+        env.close()
+        raise UserError(
+            f"rl.env_id {settings.env_id}: write rl.env_id={env.spec.id}, so that the config "
+            "counts for this project's environment"
+        )
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
         env.close()
         raise no_pictures

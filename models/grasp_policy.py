@@ -34,7 +34,7 @@ from utils.checkpoint import (
 )
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
-from utils.errors import UserError
+from utils.errors import UserError, unknown_choice
 
 __all__ = [
     "ActionDistribution",
@@ -55,7 +55,11 @@ BOUNDS = ("action_low", "action_high")  # of an action space, perhaps infinite
 UNSHAPED = {
     "activation": "activation", "squash": "squash", "normalise": "normalise_observations",
 }  # fmt: skip
-MEANING = ("control", "frame", "gripper")  # keys of section env that say what an action means
+# Keys of section env that say what an action means, and how far it goes.
+MEANING = (
+    "control", "frame", "gripper", "position_step", "rotation_step", "joint_step", "gripper_step",
+    "substeps",
+)  # fmt: skip
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
@@ -395,6 +399,10 @@ def make_ppo(
         *(settings.estimated_observations or ()),  # first: the network estimates the first ones
         *(settings.privileged_observations or ()),
     )
+    known = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {}
+    for key in settings.estimated_observations or ():
+        if key not in known:
+            raise unknown_choice("rl.estimated_observations", key, known)
     layout = ObservationLayout.of(observation_space, settings.policy_observations, privileged)
     torch.manual_seed(config.seed)
     network = policy_for(layout, action_space, settings)

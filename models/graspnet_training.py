@@ -152,8 +152,9 @@ class Trainer:
         total, parts = self.losses(batch)
         if not torch.isfinite(total):
             raise UserError(
-                f"the loss is {total.item()} at step {self.step}; the weights of the last "
-                "checkpoint are sound: lower train.lr or use train.precision=float32"
+                f"the loss is {total.item()} at step {self.step}; the weights of the run's last.pt "
+                "are sound: start a new run from them (train.initial=RUN/last.pt) with a lower "
+                "train.lr or with train.precision=float32"
             )
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(total).backward()

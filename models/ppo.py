@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from models.ppo_observations import ObservationLayout, Observations, RewardScaler
-from models.ppo_rollouts import NotFinite, Rollout, StepMemory, joined
+from models.ppo_rollouts import Diverged, Rollout, StepMemory, joined
 from utils.checkpoint import load_checkpoint, load_weights, reading, save_checkpoint
 from utils.config_schema import Config, RLConfig
 from utils.distributed import ALONE, Team
@@ -135,7 +135,7 @@ class GraspPPO:
 
         progress: share of the training that is done, for the annealed learning rate.
         Returns means over the minibatches, and the gradients' norm before it was clipped.
-        Raises NotFinite, with the weights as they were before that minibatch, if a gradient is no
+        Raises Diverged, with the weights as they were before that minibatch, if a gradient is no
         number.
         """
         batch, explained_variance = self._prepare(rollout)
@@ -149,7 +149,7 @@ class GraspPPO:
             losses = self.losses(minibatch)
             norm = self.gradient(losses.loss)
             if not math.isfinite(norm):
-                raise NotFinite(
+                raise Diverged(
                     f"a gradient is not finite at update {self.updates} (loss "
                     f"{losses.loss.item():.3g}, of the value {losses.value_loss.item():.3g})"
                 )
@@ -331,7 +331,7 @@ class GraspPPO:
             loss = self.network.estimate_loss(seen.image(), seen.state, seen.privileged)
             norm = self.gradient(loss, self.estimator_weights)
             if not math.isfinite(norm):
-                raise NotFinite(f"a gradient of the estimates is not finite ({self.updates=})")
+                raise Diverged(f"a gradient of the estimates is not finite ({self.updates=})")
             self.estimator_optimizer.step()
             losses.append(loss.detach())
         self.memory.add(new)

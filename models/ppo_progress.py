@@ -7,6 +7,7 @@ history is the list of all rows. This module makes no environment and no network
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -22,12 +23,15 @@ from models.ppo_observations import ObservationLayout
 from models.ppo_rollouts import (
     EVALUATION,
     SIMULATION,
+    Diverged,
     Envs,
     Episode,
+    NotFinite,
     derived_seeds,
     evaluate_policy,
 )
 from utils.checkpoint import reading
+from utils.config import changed_keys
 from utils.config_schema import Config, RLConfig
 from utils.runs import Stopwatch, resume_command, save_results, this_python
 
@@ -50,6 +54,21 @@ def updates_of(config: Config) -> int:
 def evaluation_due(config: Config, updates: int) -> bool:
     """Whether the policy is evaluated after so many updates, and a checkpoint written."""
     return updates % config.rl.evaluate_every == 0 or updates == updates_of(config)
+
+
+def warn_of_short_episodes(config: Config) -> None:
+    """Remark where each episode of a training ends before its time: episodes begin anew after every
+    checkpoint, as those of a run that is resumed from it do."""
+    settings = config.rl
+    longest = settings.evaluate_every * settings.rollout_steps
+    if longest < config.env.max_steps:
+        warnings.warn(
+            f"rl.evaluate_every={settings.evaluate_every} and "
+            f"rl.rollout_steps={settings.rollout_steps}: a checkpoint, after which episodes begin "
+            f"anew, comes every {longest} steps, so that none of the training reaches "
+            f"env.max_steps={config.env.max_steps}; evaluate less often",
+            stacklevel=2,
+        )
 
 
 def announcement(config: Config, run: Path, ppo: GraspPPO) -> str:
@@ -158,15 +177,18 @@ class Curves:
             self._writer.close()
 
 
-def after_not_finite(run: Path) -> str:
+def after_not_finite(error: NotFinite, run: Path) -> str:
     """What to do after a number that is not finite."""
     last = run / "last.pt"
+    if not isinstance(error, Diverged):
+        saved = f"the weights of {last} are sound" if last.is_file() else "nothing was saved before"
+        return f"{saved}; look at the environment's rewards and observations"
     if last.is_file():
         return (
             f"the weights of {last} are sound: continue from them with rl.initial, perhaps with a "
             "lower rl.lr"
         )
-    return "nothing was saved before; look at the environment's rewards and observations"
+    return "nothing was saved before; look at the environment's rewards, or lower rl.lr"
 
 
 def after_worker_error(run: Path) -> str:
@@ -226,10 +248,13 @@ def scoring_command(
     best = run / "best.pt"
     if any(part.key not in known for part in layout.state):
         return f"{this_python()} -m benchmarks.bench_policy {best}"
+    # The checkpoint brings these sections; scenes and objects are those of the evaluation.
+    own = ("env", "rl", "camera", "evaluate", "train", "data", "compute", "seed", "objects.split")
+    changed = [key for key in changed_keys(config) if not key.startswith(own)]
     return (
         f"{this_python()} evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
-        f"evaluate.object_sets={config.env.objects}"
-    )
+        f"evaluate.object_sets={config.env.objects} {shlex.join(changed)}"
+    ).rstrip()
 
 
 def stopped_in_words(

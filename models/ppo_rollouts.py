@@ -47,7 +47,11 @@ class Envs(Protocol):
 
 
 class NotFinite(UserError):
-    """An environment or an update produced NaN or infinity; no weight has been changed by it."""
+    """An environment produced NaN or infinity; no weight has been changed by it."""
+
+
+class Diverged(NotFinite):
+    """A gradient is not finite; no weight has been changed by it."""
 
 
 class Episode(NamedTuple):

@@ -179,7 +179,9 @@ class _NetworkUnpickler(pickle.Unpickler):
         is_function = _FUNCTIONS.fullmatch(place) is not None
         if is_function or _CLASSES.fullmatch(place):
             found = super().find_class(module, name)
-            if is_function or isinstance(found, type):
+            # A module also has what it has imported, such as `functools.partial`.
+            own = isinstance(found, type) and found.__module__.split(".")[0] == module.split(".")[0]
+            if is_function or own:
                 return found
         raise pickle.UnpicklingError(f"it holds {place}, which no policy needs")
 

@@ -95,7 +95,12 @@ def test_a_map_answers_where_the_image_changes(name: str) -> None:
     with torch.no_grad():
         first = model(x, logits=True)[0].roll((stride, 2 * stride), dims=(2, 3))
         second = model(moved, logits=True)[0]
+        # And the answer lies where the change is: padding on one side alone would move it.
+        change = (model(x, logits=True)[0] - model(0 * x, logits=True)[0])[0, 0].abs()
     torch.testing.assert_close(first[..., inner, inner], second[..., inner, inner])
+    rows, columns = torch.meshgrid(*[torch.arange(2.0 * middle) + 0.5] * 2, indexing="ij")
+    for place in (rows, columns):
+        assert abs((change * place).sum() / change.sum() - (middle - stride / 2)) <= stride
 
 
 def test_logits_are_the_quality_before_its_sigmoid() -> None:
@@ -282,6 +287,8 @@ def test_the_gradient_reaches_every_parameter(name: str) -> None:
     GraspLoss()(*model(torch.randn(2, 4, 32, 32), logits=True), targets)[0].backward()
     for part, parameter in model.named_parameters():
         assert parameter.grad is not None, part
+        # A bias before a normalisation shifts what is taken off again.
+        assert parameter.grad.abs().max() > 0 or part.endswith("bias"), part
     for head in (model.quality_head, model.angle_head, model.width_head):
         assert head.weight.grad.abs().max() > 0
 

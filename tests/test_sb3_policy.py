@@ -2,7 +2,9 @@
 
 import base64
 import builtins
+import io
 import json
+import pickle
 import warnings
 import zipfile
 
@@ -17,6 +19,7 @@ from envs.objects import load_object_set
 from envs.policy_approach import check_learned, is_learned, learned_approach, placeholder
 from envs.rounds import run_round
 from envs.simulators import make_cell
+from models import sb3_policy
 from models.sb3_policy import load_sb3
 from utils.config import load_config
 from utils.errors import UserError
@@ -157,6 +160,19 @@ def test_a_file_that_is_none_is_refused(tmp_path):
     (tmp_path / "other.zip").write_text("no zip")
     with pytest.raises(UserError, match="not a policy of Stable-Baselines3"):
         load_sb3(tmp_path / "other.zip")
+
+
+def test_what_a_module_has_imported_is_none_of_its_classes():
+    """`functools.partial`, which calls anything, is known to Stable-Baselines3's policies."""
+    from stable_baselines3.common import policies
+
+    assert hasattr(policies, "partial")
+    for name, module in (("partial", "stable_baselines3.common.policies"), ("chain", "torch.nn")):
+        code = f"c{module}\n{name}\n.".encode()
+        with pytest.raises(pickle.UnpicklingError, match=f"{name}, which no policy needs"):
+            sb3_policy._NetworkUnpickler(io.BytesIO(code)).load()
+    code = b"cstable_baselines3.common.policies\nActorCriticPolicy\n."
+    assert sb3_policy._NetworkUnpickler(io.BytesIO(code)).load() is policies.ActorCriticPolicy
 
 
 def test_code_in_a_file_is_not_run(files, tmp_path):

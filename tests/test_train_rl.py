@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,8 +25,19 @@ from envs.vector_env import WorkerError, make_env, training_envs
 from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo import KIND
 from models.ppo_observations import ObservationLayout
-from models.ppo_progress import reached, scoring_command
-from models.ppo_rollouts import EVALUATION, derived_seeds, evaluate_policy
+from models.ppo_progress import (
+    after_not_finite,
+    reached,
+    scoring_command,
+    warn_of_short_episodes,
+)
+from models.ppo_rollouts import (
+    EVALUATION,
+    Diverged,
+    NotFinite,
+    derived_seeds,
+    evaluate_policy,
+)
 from tests.helpers.compare import same
 from tests.helpers.interruption import interrupt_after
 from tests.helpers.ppo_parts import batch_of, ppo_of
@@ -277,6 +289,24 @@ def test_pretraining_is_not_repeated_where_the_first_evaluation_was_broken_off(
     assert train_rl.main(["--resume", str(run)]) == 0
 
 
+def test_episodes_that_checkpoints_cut_short_are_told_of():
+    with pytest.warns(UserWarning, match="every 32 steps, so that none .* env.max_steps=100; eval"):
+        warn_of_short_episodes(load_config(None, ["rl.rollout_steps=32", "rl.evaluate_every=1"]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for file in ("ppo", "ppo_primitives", "ppo_random_urdfs", "ppo_state", "ppo_varied_looks"):
+            warn_of_short_episodes(load_config(REPOSITORY / f"configs/{file}.yaml", []))
+
+
+def test_an_environment_s_bad_number_is_not_taken_for_a_diverged_network(tmp_path):
+    bad, diverged = NotFinite("the reward"), Diverged("a gradient")
+    assert after_not_finite(bad, tmp_path).endswith("environment's rewards and observations")
+    assert after_not_finite(diverged, tmp_path).endswith("rewards, or lower rl.lr")
+    (tmp_path / "last.pt").touch()
+    assert after_not_finite(bad, tmp_path).endswith("environment's rewards and observations")
+    assert "continue from them with rl.initial" in after_not_finite(Diverged("a"), tmp_path)
+
+
 def test_the_end_says_where_policy_and_curves_are(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert train_rl.main([*POINT, "rl.target_return=-100"]) == 0
@@ -294,6 +324,12 @@ def test_a_policy_that_sees_what_no_robot_knows_is_not_scored_beside_planners():
     assert scoring_command(config, Path("run"), seen, KNOWN_TO_A_ROBOT) == (
         f"{this_python()} evaluate.py evaluate.policies=ppo:run/best.pt "
         "evaluate.scenarios=isolated evaluate.object_sets=primitives"
+    )
+    # With what makes another cell, and nothing of the training.
+    cell = ["simulator=mujoco", "objects.scale=1.5", "objects.split=train", "seed=3", "rl.lr=1e-4"]
+    other = load_config(None, ["env.objects=primitives", "env.control=ee", *cell])
+    assert scoring_command(other, Path("run"), seen, KNOWN_TO_A_ROBOT).endswith(
+        " evaluate.object_sets=primitives 'simulator=\"mujoco\"' objects.scale=1.5"
     )
     more = ObservationLayout.of(spaces.Dict({"gripper": box, "object_offset": box}))
     command = scoring_command(config, Path("run"), more, KNOWN_TO_A_ROBOT)

@@ -56,6 +56,14 @@ def test_env_kwargs_and_info_reach_the_environment():
     np.testing.assert_allclose(first["goal"], rng.uniform(-1, 1, 2), rtol=1e-6)
 
 
+@pytest.mark.parametrize("other", ["RobotGrasping", "envs:RobotGrasping-v0"])
+def test_the_own_environment_by_another_name_is_refused(other):
+    """Gymnasium knows it by these, too, but it would be made without the config."""
+    said = f"rl.env_id {other}: write rl.env_id=RobotGrasping-v0, so that the config counts"
+    with pytest.raises(UserError, match=said):
+        make_env(load_config(None, [f"rl.env_id={other}", "env.control=joint"]))
+
+
 @pytest.mark.parametrize("env_id", ["RobotGrasping-v0", "RandomizedGrasping-v0"])
 def test_env_kwargs_set_no_key_of_section_env(env_id):
     """evaluate.py scores the policy by the section."""
