@@ -104,8 +104,9 @@ def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int
     )  # fmt: skip
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
-    if unfinished is not None:
-        print(f"{unfinished}; go on with {going_on(run, copies(options))}")
+    if unfinished is not None:  # an error says itself whether and how it can go on
+        hint = "" if outcome.error else f"; go on with {going_on(run, copies(options))}"
+        print(f"{unfinished}{hint}")
     # Last, so that the run's own files are there even where these cannot be written.
     if options.results is not None:
         write_results(options.results, *results)

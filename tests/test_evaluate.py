@@ -564,6 +564,7 @@ def test_an_impossible_scene_ends_the_run_but_not_the_results(
                  "scene.count=8", "workspace.size=0.06", "evaluate.workers=1",
                  "evaluate.rounds=1"]  # fmt: skip
     assert "scene.count" in refusal(arguments, tmp_path, monkeypatch, capsys)
+    # Resumed, the same scene could not be made again.
     results = json.loads((only_run(tmp_path) / "results.json").read_text())
     assert results["complete"] is False and results["rows"][0]["rounds"] >= 1
     assert (only_run(tmp_path) / "report.html").exists()

@@ -17,6 +17,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.tensorboard import SummaryWriter
 
 import train_rl
 from envs.policy_approach import KNOWN_TO_A_ROBOT, check_learned
@@ -347,6 +348,8 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path, monkeypatch
 def test_resuming_keeps_the_curves_up_to_its_checkpoint(finished, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = Path(shutil.copytree(finished, tmp_path / "run"))
+    with SummaryWriter(run / "tensorboard") as writer:  # as of updates after the last checkpoint
+        writer.add_scalar("update/loss", 7.0, 224)
     assert train_rl.main([*POINT, "--resume", str(run)]) == 0
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     assert [event.step for event in events.Scalars("evaluation/return")] == [0, 64, 128, 192]
