@@ -73,6 +73,7 @@ from utils.run_checks import check_data, check_place, counted
 from utils.runs import check_resume, parse_args, resume_command, run_script, save_results
 
 WEIGHTS = "also write graspnet.pt to this file once the training has reached its end"
+STOPPING = "interrupted: stopping after the step under way"
 SAVE_SECONDS = 300  # between two saves of last.pt within an epoch
 FREE_TO_CHANGE = (*COMPUTE_KEYS, "train.name", "train.device", "train.workers", "data.workers")
 
@@ -158,7 +159,7 @@ def train(
     quiet = not is_main or trainer.was_finished
     bar = tqdm(total=trainer.total_steps, initial=trainer.step, unit="step", disable=quiet)
     last_save = time.monotonic()
-    with stop_on_interrupt() as interrupted, bar, curves as writer:
+    with stop_on_interrupt(STOPPING if is_main else None) as interrupted, bar, curves as writer:
         for epoch in range(len(history), config.train.epochs):
             skip = trainer.step - epoch * steps
             for batch in epoch_loader(config, data, processes, epoch, skip):

@@ -29,6 +29,7 @@ from envs.cell import Cell, Intrinsics, require_arm, wrist_mount
 from envs.cell_layout import EMPTY, Scene
 from envs.cell_scenes import LAYOUTS
 from envs.robot_kinematics import forward_kinematics
+from utils.errors import TargetLostError
 from utils.random_streams import Stream
 from utils.table_plane import fit_table_plane
 from utils.transforms import RGBDFrame, inverse_pose, planar
@@ -98,10 +99,14 @@ def teach(cell: Cell, scene: Scene = EMPTY) -> np.ndarray:
     while the jig holds the board at a known pose in E. The first call with a cell empties it and
     keeps the pose as `cell.taught`; later calls return that. A cell that differs from scene to
     scene (`evaluate.randomise`) is built each time as for `scene`, with the camera that it has
-    there; the jig holds the board over the objects."""
+    there; the jig holds the board over the objects. Where its light or its noise hides the board,
+    the pose is the one that the config states."""
     require_arm(cell.config, "a closed loop")
     if cell.on_build is not None:
-        return _measure_mount(cell, scene)
+        try:
+            return _measure_mount(cell, scene)
+        except TargetLostError:
+            return inverse_pose(wrist_mount(cell.config.camera))
     if cell.taught is None:
         cell.taught = _measure_mount(cell, EMPTY)
     return cell.taught

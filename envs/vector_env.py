@@ -2,7 +2,8 @@
 
 `make_env` makes one from the config's section `rl`, `training_envs` all of them. A worker that
 raises, dies or hangs at a task ends the call with an error that says what is known about it: no
-task waits for ever. Environments never reset on their own, so that no final observation is lost.
+task of a worker waits for ever (in the main process, with rl.parallel=false or one environment, one
+may). Environments never reset on their own, so that no final observation is lost.
 This module knows no policy.
 """
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from envs import scenarios
 from envs.cell import wrist_mount
 from envs.cell_layout import GRAVITY
 from envs.mujoco_cell import MujocoCell
@@ -25,6 +26,7 @@ from envs.scenarios import (
 )
 from envs.simulators import make_cell
 from utils.config import load_config
+from utils.errors import TargetLostError
 from utils.table_plane import fit_table_plane
 from utils.transforms import inverse_pose, top_down_pose
 
@@ -171,6 +173,22 @@ def test_a_randomised_cell_is_taught_with_the_camera_of_its_scene(scene, seed):
         away = taught @ wrist_mount(CONFIG) @ cell.view.T_CC  # identity
     assert np.linalg.norm(away[:2, 3]) < 2.5e-3 and abs(away[2, 3]) < 0.02
     assert np.degrees(Rotation.from_matrix(away[:3, :3]).magnitude()) < 1
+
+
+def test_a_randomised_cell_whose_board_is_not_seen_has_the_mount_of_its_config(
+    cell, scene, monkeypatch
+):
+    """One cell alone must not end an evaluation; a nominal one in which this happens is broken."""
+
+    def dark(*_):
+        raise TargetLostError("target lost: of its 4 markers not seen: 0, 1, 2, 3")
+
+    monkeypatch.setattr(scenarios.Board, "find", dark)
+    monkeypatch.setattr(cell, "taught", None)
+    with pytest.raises(TargetLostError):
+        teach(cell, scene)
+    monkeypatch.setattr(cell, "on_build", lambda cell: None)
+    np.testing.assert_allclose(teach(cell, scene) @ wrist_mount(CONFIG), np.eye(4), atol=1e-12)
 
 
 def test_what_is_taught_is_the_true_mount(cell):

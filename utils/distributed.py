@@ -14,6 +14,7 @@ import time
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
@@ -27,6 +28,9 @@ from utils.errors import UserError
 from utils.run_checks import check_data, keep_data
 from utils.runs import open_run, run_of_job
 
+# For which processes wait for each other: one may play its last shard of data once more after
+# compute.timeout. torchrun itself ends those whose partner is gone.
+_PATIENCE = timedelta(hours=2)
 MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
 
 
@@ -122,6 +126,7 @@ def team(device: str, environment: Mapping[str, str], key: str = "train.device")
     dist.init_process_group(
         "nccl" if chosen.type == "cuda" else "gloo",
         store=dist.PrefixStore(new_prefix(store, rank, ranks), store), rank=rank, world_size=ranks,
+        timeout=_PATIENCE,
     )  # fmt: skip
     try:
         yield Team(dist.get_rank(), ranks, chosen)
