@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from utils import distributed
+from utils.config import load_config
 from utils.distributed import ALONE, Team, choose_device, new_prefix, stop_on_interrupt, team
 from utils.errors import UserError
 from utils.runs import REPOSITORY
@@ -61,8 +62,10 @@ def test_a_process_takes_its_gpu_before_it_talks_to_the_others(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "set_device", calls.append)
 
-    def init(backend, store, rank, world_size):
+    def init(backend, store, rank, world_size, timeout):
         calls.append(backend)
+        # One may wait for the other's shard of data, played once more after compute.timeout.
+        assert timeout.total_seconds() >= 2 * load_config(None, []).compute.timeout
         store.set("address", "of this start")
         assert (rank, world_size) == (1, 2)
 
