@@ -35,7 +35,7 @@ from envs.transfer_plan import columns_of, evaluations_of, score_photographs, tr
 from models.photographs import photographs
 from utils.atomic_files import check_copies
 from utils.config import Config, load_foreign, values_of
-from utils.errors import UserError
+from utils.errors import RecurringError, UserError
 from utils.evaluation import (
     FREE_TO_CHANGE,
     check_controllers,
@@ -104,9 +104,9 @@ def report_scores(config: Config, options: argparse.Namespace, run: Path) -> int
     )  # fmt: skip
     write_failures(run / "failures.png", outcome.gallery)
     print(f"report: {run / 'report.html'}")
-    if unfinished is not None:  # an error says itself whether and how it can go on
-        hint = "" if outcome.error else f"; go on with {going_on(run, copies(options))}"
-        print(f"{unfinished}{hint}")
+    if unfinished is not None:
+        recurs = isinstance(outcome.error, RecurringError)
+        print(unfinished + f"; go on with {going_on(run, copies(options))}" * (not recurs))
     # Last, so that the run's own files are there even where these cannot be written.
     if options.results is not None:
         write_results(options.results, *results)

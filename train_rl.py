@@ -105,12 +105,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     check_names(config)
     check_weights_file("--weights", options.weights, KIND)
     check_resume(config, options.resume, FREE_TO_CHANGE, ["last.pt"])
-    if config.rl.env_id in OWN_ENVS:
-        warn_of_short_episodes(config)
     if config.rl.films:  # one that draws no pictures is told of now
         make_env(config, render_mode="rgb_array").close()
     if os.environ.get("LOCAL_RANK", "0") == "0":
         make_objects(config)
+        if config.rl.env_id in OWN_ENVS and options.resume is None:
+            warn_of_short_episodes(config)
     with (
         team(config.rl.device, os.environ, "rl.device") as processes,
         training_envs(config, envs_of_each(config, processes)) as envs,

@@ -38,7 +38,7 @@ from envs.objects import ObjectSet, fits
 from envs.simulators import make_layout_table
 from models.planner_contacts import buried_share
 from utils.config import Config
-from utils.errors import UserError
+from utils.errors import RecurringError
 from utils.geometry import SceneGeometry, SolidObject
 from utils.grasp_quality import RELAXED
 from utils.height_map import height_map_from_scene
@@ -59,7 +59,7 @@ _FLAT, _SPAN = 0.016, 0.085  # m, of the layout flat: greatest thickness, least 
 _SHELVED = (0.12, 0.25)  # m, longest sides of what stands under the board of the layout shelf
 
 
-class SceneError(UserError):
+class SceneError(RecurringError):
     """No valid scene could be made."""
 
 

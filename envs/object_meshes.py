@@ -23,7 +23,7 @@ import trimesh
 from envs import object_parts
 from envs.object_parts import MassProperties, convex_parts, solid_of
 from utils.atomic_files import write_atomic
-from utils.errors import UNREADABLE_NPZ, UserError
+from utils.errors import UNREADABLE_NPZ, RecurringError
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".dae")
 MOST_FACES, MOST_PIECES = 2_000_000, 2_000
@@ -43,7 +43,7 @@ _SETTINGS = (
 )
 
 
-class ObjectError(UserError):
+class ObjectError(RecurringError):
     """An object, mesh or object set that cannot be used; the message says why and what to do."""
 
 

@@ -94,7 +94,7 @@ def run_round(
 ) -> RoundRecord:
     """Load a scene, let a planner work on it, and return the record.
 
-    plan: the planner, which is first reset with the scene's seed if it has `reset`.
+    plan: the planner, which is first reset with the scene's `planner_seed` if it has `reset`.
     policy, objects: the planner's and the object set's name in the record.
     scenario: a key of SCENARIOS, the conditions of the round; None: the scene's layout.
     controller: how the arm reaches the grasps.

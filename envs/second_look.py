@@ -87,6 +87,7 @@ class SecondLook:
         careful = partial(cell.robot.stop_on_contact, cell.config.execution.contact_stop)
         follow(cell, way, careful)
         cell.step(round(_STILL_SECONDS / cell.dt))
+        cell.check_physics()
         frame = self._calibrated(wrist_frame(cell))
         follow(cell, cell.robot.joint_move(way.positions[-1], cell.home, **scales(cell)))
         cell.check_physics()

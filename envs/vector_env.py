@@ -271,7 +271,7 @@ def make_env(config: Config, index: int = 0, render_mode: str | None = None) -> 
         env.close()
         raise UserError(
             f"rl.env_id {settings.env_id}: write rl.env_id={env.spec.id}, so that the config "
-            "counts for this project's environment"
+            "counts for this project's environment (a run that was begun so cannot go on)"
         )
     if render_mode is not None and render_mode not in env.metadata.get("render_modes", ()):
         env.close()

@@ -21,6 +21,7 @@ from torch import nn
 
 from models.ppo import KIND, GraspPPO
 from models.ppo_observations import (
+    ALL,
     ObservationLayout,
     ObservationNormaliser,
     Observations,
@@ -55,11 +56,12 @@ BOUNDS = ("action_low", "action_high")  # of an action space, perhaps infinite
 UNSHAPED = {
     "activation": "activation", "squash": "squash", "normalise": "normalise_observations",
 }  # fmt: skip
-# Keys of section env that say what an action means, and how far it goes.
-MEANING = (
-    "control", "frame", "gripper", "position_step", "rotation_step", "joint_step", "gripper_step",
-    "substeps",
-)  # fmt: skip
+# Keys of section env that say what an action means; then how far it goes, by control and gripper.
+MEANING = ("control", "frame", "gripper", "substeps")
+STEPS = {
+    "joint": ("joint_step",), "ee": ("position_step", "rotation_step"),
+    "ee_planar": ("position_step", "rotation_step"), "change": ("gripper_step",),
+}  # fmt: skip
 LOWEST_LOG_STD, HIGHEST_LOG_STD = -5.0, 2.0  # beyond them exploration has died or drowned the mean
 POOLED = 7  # rows and columns that the last convolution is pooled to
 RELIEF_SCALE, RELIEF_LIMIT = 0.03, 5.0  # m to which a relief is scaled, and how far that goes
@@ -399,7 +401,8 @@ def make_ppo(
         *(settings.estimated_observations or ()),  # first: the network estimates the first ones
         *(settings.privileged_observations or ()),
     )
-    known = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {}
+    several = isinstance(observation_space, spaces.Dict)
+    known = observation_space.spaces if several else {ALL: observation_space}
     for key in settings.estimated_observations or ():
         if key not in known:
             raise unknown_choice("rl.estimated_observations", key, known)
@@ -436,7 +439,8 @@ def load_initial(
                     f"one has {now}; set rl.{key}={before}, or rl.initial=null"
                 )
         trained, env = checkpoint["config"].get("env", {}), config.env.model_dump()
-        others = [key for key in MEANING if trained.get(key, env[key]) != env[key]]
+        steps = STEPS.get(env["control"], ()) + STEPS.get(env["gripper"], ())
+        others = [key for key in (*MEANING, *steps) if trained.get(key, env[key]) != env[key]]
     if seen.entries() != layout.entries():
         raise UserError(
             f"rl.initial {path}: its policy sees {_listed(seen)}, this one {_listed(layout)}; set "

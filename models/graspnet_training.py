@@ -152,9 +152,9 @@ class Trainer:
         total, parts = self.losses(batch)
         if not torch.isfinite(total):
             raise UserError(
-                f"the loss is {total.item()} at step {self.step}; the weights of the run's last.pt "
-                "are sound: start a new run from them (train.initial=RUN/last.pt) with a lower "
-                "train.lr or with train.precision=float32"
+                f"the loss is {total.item()} at step {self.step}; start a new run with a lower "
+                "train.lr or with train.precision=float32, from the weights of this run's last.pt "
+                "(train.initial=RUN/last.pt) where there is one: they are sound"
             )
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(total).backward()

@@ -56,6 +56,12 @@ def evaluation_due(config: Config, updates: int) -> bool:
     return updates % config.rl.evaluate_every == 0 or updates == updates_of(config)
 
 
+# Sections and keys that make the cell in which a policy acts.
+CELL_SECTIONS = (
+    "simulator=", "sim.", "robot.", "gripper.", "workspace.", "objects.", "execution.", "safety."
+)  # fmt: skip
+
+
 def warn_of_short_episodes(config: Config) -> None:
     """Remark where each episode of a training ends before its time: episodes begin anew after every
     checkpoint, as those of a run that is resumed from it do."""
@@ -248,9 +254,13 @@ def scoring_command(
     best = run / "best.pt"
     if any(part.key not in known for part in layout.state):
         return f"{this_python()} -m benchmarks.bench_policy {best}"
-    # The checkpoint brings these sections; scenes and objects are those of the evaluation.
-    own = ("env", "rl", "camera", "evaluate", "train", "data", "compute", "seed", "objects.split")
-    changed = [key for key in changed_keys(config) if not key.startswith(own)]
+    # The checkpoint brings section env, and of the camera all but its noise.
+    changed = [
+        key for key in changed_keys(config)
+        if key.startswith(CELL_SECTIONS) and not key.startswith("objects.split=")
+    ]  # fmt: skip
+    if any(key.startswith("camera.depth_noise=") for key in changed_keys(config)):
+        changed.append(f"evaluate.depth_noises={config.camera.depth_noise}")
     return (
         f"{this_python()} evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
         f"evaluate.object_sets={config.env.objects} {shlex.join(changed)}"

@@ -48,16 +48,21 @@ def run_script(arguments, folder, **options):
 def refusal(arguments, folder, monkeypatch, captured) -> str:
     """The one line on stderr with which evaluate.py, run here and not in a process of its own,
     refuses its input. captured: capsys, or capfd for what other processes write, too."""
+    return refused(arguments, folder, monkeypatch, captured)[0]
+
+
+def refused(arguments, folder, monkeypatch, captured) -> tuple[str, str]:
+    """That line, and what it has printed."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, arguments)])
     monkeypatch.setattr(sys, "path", list(sys.path))  # a script adds the current folder
     with pytest.raises(SystemExit) as end:
         end_like_a_script(evaluate.main)
     assert end.value.code == 2
-    errors = captured.readouterr().err
+    printed, errors = captured.readouterr()
     assert "Traceback" not in errors
     (line,) = [x for x in errors.splitlines() if x.startswith("error:")]
-    return line
+    return line, printed
 
 
 def only_run(folder: Path) -> Path:
@@ -563,8 +568,9 @@ def test_an_impossible_scene_ends_the_run_but_not_the_results(
     arguments = [*SMALL, "evaluate.scenarios=isolated,pile", "evaluate.policies=heuristic",
                  "scene.count=8", "workspace.size=0.06", "evaluate.workers=1",
                  "evaluate.rounds=1"]  # fmt: skip
-    assert "scene.count" in refusal(arguments, tmp_path, monkeypatch, capsys)
+    line, printed = refused(arguments, tmp_path, monkeypatch, capsys)
     # Resumed, the same scene could not be made again.
+    assert "scene.count" in line and "interrupted: " in printed and "--resume" not in printed
     results = json.loads((only_run(tmp_path) / "results.json").read_text())
     assert results["complete"] is False and results["rows"][0]["rounds"] >= 1
     assert (only_run(tmp_path) / "report.html").exists()

@@ -339,10 +339,23 @@ def test_actions_that_meant_something_else_are_remarked_on(tmp_path):
         make_ppo(SEEN, act, load_config(None, [*small, initial, "env.gripper=change"]))
     (warning,) = caught
     assert "trained with env.frame=hand, and not with world, so that" in str(warning.message)
+    same = [*small, initial, "env.frame=hand", "env.gripper=change"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make_ppo(SEEN, act, load_config(None, [*small, initial, "env.frame=hand",
-                                               "env.gripper=change"]))  # fmt: skip
+        make_ppo(SEEN, act, load_config(None, same))
+        # Nothing is moved by joints here.
+        make_ppo(SEEN, act, load_config(None, [*same, "env.joint_step=0.05"]))
+    for step in ("position_step=0.01", "gripper_step=0.02", "substeps=10"):
+        with pytest.warns(UserWarning, match=f"{step.partition('=')[0]}=.* mean something else"):
+            make_ppo(SEEN, act, load_config(None, [*same, f"env.{step}"]))
+
+
+def test_an_unknown_entry_to_estimate_is_named_with_its_key():
+    act = spaces.Box(-1, 1, (2,))
+    config = load_config(None, ["rl.estimated_observations=[x]"])
+    for space in (spaces.Box(-1, 1, (3,)), spaces.Dict({"observation": spaces.Box(-1, 1, (3,))})):
+        with pytest.raises(UserError, match="rl.estimated_observations: .*'x'.* of observation"):
+            make_ppo(space, act, config)
 
 
 @pytest.mark.parametrize("keys", [["depth", "rgb"], ["rgb"], ["state"], ["grey"]])

@@ -14,7 +14,7 @@ from models.grasp_policy import (
 )
 from models.ppo_observations import ObservationLayout, Observations
 from models.ppo_rollouts import (
-    NotFinite,
+    Diverged,
     RolloutCollector,
 )
 from tests.helpers.compare import same
@@ -307,7 +307,7 @@ def test_a_loss_that_is_no_number_poisons_no_weight():
     moments = {k: v.clone() for k, v in ppo.optimizer.state_dict()["state"][0].items()}
     broken = rollout_of(ppo)
     broken.rewards[3, 1] = np.inf  # as no collector would let through
-    with pytest.raises(NotFinite, match="not finite at update 1"):
+    with pytest.raises(Diverged, match="not finite at update 1"):
         ppo.update(broken)
     assert same(before, dict(ppo.network.state_dict()))
     assert same(moments, ppo.optimizer.state_dict()["state"][0])

@@ -1,5 +1,6 @@
 """Command lines, exit statuses, run folders, resumed runs, files written whole or not at all."""
 
+import hashlib
 import io
 import json
 import os
@@ -37,6 +38,7 @@ from utils.runs import (
     git_state,
     named_files,
     new_run_folder,
+    note_code,
     open_run,
     parse_args,
     plain_remarks,
@@ -315,10 +317,16 @@ def test_a_run_notes_with_which_code_it_was_continued(tmp_path, monkeypatch):
     for commit, changes in (("a", None), ("b", "c" * 64), ("b", "c" * 64), ("a", None)):
         code.update(commit=commit * 40, changes=changes)
         with open_run(run, "evaluate", None, config):
-            pass
+            note_code(run)
+    code.update(commit=None)  # where git does not answer
+    note_code(run)
     expected = ["aaaaaaaaaa", "bbbbbbbbbb with changes cccccccc", "aaaaaaaaaa"]
     assert code_of(run) == [f"commit {one}" for one in expected]
     assert begun_with(run)["commit"] == "a" * 40 and begun_with(run)["script"] == "evaluate"
+    # As earlier versions noted that pages alone had been changed.
+    facts = begun_with(run) | {"changes": hashlib.sha256(b"").hexdigest()}
+    write_json_atomic(run / "environment.json", facts)
+    assert code_of(run)[0] == "commit aaaaaaaaaa"
     (run / "environment.json").unlink()
     assert code_of(run) == []
 

@@ -327,10 +327,12 @@ def test_a_policy_that_sees_what_no_robot_knows_is_not_scored_beside_planners():
         "evaluate.scenarios=isolated evaluate.object_sets=primitives"
     )
     # With what makes another cell, and nothing of the training.
-    cell = ["simulator=mujoco", "objects.scale=1.5", "objects.split=train", "seed=3", "rl.lr=1e-4"]
+    cell = ["simulator=mujoco", "objects.scale=1.5", "objects.split=train", "seed=3", "rl.lr=1e-4",
+            "randomization.parts=[vision]", "camera.depth_noise=gamma"]  # fmt: skip
     other = load_config(None, ["env.objects=primitives", "env.control=ee", *cell])
-    assert scoring_command(other, Path("run"), seen, KNOWN_TO_A_ROBOT).endswith(
-        " evaluate.object_sets=primitives 'simulator=\"mujoco\"' objects.scale=1.5"
+    command = scoring_command(other, Path("run"), seen, KNOWN_TO_A_ROBOT)
+    assert command.partition(" evaluate.object_sets=primitives ")[2] == (
+        "'simulator=\"mujoco\"' objects.scale=1.5 evaluate.depth_noises=gamma"
     )
     more = ObservationLayout.of(spaces.Dict({"gripper": box, "object_offset": box}))
     command = scoring_command(config, Path("run"), more, KNOWN_TO_A_ROBOT)

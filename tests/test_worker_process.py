@@ -84,17 +84,20 @@ def test_packages_that_make_the_bits_are_compared():
 
 
 def test_a_worker_with_other_weights_is_refused(tmp_path, monkeypatch):
-    """Those of the files in `checkpoints`, whatever their names are."""
+    """Those that the project's planners load; other files there do not matter."""
     (tmp_path / "checkpoints").mkdir()
     weights = tmp_path / "checkpoints" / "critic.pt"
     weights.write_bytes(b"one")
     monkeypatch.setattr(worker_process, "REPOSITORY", tmp_path)
     facts = facts_of([])
     worker_process._content.cache_clear()  # as in a process that starts now
+    (tmp_path / "checkpoints" / "mine.pt").write_bytes(b"mine")
     check(facts)
     worker_process._content.cache_clear()
     weights.write_bytes(b"another")
-    with pytest.raises(UserError, match="the content of checkpoints is .* there and .* here"):
+    with pytest.raises(
+        UserError, match="the content of checkpoints/critic.pt is .* there and .* here"
+    ):
         check(facts)
 
 

@@ -26,10 +26,10 @@ from torch import nn
 from utils.config import Config, with_settings
 from utils.errors import UserError
 from utils.run_checks import check_data, keep_data
-from utils.runs import open_run, run_of_job
+from utils.runs import note_code, open_run, run_of_job
 
 # For which processes wait for each other: one may play its last shard of data once more after
-# compute.timeout. torchrun itself ends those whose partner is gone.
+# compute.timeout, of half an hour by default. torchrun itself ends those whose partner is gone.
 _PATIENCE = timedelta(hours=2)
 MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
 
@@ -202,6 +202,7 @@ def run_folder(
             # torchrun has ended those before; a machine that was lost may hold its lock for long.
             again = run_of_job(script, config) if resume is None else None
             folder = again or opened.enter_context(open_run(resume, script, name, config))
+            note_code(folder)
             if data is not None:
                 check_data(folder, data)
                 keep_data(folder, data)

@@ -26,6 +26,10 @@ class UserError(ValueError):
     """
 
 
+class RecurringError(UserError):
+    """One that a run of the same config meets again, so that it cannot simply go on."""
+
+
 def did_you_mean(value: object, known: Iterable[str]) -> str:
     """'; did you mean X?' with the nearest known name, or '' when nothing is near."""
     near = difflib.get_close_matches(str(value), list(known), n=1, cutoff=0.6)

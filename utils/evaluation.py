@@ -35,7 +35,7 @@ from utils.result_records import (
     read_rounds,
     writing,
 )
-from utils.runs import resume_command, usable_cpus
+from utils.runs import note_code, resume_command, usable_cpus
 
 GALLERY_SECONDS = 60  # between two times that the pictures are written: it takes some tenths of one
 
@@ -280,6 +280,8 @@ def _play(
     films, gallery, shown = run / "films", run / "gallery.npz", config.evaluate.gallery
     outcome.gallery, written = read_gallery(gallery), time.monotonic()
     todo = tasks(config, outcome.rounds)
+    if todo:
+        note_code(run)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")
     try:
         with (

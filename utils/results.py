@@ -51,8 +51,9 @@ class Row:
 
     attempts: executed grasps. The 95 % intervals take whole rounds as independent, not their
         attempts or objects (`utils.statistics.clustered_interval`).
-    plan_ms_median: over all calls of the planner, also those that found nothing; None for fewer
-        than LEAST_PLANS, most of which the first ones of workers, which load and compile, would be.
+    plan_ms_median: over all calls of the planner, with the search for what the arm reaches, also
+        those that found nothing; None for fewer than LEAST_PLANS, most of which the first ones of
+        workers, which load and compile, would be.
     sim_seconds_per_pick: simulated time of all attempts, failed ones too, for each success.
     turned, slid: successes in which the object moved in the hand by more than 15 degrees or 1 cm.
         firm: successes in which it did neither.

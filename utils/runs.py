@@ -275,7 +275,6 @@ def open_run(
     refusal = "another process works in this run; wait until it has ended, or start a new run"
     with locked(run / ".lock", f"{run}: {refusal}"):
         if resumed is not None:
-            _note_code(run)
             write_atomic(run / "config.yaml", dump_config(config))
         yield run
 
@@ -379,21 +378,25 @@ def code_states(run: Path) -> list[dict[str, Any]]:
     """The facts with which a run began, and commit and changes of the code whenever it was
     continued with other ones."""
     begun = begun_with(run)
-    return [begun, *begun.get(CONTINUED, [])]
+    states = [begun, *begun.get(CONTINUED, [])]
+    # Earlier versions noted so that nothing but pages and tables had been changed.
+    nothing = hashlib.sha256(b"").hexdigest()
+    return [{**one, "changes": None} if one.get("changes") == nothing else one for one in states]
 
 
-def _note_code(run: Path) -> None:
-    """Add the present code to a run's environment.json, where it is another than the last."""
+def note_code(run: Path) -> None:
+    """Add the present code to the environment.json of a run that goes on, where it is known and
+    another than the last."""
     begun, *later = code_states(run)
     now = {name: value for name, value in environment().items() if name in ("commit", "changes")}
     last = later[-1] if later else begun
-    if begun and any(last.get(name) != value for name, value in now.items()):
+    if begun and now["commit"] and any(last.get(name) != value for name, value in now.items()):
         write_json_atomic(run / "environment.json", begun | {CONTINUED: [*later, now]})
 
 
 def _changed_since(run: Path, config: Config) -> list[str]:
     """What is not as it was when a run began, in words; what was not noted counts as the same."""
-    begun, now = begun_with(run), environment()
+    (begun, *_), now = code_states(run), environment()
     changed = []
     if None not in (begun.get("commit"), now["commit"]) and begun["commit"] != now["commit"]:
         changed.append(f"at commit {begun['commit'][:10]} and goes on at {now['commit'][:10]}")

@@ -31,6 +31,8 @@ import cv2
 from utils.errors import UserError
 from utils.runs import PACKAGES, REPOSITORY, package_version
 
+# What the project's planners load.
+WEIGHTS = tuple(f"checkpoints/{name}" for name in ("graspnet.pt", "critic.pt", "calibration.json"))
 SOURCES = ("envs", "models", "utils")  # this project's packages
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
@@ -176,7 +178,7 @@ def facts_of(modules: Sequence[str]) -> dict[str, str]:
     packages or plug-ins."""
     facts = {"Python": ".".join(platform.python_version_tuple()[:2])}
     facts |= {name: package_version(name) or "missing" for name in PACKAGES}
-    facts["the content of checkpoints"] = _content(REPOSITORY / "checkpoints")
+    facts |= {f"the content of {name}": _content(REPOSITORY / name) for name in WEIGHTS}
     return facts | {f"the source of {name}": _digest(name) for name in modules}
 
 
@@ -191,8 +193,8 @@ def check(expected: Mapping[str, str]) -> None:
         name = different[0]
         raise UserError(
             f"a worker of the cluster on {platform.node()} would not compute the same: {name} is "
-            f"{ours[name]} there and {expected[name]} here; bring both to the same commit and "
-            "packages, and restart the workers"
+            f"{ours[name]} there and {expected[name]} here; bring both to the same commit, "
+            "packages and weights, and restart the workers"
         )
 
 
@@ -211,8 +213,8 @@ def _digest(module: str) -> str:
 
 
 @functools.cache  # the planners of a process keep the weights that they have loaded
-def _content(folder: Path) -> str:
-    return _digest_of(sorted(file for file in folder.iterdir() if file.is_file()))
+def _content(file: Path) -> str:
+    return _digest_of([file]) if file.is_file() else "missing"
 
 
 def _digest_of(files: Sequence[Path]) -> str:
