@@ -255,11 +255,12 @@ def scoring_command(
     if any(part.key not in known for part in layout.state):
         return f"{this_python()} -m benchmarks.bench_policy {best}"
     # The checkpoint brings section env, and of the camera all but its noise.
+    all_changed = changed_keys(config)
     changed = [
-        key for key in changed_keys(config)
+        key for key in all_changed
         if key.startswith(CELL_SECTIONS) and not key.startswith("objects.split=")
     ]  # fmt: skip
-    if any(key.startswith("camera.depth_noise=") for key in changed_keys(config)):
+    if any(key.startswith("camera.depth_noise=") for key in all_changed):
         changed.append(f"evaluate.depth_noises={config.camera.depth_noise}")
     return (
         f"{this_python()} evaluate.py evaluate.policies=ppo:{best} evaluate.scenarios=isolated "
