@@ -54,12 +54,12 @@ from models.ppo_pretraining import pretrain_estimator
 from models.ppo_progress import (
     Curves,
     ProgressRow,
-    after_not_finite,
     after_worker_error,
     announcement,
     evaluate,
     evaluation_due,
     load_progress,
+    not_finite,
     reached,
     row_in_words,
     save_evaluation,
@@ -208,7 +208,7 @@ def train(
                 rate = per_update / (time.perf_counter() - begun)
                 curves.add("time", step, {"steps_per_second": rate})
     except NotFinite as error:
-        raise UserError(f"{error}; {after_not_finite(error, run)}") from error
+        raise not_finite(error, run, processes) from error
     except WorkerError:
         print(f"after this error, {after_worker_error(run)}", file=sys.stderr)
         raise

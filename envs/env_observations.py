@@ -24,10 +24,11 @@ from utils.transforms import known_depth
 
 # Entries of info that can be observed, and their sizes.
 INFO_OBSERVATIONS = {
-    "end_effector_position": 3, "gripper": 2, "opening_error": 1, "reachable": 1, "grasped": 1,
+    "state": 15, "end_effector_position": 3, "gripper": 2, "opening_error": 1, "reachable": 1,
+    "grasped": 1,
     "object_position": 3, "object_offset": 6, "object_outline": 9, "grasp_goal": 11,
 }  # fmt: skip
-OBSERVATIONS = ("rgb", "depth", "state", *INFO_OBSERVATIONS)
+OBSERVATIONS = ("rgb", "depth", *INFO_OBSERVATIONS)
 
 _NEAR = 0.03  # m, the scale of the tanh in `object_offset`
 _JOINT_SLACK = 0.1  # rad: the motors may overshoot a limit a little
@@ -76,10 +77,10 @@ class Observer:
         boxes = {
             "rgb": spaces.Box(0, 255, (side, side, 3), np.uint8),
             "depth": spaces.Box(0.0, config.camera.far, (side, side, 1), np.float32),
-            "state": spaces.Box(self._low, self._high, dtype=np.float32),
         }
         for name, size in INFO_OBSERVATIONS.items():
             boxes[name] = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        boxes["state"] = spaces.Box(self._low, self._high, dtype=np.float32)
         self.space = spaces.Dict({name: boxes[name] for name in names})
 
     def begin_scene(self) -> None:
@@ -133,6 +134,7 @@ class Observer:
         offset[:3] = self.view.offset
         np.tanh(self.view.offset / _NEAR, out=offset[3:])
         info = {
+            "state": np.minimum(np.maximum(self.state, self._low), self._high),
             "object_position": self.object_position,
             "object_offset": offset,
             "object_outline": self.view.vector(),
@@ -152,9 +154,7 @@ class Observer:
         if "rgb" in self._names or "depth" in self._names:
             found["rgb"], found["depth"] = self._images()
         for name in self._names:
-            if name == "state":
-                found[name] = np.minimum(np.maximum(self.state, self._low), self._high)
-            elif name in INFO_OBSERVATIONS:
+            if name in INFO_OBSERVATIONS:
                 found[name] = np.atleast_1d(np.asarray(info[name], np.float32))
         return {name: found[name] for name in self._names}
 

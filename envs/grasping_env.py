@@ -112,6 +112,7 @@ class RobotGraspingEnv(gymnasium.Env):
     |-------------------------|------|-------------|--------------------------------------------------|
     | `is_success`, `reason`  |      |             | success; why the episode ended, or None          |
     | `scene_seed`            |      |             | what the scene was made from                     |
+    | `state`                 | 15   | rad, rad/s, m | as in the observation                          |
     | `end_effector_position` | 3    | m, W        | E                                                |
     | `gripper`               | 2    | m           | opening, commanded opening                       |
     | `opening_error`         | 1    | m           | opening - commanded: the fingers move or hold something |

@@ -92,7 +92,7 @@ class GraspExamples(Dataset):
 
     def __getitem__(self, place: tuple[int, int]) -> Example:
         epoch, index = place
-        rng = np.random.default_rng([self.seed, epoch, index])
+        rng = np.random.default_rng([self.seed, epoch, index + 1])  # 0: the epoch's order
         if self.augmentation is None:
             image = self.images[index]
         elif isinstance(self.images, AtPixelSize):

@@ -134,7 +134,8 @@ class GraspPPO:
         """Learn from a rollout: several passes over it in shuffled minibatches.
 
         progress: share of the training that is done, for the annealed learning rate.
-        Returns means over the minibatches, and the gradients' norm before it was clipped.
+        Returns means over the minibatches, the gradients' norm before it was clipped, and how many
+        steps the optimizer took.
         Raises Diverged, with the weights as they were before that minibatch, if a gradient is no
         number.
         """
@@ -145,6 +146,7 @@ class GraspPPO:
             group["lr"] = lr
         parts: list[torch.Tensor] = []
         norms: list[float] = []
+        steps = 0
         for minibatch in self._minibatches(batch, len(batch.latents), self.settings.epochs):
             losses = self.losses(minibatch)
             norm = self.gradient(losses.loss)
@@ -158,6 +160,7 @@ class GraspPPO:
             if self._too_far(losses.approx_kl):
                 break
             self.optimizer.step()
+            steps += 1
             self.network.limit_exploration()
         estimates = {}
         if self.estimator_weights is not None:
@@ -173,7 +176,7 @@ class GraspPPO:
             "explained_variance": explained,
             "std": self.network.log_std.detach().exp().mean().item(),
             "learning_rate": lr,
-            "minibatches": float(len(parts)),
+            "optimizer_steps": float(steps),
             **estimates,
         }
 

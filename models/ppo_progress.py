@@ -33,6 +33,8 @@ from models.ppo_rollouts import (
 from utils.checkpoint import reading
 from utils.config import changed_keys
 from utils.config_schema import Config, RLConfig
+from utils.distributed import Team
+from utils.errors import UserError
 from utils.runs import Stopwatch, resume_command, save_results, this_python
 
 ProgressRow = dict[str, Any]
@@ -183,18 +185,18 @@ class Curves:
             self._writer.close()
 
 
-def after_not_finite(error: NotFinite, run: Path) -> str:
-    """What to do after a number that is not finite."""
+def not_finite(error: NotFinite, run: Path, team: Team) -> UserError:
+    """The error for a number that is not finite, with where it was and what to do."""
     last = run / "last.pt"
+    saved = f"the weights of {last} are sound" if last.is_file() else "nothing was saved before"
     if not isinstance(error, Diverged):
-        saved = f"the weights of {last} are sound" if last.is_file() else "nothing was saved before"
-        return f"{saved}; look at the environment's rewards and observations"
-    if last.is_file():
-        return (
-            f"the weights of {last} are sound: continue from them with rl.initial, perhaps with a "
-            "lower rl.lr"
-        )
-    return "nothing was saved before; look at the environment's rewards, or lower rl.lr"
+        advice = f"{saved}; look at the environment's rewards and observations"
+    elif last.is_file():
+        advice = f"{saved}: continue from them with rl.initial, perhaps with a lower rl.lr"
+    else:
+        advice = f"{saved}; look at the environment's rewards, or lower rl.lr"
+    where = f"process {team.rank} of {team.ranks}: " if team.ranks > 1 else ""
+    return UserError(f"{where}{error}; {advice}")
 
 
 def after_worker_error(run: Path) -> str:

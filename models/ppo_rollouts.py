@@ -28,6 +28,7 @@ SIMULATION, NETWORK = "simulation", "network"  # parts of the time that the stop
 # Purposes of seeds (`derived_seeds`), no two of which share a seed: FRESH scores a trained policy.
 TRAINING, EVALUATION, LEARNING, FRESH, PRETRAINING = range(5)
 SLICE_SECONDS = 2.0  # of an evaluation, between two of which it can be broken off
+LONGEST_EPISODE = 100_000  # steps of an episode in an evaluation, which would never end otherwise
 SUCCESS = "is_success"  # entry of an environment's info, by Gymnasium's convention for robots
 
 Task = Callable[[gymnasium.Env, int], Generator[None, None, Any]]
@@ -238,7 +239,8 @@ def play_episodes(
 ) -> Generator[None, None, tuple[list[Episode], Share]]:  # fmt: skip
     """A task: play episodes without noise, one from each seed of this environment's share, until a
     time of the monotonic clock, which all processes share, but one step at least. Returns those
-    that have ended, and what is left of the share."""
+    that have ended, and what is left of the share. Raises NotFinite, and UserError where an
+    episode does not end."""
     (seeds, now), episodes = shares[index], []
     while len(seeds):
         place = f"in an evaluation, of the episode with seed {seeds[0]}, is not finite"
@@ -256,6 +258,11 @@ def play_episodes(
         if terminated or truncated:
             episodes.append(Episode(total, length, _success(info)))
             seeds, now = seeds[1:], None
+        elif length >= LONGEST_EPISODE:
+            raise UserError(
+                f"an episode of an evaluation has not ended in {LONGEST_EPISODE} steps; give the "
+                "environment a limit (max_episode_steps where it is registered)"
+            )
         else:
             _read(observation, layout, now.seen, place)
             now = Underway(now.seen, total, length)

@@ -80,7 +80,7 @@ class RectangleExamples(Dataset):
 
     def __getitem__(self, place: tuple[int, int]) -> Example:
         epoch, index = place
-        rng = np.random.default_rng([self.seed, epoch, index])
+        rng = np.random.default_rng([self.seed, epoch, index + 1])  # 0: the epoch's order
         change = self.augmentation.draw(rng, (self.view.size, self.view.size))
         rgb, depth, rectangles = self.view.warp(
             self.samples[index % len(self.samples)], change.matrix((self.view.size, self.view.size))

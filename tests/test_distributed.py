@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
@@ -160,10 +161,15 @@ def test_one_process_alone_exchanges_with_itself():
     assert tensor.tolist() == [0.0, 1.0, 2.0]
 
 
-def test_ctrl_c_sets_an_event_and_is_given_back():
+def test_ctrl_c_sets_an_event_and_is_given_back(monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     with stop_on_interrupt() as interrupted:
         assert not interrupted.is_set()
         signal.raise_signal(signal.SIGINT)
         assert interrupted.is_set()
+        signal.raise_signal(signal.SIGINT)  # the same one, passed on by another process
+        now = time.monotonic()
+        monkeypatch.setattr("utils.distributed.time.monotonic", lambda: now + 2)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before

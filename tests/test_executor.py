@@ -168,6 +168,17 @@ def test_processes_leave_signals_to_the_main_process():
         assert list(completed(workers, sent, numbers)) == numbers
 
 
+def test_nobody_waits_for_calls_after_a_second_ctrl_c():
+    """`utils.distributed.stop_on_interrupt` raises then, while calls are under way."""
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), open_executor(load_config().compute, 2) as workers:
+        assert workers.submit(abs, -1).result() == 1
+        calls = [workers.submit(time.sleep, 120) for _ in range(2)]
+        wait_for(lambda: all(call.running() for call in calls))
+        raise KeyboardInterrupt
+    assert time.monotonic() - begun < 60 and all(call.exception() is not None for call in calls)
+
+
 def test_a_call_that_hangs_is_repeated(compute, tmp_path):
     hurried = compute.model_copy(update={"timeout": 5.0})
     with open_executor(hurried, 2) as workers:

@@ -197,11 +197,11 @@ def test_an_update_stops_at_the_target_kl():
     ppo = ppo_of("rl.target_kl=0.01", "rl.epochs=10")
     gone, losses = iter([0.0, 0.0149, 0.0149, 0.0151, 0.0]), ppo.losses
     ppo.losses = lambda batch: losses(batch)._replace(approx_kl=torch.tensor(next(gone)))
-    assert ppo.update(rollout_of(ppo))["minibatches"] == 4
+    assert ppo.update(rollout_of(ppo))["optimizer_steps"] == 3
     (state,) = ppo.optimizer.state_dict()["state"].values()
     assert state["step"] == 3
     free = ppo_of("rl.target_kl=null", "rl.epochs=10", "rl.lr=0.05")
-    assert free.update(rollout_of(free))["minibatches"] == 40
+    assert free.update(rollout_of(free))["optimizer_steps"] == 40
 
 
 def test_explained_variance_is_that_of_stable_baselines3():

@@ -23,6 +23,7 @@ from tests.helpers.ppo_parts import (
     counting,
     ppo_of,
 )
+from utils.errors import UserError
 from utils.runs import Stopwatch
 
 
@@ -85,6 +86,13 @@ def test_numbers_of_an_evaluation_that_are_not_finite_are_refused(bad):
     envs = Several(Broken(3, True))
     with pytest.raises(NotFinite, match=f"{bad}.* in an evaluation, of the episode with seed 7"):
         evaluate_policy(ppo_of().network, envs, COUNTED, [7], Stopwatch())
+
+
+def test_an_evaluation_does_not_wait_for_an_episode_without_an_end(monkeypatch):
+    monkeypatch.setattr("models.ppo_rollouts.LONGEST_EPISODE", 20)
+    evaluate_policy(ppo_of().network, Several(Count(20, False)), COUNTED, [7], Stopwatch())
+    with pytest.raises(UserError, match="not ended in 20 steps.*max_episode_steps"):
+        evaluate_policy(ppo_of().network, Several(Count(21, False)), COUNTED, [7], Stopwatch())
 
 
 def test_evaluation_gives_each_seed_its_episode():

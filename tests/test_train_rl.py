@@ -27,7 +27,7 @@ from models.grasp_policy import GraspPPO, load_policy, make_ppo
 from models.ppo import KIND
 from models.ppo_observations import ObservationLayout
 from models.ppo_progress import (
-    after_not_finite,
+    not_finite,
     reached,
     scoring_command,
     warn_of_short_episodes,
@@ -301,11 +301,14 @@ def test_episodes_that_checkpoints_cut_short_are_told_of():
 
 def test_an_environment_s_bad_number_is_not_taken_for_a_diverged_network(tmp_path):
     bad, diverged = NotFinite("the reward"), Diverged("a gradient")
-    assert after_not_finite(bad, tmp_path).endswith("environment's rewards and observations")
-    assert after_not_finite(diverged, tmp_path).endswith("rewards, or lower rl.lr")
+    looking = "; look at the environment's rewards and observations"
+    assert str(not_finite(bad, tmp_path, ALONE)).endswith(looking)
+    assert str(not_finite(diverged, tmp_path, ALONE)).endswith("rewards, or lower rl.lr")
     (tmp_path / "last.pt").touch()
-    assert after_not_finite(bad, tmp_path).endswith("environment's rewards and observations")
-    assert "continue from them with rl.initial" in after_not_finite(Diverged("a"), tmp_path)
+    assert str(not_finite(bad, tmp_path, ALONE)).endswith(f"last.pt are sound{looking}")
+    assert "continue from them with rl.initial" in str(not_finite(diverged, tmp_path, ALONE))
+    second = ALONE._replace(rank=1, ranks=2)
+    assert str(not_finite(bad, tmp_path, second)).startswith("process 1 of 2: the reward; ")
 
 
 def test_the_end_says_where_policy_and_curves_are(tmp_path, monkeypatch, capsys):

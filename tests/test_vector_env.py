@@ -56,6 +56,18 @@ def test_env_kwargs_and_info_reach_the_environment():
     np.testing.assert_allclose(first["goal"], rng.uniform(-1, 1, 2), rtol=1e-6)
 
 
+def test_the_critic_alone_can_see_the_state():
+    config = load_config(None, ["rl.parallel=false", "env.observations=[rgb]",
+                                "rl.policy_observations=[gripper]",
+                                "rl.privileged_observations=[state]"])  # fmt: skip
+    with training_envs(config, 1) as envs:
+        layout = make_ppo(envs.observation_space, envs.action_space, config).layout
+        (first,) = envs.each(first_observation)
+    assert [part.key for part in layout.state] == ["gripper"]
+    assert [(part.key, part.shape) for part in layout.privileged] == [("state", (15,))]
+    assert first["state"][14] == first["gripper"][0]
+
+
 @pytest.mark.parametrize("other", ["RobotGrasping", "envs:RobotGrasping-v0"])
 def test_the_own_environment_by_another_name_is_refused(other):
     """Gymnasium knows it by these, too, but it would be made without the config."""

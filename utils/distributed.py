@@ -8,6 +8,7 @@ knows no network and no data.
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -32,6 +33,8 @@ from utils.runs import note_code, open_run, run_of_job
 # compute.timeout, of half an hour by default. torchrun itself ends those whose partner is gone.
 _PATIENCE = timedelta(hours=2)
 MEETING_SECONDS = 0.05  # between two looks of the main process at who has come
+# A terminal and torchrun may both pass on one Ctrl-C.
+SAME_INTERRUPT = 1.0  # s
 
 
 class Team(NamedTuple):
@@ -221,12 +224,18 @@ def without_initial(config: Config, section: str, run: Path | None) -> Config:
 @contextmanager
 def stop_on_interrupt(message: str | None = None) -> Iterator[Event]:
     """Yield an event that Ctrl-C sets, so that the work stops between two whole steps; `message`
-    is then printed at once."""
-    interrupted = Event()
+    is then printed at once. Where such a step does not end, another Ctrl-C raises
+    KeyboardInterrupt."""
+    interrupted, first = Event(), math.inf
 
     def stop(*_: object) -> None:
-        if message is not None and not interrupted.is_set():
-            print(f"\n{message}", file=sys.stderr, flush=True)
+        nonlocal first
+        if not interrupted.is_set():
+            first = time.monotonic()
+            if message is not None:
+                print(f"\n{message}\nCtrl-C again stops at once", file=sys.stderr, flush=True)
+        elif time.monotonic() - first > SAME_INTERRUPT:
+            raise KeyboardInterrupt
         interrupted.set()
 
     before = signal.signal(signal.SIGINT, stop)

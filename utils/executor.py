@@ -91,14 +91,19 @@ def open_executor(compute: ComputeConfig, workers: int | None = None) -> Iterato
 
     workers: calls under way at a time; None for all workers of the cluster, or one for each CPU
     that this process may use.
-    At the end of the context local processes finish the calls under way; a cluster forgets them.
+    At the end of the context local processes finish the calls under way, but for one that
+    KeyboardInterrupt has brought about; a cluster forgets them.
     Raises UserError for a scheduler that cannot be reached or is lost, and for a worker that would
     not compute what this process computes; LostWorkerError for a call that ends every worker.
     """
     job = Job(uuid.uuid4().hex, compute.timeout)
     if compute.scheduler is None:
         with worker_environment(), _Processes(workers or usable_cpus(), job) as processes:
-            yield processes
+            try:
+                yield processes
+            except KeyboardInterrupt:
+                processes.abandon()
+                raise
     else:
         with _cluster(compute.scheduler, workers, job) as cluster:
             yield cluster
@@ -165,6 +170,8 @@ class _Processes(Workers):
         self._count, self._job = count, job
         self._threads = ThreadPoolExecutor(count)
         self._idle: deque[_Process] = deque()
+        self._begun: list[_Process] = []
+        self._abandoned = False
 
     def size(self) -> int:
         return self._count
@@ -179,15 +186,27 @@ class _Processes(Workers):
                 process = self._idle.pop()
             except IndexError:
                 process = _Process()
+                self._begun.append(process)
+            if self._abandoned:  # since its process began
+                process.kill()
             try:
                 return process.run(self._job, call)
             except BrokenProcessPool as error:
                 process.shutdown()
+                self._begun.remove(process)
                 process, cause = None, error
+                if self._abandoned:
+                    break
             finally:
                 if process is not None:
                     self._idle.append(process)
         raise _lost(self._job) from cause
+
+    def abandon(self) -> None:
+        """End all processes, whose calls nobody waits for any more."""
+        self._abandoned = True
+        for process in list(self._begun):
+            process.kill()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
@@ -209,14 +228,14 @@ class _Process:
         future = self._pool.submit(work, job, call)
         started = wait([self._began], START_SECONDS).done  # which does not count
         if not started or not wait([future], job.seconds + FREEZE_SECONDS).done:
-            self._kill()
+            self.kill()
         try:
             return future.result()
         except BrokenProcessPool:
-            self._kill()  # if it lives, the pool sends it SIGTERM and waits
+            self.kill()  # if it lives, the pool sends it SIGTERM and waits
             raise
 
-    def _kill(self) -> None:
+    def kill(self) -> None:
         # Before Python 3.14 a pool has no public way to end a process that does not answer.
         for process in list((self._pool._processes or {}).values()):
             process.kill()
