@@ -95,11 +95,11 @@ AIMS: dict[tuple[str, ...], str] = {
 }  # fmt: skip
 
 _HEADLINE = (
-    "**Result** on unseen objects{}: {} of GraspNet's grasps succeed in piles of 5 objects, {} in "
-    "piles of 15; {} and {} of the objects reach the tray."
+    "**Result** on unseen objects{}: {} of the grasps of `graspnet` succeed in piles of 5 "
+    "objects, {} in piles of 15; {} and {} of the objects reach the tray."
 )
 _AHEAD = (
-    "On 15 objects{} GraspNet's success minus the heuristic's is {} points (95 % bootstrap, paired "
+    "On 15 objects{} the success of `graspnet` minus that of `heuristic` is {} points (95 % bootstrap, paired "
     "by scene)."
 )
 CHINESE = {
@@ -118,11 +118,11 @@ CHINESE = {
     " with `{}` depth": "、深度噪声为 `{}` ",
     " with `{}` depth noise": "、深度噪声为 `{}` ",
     _HEADLINE: (
-        "**结果**：没见过的物体{}时，GraspNet 的抓取在 5 个物体的堆中有 {} 成功，"
+        "**结果**：没见过的物体{}时，`graspnet` 的抓取在 5 个物体的堆中有 {} 成功，"
         "在 15 个物体的堆中有 {}；分别有 {} 和 {} 的物体被放进托盘。"
     ),
     _AHEAD: (
-        "15 个物体{}时，GraspNet 的成功率减去启发式规划器的成功率为 {} 个百分点"
+        "15 个物体{}时，`graspnet` 的成功率减去 `heuristic` 的成功率为 {} 个百分点"
         "（95 % bootstrap，按场景配对）。"
     ),
     "OrbitGrasp (published: floating hand, noisy side view)": (

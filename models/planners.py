@@ -1,8 +1,8 @@
 """Planners: callables `plan(frame) -> list[Grasp]` that turn an RGB-D frame into ranked grasps.
 
 The list is sorted, best first; an empty list means that there is nothing to grasp. `PLANNERS`
-names the planners of this project: `random` and `heuristic` see only the depth image, `graspnet`
-also the colours, `oracle` the true geometry; those that end in `6d` grasp from any side, the others
+names the planners of this project: `random` sees the depth image, `heuristic` and `graspnet` also
+the colours, `oracle` the true geometry; those that end in `6d` grasp from any side, the others
 from straight above. A planner of your own is named by its import path, see
 `make_planner` and docs/planner.md. This module knows no simulator.
 """

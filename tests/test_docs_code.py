@@ -22,6 +22,7 @@ ELSEWHERE = {
 LEFT_OUT = {
     "dask_jobqueue": "a SLURM scheduler",
     "dask_kubernetes": "a Kubernetes cluster",
+    "stable_baselines3": "a training of 100,000 steps",
 }
 # Where a page defines what it does not call: what it gives on the two boxes of `names`.
 CALLED = {

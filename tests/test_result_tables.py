@@ -219,10 +219,10 @@ def test_differences_name_the_noise_of_the_first_pair(tmp_path):
         f"<!-- results:{name} -->\n<!-- /results -->\n" for name in ("planners", "differences")
     )
     written = with_tables(page, tmp_path)
-    assert "On 15 objects with `realsense` depth GraspNet's success minus" in written
+    assert "On 15 objects with `realsense` depth the success of `graspnet` minus" in written
     assert "| `random_urdfs` | pile | `realsense` | +1.5 [-0.2, +3.1] | - |" in written
     chinese = with_tables(page, tmp_path, chinese=True)
-    assert "15 个物体、深度噪声为 `realsense` 时，GraspNet" in chinese
+    assert "15 个物体、深度噪声为 `realsense` 时，`graspnet`" in chinese
 
 
 def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
@@ -233,9 +233,9 @@ def test_the_first_sentence_has_the_shares_of_the_noisy_rows(tmp_path):
     page = "<!-- results:headline -->\n<!-- /results -->"
     written = with_tables(page, tmp_path).splitlines()[1]
     assert written == (
-        "**Result** on unseen objects with `realsense` depth noise: 90 % of GraspNet's grasps "
-        "succeed in piles of 5 objects, 75 % in piles of 15; 90 % and 60 % of the objects reach "
-        "the tray."
+        "**Result** on unseen objects with `realsense` depth noise: 90 % of the grasps of "
+        "`graspnet` succeed in piles of 5 objects, 75 % in piles of 15; 90 % and 60 % of the "
+        "objects reach the tray."
     )
     chinese = with_tables(page, tmp_path, chinese=True)
     assert re.findall(r"\d+ %", chinese) == ["90 %", "75 %", "90 %", "60 %"]
