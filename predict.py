@@ -56,7 +56,7 @@ import numpy as np
 
 from models.graspnet_io import SHIPPED, SavedGraspNet, export_onnx, load_graspnet
 from models.planner_antipodal import SearchPlanner
-from models.planner_target import TargetPlanner, check_reached, least_width
+from models.planner_target import TargetPlanner, check_reached, find_target, least_width
 from models.planners import PLANNERS as ALL_PLANNERS
 from models.planners import make_planner
 from utils.atomic_files import check_writable, write_atomic
@@ -68,8 +68,9 @@ from utils.geometry import GripperGeometry, Workspace
 from utils.grasp_files import MARK, check_output, format_grasps, grasps_as_plain, scene_as_plain
 from utils.image_overlay import grasp_picture
 from utils.images import read_depth, read_mask, read_rgb
-from utils.runs import run_script, timed_folder
-from utils.target import check_target, marked_pixels, target_at, target_in_box
+from utils.run_checks import check_place
+from utils.runs import collected_remarks, portable_name, run_script, timed_folder
+from utils.target import marked_pixels
 from utils.transforms import RGBDFrame
 from utils.user_view import (
     as_depths,
@@ -81,6 +82,7 @@ from utils.user_view import (
     locate_table,
 )
 
+FOLDER = Path("runs/predict")
 NETWORK_PLANNERS = ("graspnet", "graspnet_direct", "graspnet6d")
 PLANNERS = (*NETWORK_PLANNERS, "heuristic", "heuristic6d")  # those that see the image alone
 
@@ -94,7 +96,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if options.out is not None:
         check_output(options.out)
-    image = read_image(options)
+    check_place(options.out or FOLDER)
+    with collected_remarks() as told:
+        image = read_image(options)
     mask = None if options.mask is None else read_mask(options.mask, image.depth.shape)
     network = options.planner in NETWORK_PLANNERS
     saved = load_graspnet(options.checkpoint or SHIPPED) if network else None
@@ -104,21 +108,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     if T_WC is not None:
         x, y, z = T_WC[:3, 3]
         print(f"camera: at ({x:.3f}, {y:.3f}, {z:.3f}) m in your world", file=sys.stderr)
-    frame, scaled = corrected_view(replace(image, T_WC=table.T_WC), table.height)
+    taken = replace(image, T_WC=table.T_WC)  # which the planner corrects itself
+    frame, scaled = corrected_view(taken, table.height)
     marked = marked_pixels(frame.depth.shape, options.point, options.box, mask)
     workspace, cut = chosen_workspace(frame, table.height, options.workspace, marked)
-    remarks = [*table.remarks(), *scaled, *cut, *check_view(frame, workspace)]
-    planner = new_planner(options, saved, workspace)
-    frame = replace(frame, target=find_target(planner, frame, options, mask))
+    remarks = [
+        *told,
+        *table.remarks(),
+        *scaled,
+        *cut,
+        *check_view(frame, workspace, options.table_height is not None),
+    ]
+    with collected_remarks() as more:
+        planner = new_planner(options, saved, workspace)
+    target = find_target(planner, taken, frame, options.point, options.box, mask)
+    taken, frame = replace(taken, target=target), replace(frame, target=target)
 
-    found, clearing = planner(frame), None
+    found, clearing = planner(taken), None
     grasps = found[: options.count]
-    if frame.target is not None:
-        clearing = TargetPlanner(planner).clearing(frame, found)[: options.count]
+    if target is not None:
+        clearing = TargetPlanner(planner).clearing(taken, found)[: options.count]
         width, opening = least_width(frame, table.height), planner.gripper.max_opening
         remarks += [*check_mask(mask), *check_reached(grasps, clearing, width, opening)]
     else:
         remarks += check_found(len(grasps), frame, workspace)
+    remarks += more
     if planner.calibration is not None:
         remarks += unlikely_ones(grasps) + unlikely_ones(clearing or [], "grasps of `clearing`")
     content = {
@@ -136,11 +150,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "remarks": remarks,
     }
     text = json.dumps(content, indent=2, allow_nan=False)
-    out = options.out or timed_folder(Path("runs/predict"), options.rgb.stem)
+    print(format_grasps(content) if sys.stdout.isatty() else text, flush=True)
+    out = options.out or timed_folder(FOLDER, portable_name(options.rgb.stem))
     verb = "replaced" if (out / "grasps.json").exists() else "wrote"
     write_atomic(out / "grasps.png", grasp_picture(frame, grasps, clearing or []))
     write_atomic(out / "grasps.json", text + "\n")
-    print(format_grasps(content) if sys.stdout.isatty() else text)
     for remark in remarks:
         print(f"remark: {remark}", file=sys.stderr)
     print(f"{verb} {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)
@@ -227,20 +241,6 @@ def new_planner(
         planner = make(saved.gripper, workspace, checkpoint=options.checkpoint)
     planner.return_at_least(options.count)
     return planner
-
-
-def find_target(
-    planner: SearchPlanner, frame: RGBDFrame, options: argparse.Namespace, mask: np.ndarray | None
-) -> np.ndarray | None:
-    """(H, W) bool, the pixels of the one object that was named; None where none was."""
-    if mask is not None:
-        check_target(mask, frame, planner.workspace)
-        return mask
-    if options.point is not None:
-        return target_at(planner.segments(frame), frame, options.point)
-    if options.box is not None:
-        return target_in_box(planner.segments(frame), options.box)
-    return None
 
 
 if __name__ == "__main__":

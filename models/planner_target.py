@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from models.planner_antipodal import SearchPlanner
 from models.planners import Planner, calibration_of, needs_truth, reset_planner, takes_targets
 from utils.calibration import Calibration
 from utils.depth_correction import table_roughness
 from utils.errors import UserError
-from utils.target import MOSTLY
+from utils.target import MOSTLY, check_target, target_at, target_in_box
 from utils.transforms import Grasp, RGBDFrame, known_depth
 
 
@@ -95,9 +96,9 @@ class TargetPlanner:
         Chances of a planner that nearly always succeeds may all lie above the least one: they tell
         no grasp from another, but its scores do."""
         chances, least, rough = self.calibration, self.settings.promising, frame.roughness
-        if chances is not None and not self.needs_truth:
-            table = self.plan.workspace.table_height  # type: ignore[attr-defined] - calibrated: ours
-            rough = max(rough, table_roughness(frame, table))
+        workspace = getattr(self.plan, "workspace", None)  # of the project's planners
+        if chances is not None and workspace is not None and not self.needs_truth:
+            rough = max(rough, table_roughness(frame, workspace.table_height))
         if chances is not None and chances(0.0) < least:
             return float(chances(chances.scores(least), rough))
         everything = self.plan(replace(frame, target=None))
@@ -251,6 +252,30 @@ def check_reached(
             "view or --planner graspnet6d, whose hand comes from any side"
         )
     return ["no grasp reaches the target yet; `clearing` moves aside what is in its way"]
+
+
+def find_target(
+    plan: SearchPlanner,
+    taken: RGBDFrame,
+    frame: RGBDFrame,
+    point: Sequence[float] | None,
+    box: Sequence[float] | None,
+    mask: np.ndarray | None,
+) -> np.ndarray | None:
+    """(H, W) bool, the pixels of the one object that a user has named by a pixel (u, v), a box
+    (u0, v0, u1, v1) or a mask (H, W); None where nothing was named.
+
+    taken: the frame as the camera gave it, which the planner corrects itself. frame: the same,
+    corrected. Raises UserError where nothing is there.
+    """
+    if mask is not None:
+        check_target(mask, frame, plan.workspace)
+        return mask
+    if point is not None:
+        return target_at(plan.segments(taken), frame, point)
+    if box is not None:
+        return target_in_box(plan.segments(taken), box)
+    return None
 
 
 def least_width(frame: RGBDFrame, table_height: float) -> float:

@@ -353,10 +353,11 @@ def test_a_noise_is_made_by_name_by_import_path_or_not_at_all():
             {},
             "gamma, gaussian, kinect, module:name, none, realsense; did you mean kinect",
         ),
+        ("builtins:int", None, "depth_noise: 'builtins:int': .*image_focal"),
         ("kinect", {"nois": 1}, "depth_noise_args: 'kinect' does not take them.*'nois'"),
         ("kinect", {"noise": -1}, "KinectNoise.noise must be >= 0"),
         ("tests.test_depth:nothing", {}, "has no 'nothing'"),
-        ("tests.test_depth:test_a_plane_has_holes_at_the_image_border_only", {}, "does not take"),
+        ("tests.test_depth:test_a_plane_has_holes_at_the_image_border_only", {}, "image_focal"),
         ("builtins:dict", {}, "returned a dict, expected a callable"),
     ],
 )

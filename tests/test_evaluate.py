@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 import evaluate
+import utils.runs
 from envs.cell_scenes import make_scene
 from envs.evaluation_worker import load_objects
 from envs.pybullet_files import data_folder
@@ -30,7 +31,7 @@ from utils.errors import UserError
 from utils.evaluation import Outcome
 from utils.geometry import GripperGeometry, Workspace
 from utils.result_records import differing_rounds, read_rounds, write_sample
-from utils.runs import REPOSITORY, this_python
+from utils.runs import REPOSITORY, code_of, this_python
 from utils.runs import run_script as end_like_a_script
 
 SMALL = ["evaluate.rounds=2", "evaluate.workers=2", "evaluate.videos=0", "evaluate.object_sets=box",
@@ -259,6 +260,15 @@ def undisturbed(finished, tmp_path_factory):
         patch.chdir(run.parent)
         assert evaluate.main(["--resume", str(run), "evaluate.rounds=4"]) == 0
     return run
+
+
+def test_a_finished_run_is_of_the_code_that_played_it(finished, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    shutil.copytree(only_run(finished[0]), run)
+    before, now = code_of(run), utils.runs.environment()
+    monkeypatch.setattr(utils.runs, "environment", lambda: now | {"commit": "a" * 40})
+    assert evaluate.main(["--resume", str(run)]) == 0
+    assert code_of(run) == before
 
 
 @pytest.fixture(params=["local", "cluster"])

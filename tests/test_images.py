@@ -107,6 +107,11 @@ def test_a_length_of_65535_is_known_where_numbers_have_more_bits(tmp_path):
     np.testing.assert_allclose(read_depth(tmp_path / "depth.npy", 1e-5), 0.65535)
 
 
+def test_16_bits_that_a_program_has_read_into_more_are_unknown_where_they_are_full(tmp_path):
+    np.save(tmp_path / "depth.npy", np.array([[65535, 800], [0, 700]], np.int32))
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.npy", None), [[0, 0.8], [0, 0.7]])
+
+
 # --- From above ------------------------------------------------------------------------------
 
 

@@ -62,6 +62,22 @@ def test_a_planner_keeps_its_own_order_of_the_targets_grasps() -> None:
     assert others == sorted(others, reverse=True)
 
 
+def test_a_planner_of_another_project_needs_no_workspace() -> None:
+    """The attributes of docs/planner.md alone; its chances are those of `Calibration(1, 0)`."""
+    own = make_planner("heuristic", GripperGeometry(), Workspace(), 0)
+
+    class Plain:
+        calibration = Calibration(1.0, 0.0)
+
+        def segments(self, frame: RGBDFrame) -> np.ndarray:
+            return own.segments(frame)
+
+        def __call__(self, frame: RGBDFrame) -> list[Grasp]:
+            return own(frame)
+
+    assert is_of(TargetPlanner(Plain())(frame_of([FLAT, FAR]))[0], FLAT)
+
+
 @pytest.mark.parametrize("name", ["heuristic", "oracle"])
 def test_neighbours_in_the_way_come_first_and_the_target_when_they_are_gone(name: str) -> None:
     plan = plan_for(name)

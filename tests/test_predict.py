@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import predict
@@ -135,6 +136,36 @@ def best_of_each(grasps: list[dict]) -> list[dict]:
 
 def in_world(grasp: dict) -> np.ndarray:
     return transform_points(OVERHEAD, np.array(grasp["camera"]["position"]))
+
+
+def test_the_planner_sees_the_image_as_it_was_taken(files, capsys):
+    """It corrects a rough image once, as in `evaluate.py`."""
+    rng, shape = np.random.default_rng(0), files.frame.depth.shape
+    waves = gaussian_filter(rng.standard_normal(shape), 4)
+    rough = files.frame.depth + np.float32(0.012 / waves.std()) * waves.astype(np.float32)
+    rgb = rng.integers(0, 256, files.frame.rgb.shape, dtype=np.uint8)  # smooths no colour alike
+    colours, path = files.folder / "speckled.png", files.folder / "rough.npy"
+    Image.fromarray(rgb).save(colours)
+    np.save(path, rough)
+    found = files.run(
+        capsys, rgb=colours, depth=path, planner="heuristic", checkpoint=None, table_height=0
+    )
+    place = found["workspace"]
+    workspace = Workspace(tuple(place["centre_world"][:2]), place["size"], 0.0)
+    plan = make_planner("heuristic", GripperGeometry(), workspace, 0)
+    grasps = plan(replace(files.frame, rgb=rgb, depth=rough))
+    assert grasps and len(grasps) == len(found["grasps"])
+    for grasp, printed in zip(grasps, found["grasps"]):
+        np.testing.assert_allclose(printed["world"]["position"], grasp.position, atol=1e-6)
+
+
+def test_a_lens_that_distorts_is_a_remark_of_the_result(files, capsys):
+    fx, fy, cx, cy = files.options["--intrinsics"]
+    path = files.folder / "bent.json"
+    path.write_text(json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "D": [0.1, -0.2]}))
+    assert any(
+        "lens distorts" in remark for remark in files.run(capsys, intrinsics=path)["remarks"]
+    )
 
 
 def marked(files: UserFiles, xy: tuple[float, float]) -> np.ndarray:

@@ -314,10 +314,12 @@ def test_a_run_notes_with_which_code_it_was_continued(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "environment", lambda: dict(code))
     with open_run(None, "evaluate", None, config, root=tmp_path) as run:
         assert code_of(run) == ["commit aaaaaaaaaa"]
+    note_code(run / "a_column" / "of_it")
+    assert code_of(run) == ["commit aaaaaaaaaa"]
     for commit, changes in (("a", None), ("b", "c" * 64), ("b", "c" * 64), ("a", None)):
         code.update(commit=commit * 40, changes=changes)
         with open_run(run, "evaluate", None, config):
-            note_code(run)
+            note_code(run / "a_column" / "of_it")
     code.update(commit=None)  # where git does not answer
     note_code(run)
     expected = ["aaaaaaaaaa", "bbbbbbbbbb with changes cccccccc", "aaaaaaaaaa"]

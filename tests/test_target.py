@@ -72,18 +72,34 @@ def test_a_mask_cuts_what_the_height_map_cannot() -> None:
 
 
 def test_a_target_in_pieces_is_one_object_with_one_centre() -> None:
-    """A step of 2 cm cuts the map; the mask holds both parts, 4 cm long each."""
-    low, high = (0.04, 0.04, 0.03), (0.04, 0.04, 0.05)
-    frame = boxes_frame([(low, 0.0, (0.48, 0.0)), (high, 0.0, (0.52, 0.0))])
+    """A step of 2 cm cuts the map; the mask holds both parts, 5 and 4 cm long."""
+    low, high = (0.05, 0.04, 0.03), (0.04, 0.04, 0.05)
+    frame = boxes_frame([(low, 0.0, (0.475, 0.0)), (high, 0.0, (0.52, 0.0))])
     heights = heights_of(frame)
     assert heights.label.max() == 1
     mine = only_target(heights, aimed(frame, (0.4, -0.1), (0.6, 0.1)))
     numbers = np.unique(mine.label[mine.label >= 0])
     assert len(numbers) == 1
     # Columns of 3 cm and 5 cm: the mean of x, weighted by height, and of half the height.
-    x = (3 * 0.48 + 5 * 0.52) / 8
-    z = (3 * 0.015 + 5 * 0.025) / 8
+    x = (3 * 5 * 0.475 + 5 * 4 * 0.52) / 35
+    z = (3 * 5 * 0.015 + 5 * 4 * 0.025) / 35
     np.testing.assert_allclose(mine.centres[numbers[0]], (x, 0.0, z), atol=0.002)
+
+
+def test_the_centre_of_a_target_in_pieces_counts_from_what_it_stands_on() -> None:
+    """The same two parts on a block 10 cm high."""
+    low, high = (0.05, 0.04, 0.03), (0.04, 0.04, 0.05)
+    block = ((0.2, 0.2, 0.1), 0.0, (0.5, 0.0))
+    parts = [(low, 0.0, (0.475, 0.0, 0.1)), (high, 0.0, (0.52, 0.0, 0.1))]
+    frame = boxes_frame([*parts, block], walls=1)
+    frame = replace(frame, fixtures=frame.truth.walls)
+    points = frame.points()
+    target = (points[..., 2] > 0.12) & (np.abs(points[..., :2] - 0.5) < (0.06, 0.6)).all(axis=-1)
+    mine = only_target(heights_of(frame), replace(frame, target=target))
+    (number,) = np.unique(mine.label[mine.label >= 0])
+    x = (3 * 5 * 0.475 + 5 * 4 * 0.52) / 35
+    z = 0.1 + (3 * 5 * 0.015 + 5 * 4 * 0.025) / 35
+    np.testing.assert_allclose(mine.centres[number], (x, 0.0, z), atol=0.002)
 
 
 @pytest.mark.parametrize("name", ["heuristic", "graspnet"])
@@ -245,6 +261,16 @@ def test_a_box_takes_the_object_that_lies_in_it(frame, labels) -> None:
     for box in ((u - 40, v - 30, u + 40, v + 30), (u + 40, v + 30, u - 40, v - 30)):
         np.testing.assert_array_equal(target_in_box(labels, box), expected)
     np.testing.assert_array_equal(target_in_box(labels, (u - 5, v - 5, u + 5, v + 5)), expected)
+
+
+def test_a_box_that_cuts_its_object_does_not_take_a_small_one_inside() -> None:
+    """94 of 100 columns of the large object, and all of one a tenth of its size."""
+    labels = np.full((120, 200), -1, np.int32)
+    labels[10:110, 10:110] = 0
+    labels[40:75, 112:142] = 1
+    for box in ((16, 5, 145, 115), (5, 5, 145, 104)):
+        np.testing.assert_array_equal(target_in_box(labels, box), labels == 0)
+    np.testing.assert_array_equal(target_in_box(labels, (100, 35, 145, 80)), labels == 1)
 
 
 def test_marked_pixels() -> None:

@@ -125,6 +125,14 @@ def test_a_floor_that_is_taken_for_the_table_is_told_of() -> None:
     assert check_view(scene((0.0, 0.0, 0.3), height=0.4), Workspace((0.0, 0.0))) == []
 
 
+def test_a_table_height_that_is_too_low_is_told_of() -> None:
+    """Depths are scaled by up to 12 %, here 21 cm."""
+    frame = scene((0.0, 0.0, 0.06))
+    remark = check_view(frame, Workspace((0.0, 0.0), table_height=-0.24), given=True)[-1]
+    assert remark.startswith("a flat surface 0.24 m over") and "--table-height" in remark
+    assert check_view(frame, Workspace((0.0, 0.0)), given=True) == []
+
+
 def test_what_lies_above_the_horizon_is_unknown() -> None:
     level = look_at((0.0, 0.0, UP), (1.0, 0.0, UP - 0.3), (0.0, 0.0, 1.0))
     frame = replace(scene(), T_WC=level, depth=np.full((SIDE, SIDE), 3.0, np.float32))

@@ -18,8 +18,9 @@ This module knows neither planners nor simulators.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,14 +54,22 @@ _DRAWS = 4000  # of the outcomes of all grasps
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chance of success of a score: slope > 0, offset, penalty >= 0 in 1 / m, doubt >= 0 and
-    upper >= 0 of the module's formula."""
+    """Chance of success of a score: slope >= 0, offset, penalty >= 0 in 1 / m, doubt >= 0 and
+    upper >= 0 of the module's formula. Raises ValueError for other numbers."""
 
     slope: float
     offset: float
     penalty: float = 0.0
     doubt: float = 0.0
     upper: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{field.name} is {value!r}, expected a number")
+            if not math.isfinite(value) or (value < 0 and field.name != "offset"):
+                raise ValueError(f"{field.name} is {value:g}, expected a number of 0 or more")
 
     def __call__(
         self, score: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False
@@ -204,7 +213,7 @@ def load_calibrations(path: Path) -> dict[str, Calibration]:
             "shipped one comes back by git checkout checkpoints, one of your own by "
             "python -m benchmarks.calibrate"
         ) from None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} holds no chances of success by planner: {error!r}") from None
 
 

@@ -468,7 +468,8 @@ def make_depth_noise(
     try:
         noise = make(image_focal=image_focal, **(arguments or {}))
     except (TypeError, ValueError) as error:
-        raise UserError(f"{key}_args: {name!r} does not take them: {error}") from error
+        where = f"{key}_args: {name!r} does not take them" if arguments else f"{key}: {name!r}"
+        raise UserError(f"{where}: {error}") from error
     if not callable(noise):
         raise UserError(
             f"{key}: {name!r} returned a {type(noise).__name__}, expected a callable "

@@ -205,10 +205,10 @@ def run_folder(
             # torchrun has ended those before; a machine that was lost may hold its lock for long.
             again = run_of_job(script, config) if resume is None else None
             folder = again or opened.enter_context(open_run(resume, script, name, config))
-            note_code(folder)
             if data is not None:
                 check_data(folder, data)
                 keep_data(folder, data)
+            note_code(folder)
         yield Path(processes.broadcast(str(folder)))
 
 

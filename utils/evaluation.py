@@ -279,7 +279,7 @@ def _play(
     check_recorded(outcome.rounds, config, str(journal))
     films, gallery, shown = run / "films", run / "gallery.npz", config.evaluate.gallery
     outcome.gallery, written = read_gallery(gallery), time.monotonic()
-    todo = tasks(config, outcome.rounds)
+    todo = list(tasks(config, outcome.rounds))
     if todo:
         note_code(run)
     progress = tqdm(total=planned_rounds(config), initial=len(outcome.rounds), unit="round")

@@ -128,7 +128,8 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     """(H, W) float32 metres along the optical axis of a PNG, TIFF or NPY; 0 where unknown.
 
     scale: metres that 1 in the file stands for; None: whole numbers are millimetres, fractional
-    ones metres. Zero, negative, not finite, and 65535 in 16 bits are unknown.
+    ones metres. Zero, negative, not finite, and 65535 in 16 bits are
+    unknown, and where it is the largest of millimetres in more bits.
     """
     if scale is not None and not 0 < scale < np.inf:
         raise UserError(f"--depth-scale: got {scale:g}, expected a positive number such as 0.001")
@@ -144,11 +145,13 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
             f"{path}: depth as {values.dtype}, expected 16-bit whole numbers or floats; "
             "8 bits are a picture of depth, not depth"
         )
-    if scale is None:
-        scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
     known = known_depth(values)
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:  # of either byte order
         known &= values != SATURATED
+    elif scale is None and values.dtype.kind != "f" and values.max() == SATURATED:
+        known &= values != SATURATED  # a program has read 16 bits into more, as Pillow does
+    if scale is None:
+        scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
     with np.errstate(over="ignore"):
         metres = np.where(known, values * np.float64(scale), 0).astype(np.float32)
     if not np.isfinite(metres).all():

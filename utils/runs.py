@@ -148,6 +148,20 @@ def resume_command(script: str, run: Path, files: Mapping[str, Path | None] | No
     return f"{this_python()} {launch}{script} {resumption(run, files or {})}"
 
 
+@contextmanager
+def collected_remarks() -> Iterator[list[str]]:
+    """A list to which this project's remarks go, which are `UserWarning`s, instead of stderr."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        yield texts
+    for one in told:
+        if one.category is UserWarning:
+            texts.append(" ".join(str(one.message).split()))
+        else:
+            warnings.showwarning(one.message, one.category, one.filename, one.lineno)
+
+
 def plain_remarks(in_a_worker: bool = False) -> None:
     """Print this project's remarks, which are `UserWarning`s, as one plain line each: above the
     progress bars of a terminal, and in a file, or from a worker, below what they have written."""
@@ -386,7 +400,8 @@ def code_states(run: Path) -> list[dict[str, Any]]:
 
 def note_code(run: Path) -> None:
     """Add the present code to the environment.json of a run that goes on, where it is known and
-    another than the last."""
+    another than the last. run: its folder, or the one of a part of it, as of a column."""
+    run = next((one for one in (run, *run.parents) if (one / "environment.json").exists()), run)
     begun, *later = code_states(run)
     now = {name: value for name, value in environment().items() if name in ("commit", "changes")}
     last = later[-1] if later else begun

@@ -270,6 +270,7 @@ FLAT = 0.003  # m: noise of a first Kinect at a metre, beyond which a pixel coun
 # the robot on the camera's side of the table.
 STEEP = np.array([0.0, 0.8, 1.0])
 ROBOT = np.array([0.0, 0.8, 0.2])
+GRAZING = 0.1  # of STEEP times a ray, under which it meets that plane ten times as far away
 # An origin above and behind a camera that sees less than 50 degrees: every ray leads away from it.
 # It is above any table 0.4 m away or more, unless the camera is tilted by 60 degrees.
 BEHIND = np.array([0.0, 0.6, -0.1])
@@ -393,10 +394,12 @@ def _fit_distances(rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def _middle(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) rays of pixels in the middle of an image whose values are known, and these (n,)."""
+    """(n, 3) rays of pixels in the middle of an image whose values are known, and these (n,); of a
+    wide-angle camera those alone that meet the plane from which a search starts."""
     values = image[_middle_of(image.shape)].ravel().astype(float)
-    known = known_depth(values)
-    return _middle_rays(image.shape, K)[known], values[known]
+    rays = _middle_rays(image.shape, K)
+    usable = known_depth(values) & (rays @ STEEP > GRAZING)
+    return rays[usable], values[usable]
 
 
 def _middle_rays(shape: tuple[int, ...], K: np.ndarray) -> np.ndarray:

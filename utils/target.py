@@ -17,13 +17,15 @@ import numpy as np
 from utils.depth_holes import nearest_values
 from utils.errors import UserError
 from utils.geometry import Workspace
-from utils.height_map import HUNG, OTHER_LABEL, HeightMap
+from utils.height_map import HUNG, OTHER_LABEL, HeightMap, base_heights
 from utils.transforms import RGBDFrame, known_depth, project, transform_points
 
 # Depth cameras and hand-drawn masks are off by some pixels at an edge: nearer to a mask's outline
 # than this, the height map's own labels decide.
 RIM = 0.004  # m
-MOSTLY = 0.8  # share of an object's cells in the mask, above which all of it is the target
+# Of an object's cells in the mask: above it all of the object is the target. Of the target's cells
+# in one object: above it the object's centre is the target's.
+MOSTLY = 0.8
 LEAST_PIXELS = 12  # of a target: fewer are the noise of an edge
 CLICK_REACH = 4  # pixels around a click in which an object counts as hit where depth is missing
 
@@ -44,7 +46,7 @@ def only_target(heights: HeightMap, frame: RGBDFrame) -> HeightMap:
     pieces = np.bincount(heights.label[mine])
     main = int(pieces.argmax())
     whole = int((heights.label == main).sum())
-    if pieces[main] > max(mine.sum(), whole) / 2:
+    if pieces[main] > MOSTLY * max(mine.sum(), whole):
         return replace(heights, label=np.where(mine, main, label))
     label = np.where(mine, len(heights.centres), label)
     return replace(
@@ -114,13 +116,16 @@ def _in_mask(
 
 
 def _centroid(heights: HeightMap, cells: np.ndarray) -> np.ndarray:
-    """(3,) centroid of the columns between the table and the surface in the cells of a map from
-    above."""
+    """(3,) centroid of the columns between what the cells of a map from above rest on and their
+    surface."""
     row, column = np.nonzero(cells)
-    rise = np.maximum(heights.height[row, column] - heights.table_height, 1e-6)
+    base = heights.table_height
+    if heights.fixed is not None:
+        base = float(base_heights(np.where(cells, 0, -1), heights.fixed, base)[0])
+    rise = np.maximum(heights.height[row, column] - base, 1e-6)
     xy = heights.origin + heights.cell * np.column_stack([column, row])
     middle = (rise[:, None] * xy).sum(axis=0) / rise.sum()
-    return np.array([*middle, heights.table_height + (rise**2).sum() / (2 * rise.sum())])
+    return np.array([*middle, base + (rise**2).sum() / (2 * rise.sum())])
 
 
 # --- Pixels ---------------------------------------------------------------------------------
@@ -174,9 +179,9 @@ def target_at(labels: np.ndarray, frame: RGBDFrame, point: Sequence[float]) -> n
 
 
 def target_in_box(labels: np.ndarray, box: Sequence[float]) -> np.ndarray:
-    """(H, W) bool: the pixels of the object that fills most of a box (u0, v0, u1, v1), its corners
-    in any order: the one with most of its pixels inside, of those that fill at least a tenth of the
-    raised pixels there. Raises UserError for a box that holds no object."""
+    """(H, W) bool: the pixels of the object that a box (u0, v0, u1, v1), its corners in any order,
+    is drawn around: the one with the largest share that is both in the object and among the raised
+    pixels of the box (intersection over union). Raises UserError for a box that holds no object."""
     name = "box " + " ".join(f"{x:g}" for x in box)
     height, width = labels.shape
     if not np.isfinite(box).all():
@@ -188,9 +193,7 @@ def target_in_box(labels: np.ndarray, box: Sequence[float]) -> np.ndarray:
     if inside.sum() < LEAST_PIXELS:
         raise UserError(f"{name}: no object in it, only the table or nothing; draw it around one")
     whole = np.bincount(labels[labels >= 0], minlength=len(inside))
-    share = np.where(inside >= inside.sum() / 10, inside / np.maximum(whole, 1), 0)
-    # Of objects that lie wholly inside, the largest.
-    best = np.lexsort((inside, np.round(share, 1)))[-1]
+    best = (inside / (whole + inside.sum() - inside)).argmax()
     return labels == best
 
 

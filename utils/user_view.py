@@ -12,7 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from utils.depth_correction import TRUSTED_SCALE, bump_height, corrected, scale_to_table
+from utils.depth_correction import (
+    SCALE_REACH,
+    TRUSTED_SCALE,
+    bump_height,
+    corrected,
+    scale_to_table,
+)
 from utils.depth_holes import check_rgbd, depth_of_plane
 from utils.errors import UserError
 from utils.geometry import Workspace
@@ -237,16 +243,17 @@ def check_mask(mask: np.ndarray | None) -> list[str]:
     return [f"--mask marks {share:.0%} of the image as the object; is it inverted?"]
 
 
-def check_view(frame: RGBDFrame, workspace: Workspace) -> list[str]:
-    """Remarks on a view that shows little. Raises UserError for one from which grasps would be
-    guessed: too oblique, or with too little of the workspace in the image or measured."""
+def check_view(frame: RGBDFrame, workspace: Workspace, given: bool = False) -> list[str]:
+    """Remarks on a view that shows little. given: whether it is the user who says how high the table
+    is. Raises UserError for a view from which grasps would be guessed: too oblique, or with too
+    little of the workspace in the image or measured."""
     tilt = float(np.rad2deg(np.arccos(np.clip(-frame.T_WC[2, 2], -1, 1))))
     if tilt > MOST_OBLIQUE:
         raise UserError(
             f"the view is too oblique: the camera looks {tilt:.0f} degrees off the table's normal, "
             f"at most {MOST_OBLIQUE:g} are allowed; look more from above"
         )
-    remarks = [*_check_units(frame), *_check_table(frame, workspace.table_height)]
+    remarks = [*_check_units(frame), *_check_table(frame, workspace.table_height, given)]
     (height, width), (cx, cy) = frame.depth.shape, frame.K[:2, 2]
     if not (0 <= cx < width and 0 <= cy < height):
         remarks.append(
@@ -293,12 +300,15 @@ def _check_units(frame: RGBDFrame) -> list[str]:
     return remarks
 
 
-def _check_table(frame: RGBDFrame, table_height: float) -> list[str]:
-    """A remark on a wide flat surface far over the table, which may be a floor then."""
-    known = known_depth(frame.depth)
+def _check_table(frame: RGBDFrame, table_height: float, given: bool) -> list[str]:
+    """A remark on a wide flat surface far over the table, which may be a floor then; or, where its
+    height was given, farther over it than depths are scaled to meet it."""
+    known, least = known_depth(frame.depth), HIGH_TABLE
+    if given:
+        least = min(HIGH_TABLE, SCALE_REACH * (frame.T_WC[2, 3] - table_height))
     over = frame.points()[known][:, 2] - table_height
-    high = over[over > HIGH_TABLE]
-    layers = np.floor((high - HIGH_TABLE) / LAYER).astype(int)
+    high = over[over > least]
+    layers = np.floor((high - least) / LAYER).astype(int)
     counts = np.bincount(layers, minlength=2)
     pairs = counts[:-1] + counts[1:]  # a surface may lie on the border of two
     share = float(pairs.max() / len(over))
@@ -308,7 +318,12 @@ def _check_table(frame: RGBDFrame, table_height: float) -> list[str]:
     height = np.median(high[(layers == lower) | (layers == lower + 1)])
     return [
         f"a flat surface {height:.2f} m over the table holds {share:.0%} of the image; if that is "
-        "the table, crop the image to it, or give --camera-pose and --table-height"
+        "the table, "
+        + (
+            "correct --table-height or --camera-pose"
+            if given
+            else "crop the image to it, or give --camera-pose and --table-height"
+        )
     ]
 
 
